@@ -537,6 +537,7 @@ def is_present(module: str) -> bool:
 
 
 def _find_spec(module: str, path: Sequence[str] | None) -> ModuleSpec | None:
+    """Return where Python would import a module from, without importing it or its parents."""
     for finder in sys.meta_path:
         try:
             spec = finder.find_spec(module, path)

@@ -114,7 +114,10 @@ LIST_SETTINGS = (
     "held_out_environment",
 )
 """The settings that may be several names, where a command takes several."""
-TEXT_SETTINGS = (*LIST_SETTINGS, "task", "up", "camera", "run", "objective")
+TEXT_SETTINGS = (
+    *LIST_SETTINGS,
+    *("task", "up", "camera", "backdrop", "occluder", "run", "objective"),
+)
 """The settings that are texts, whatever they are given as."""
 # controls as they are asked for: their names, each with its settings
 ControlsByName = dict[str, dict[str, object]]
@@ -225,6 +228,25 @@ class SceneConfig(Config):
         "it, several with ; between them",
         flag="--with",
         otherwise="nothing",
+    )
+    backdrop: str | None = setting(
+        None,
+        "scene",
+        "a photograph that the object is rendered into, taken by the camera of the "
+        "scene",
+        "a picture file, or a part of it, photo.jpg#X,Y,WIDTH,HEIGHT in pixels",
+        metavar="FILE",
+        otherwise="the environment is behind the object",
+        min_length=1,
+    )
+    occluder: str | None = setting(
+        None,
+        "scene",
+        "a mask of what is before the object in the photograph of `backdrop`",
+        "a picture file of the photograph's size, white where something is before it",
+        metavar="FILE",
+        otherwise="nothing is before the object",
+        min_length=1,
     )
     judge: str = setting(
         "object",
@@ -489,6 +511,7 @@ class SceneConfig(Config):
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
+        """Join a list of prompts by " | "; none of them may be empty."""
         if isinstance(value, (list, tuple)) and all(
             isinstance(text, str) for text in value
         ):
@@ -619,6 +642,7 @@ class RenderConfig(SceneConfig):
     @field_validator("out", mode="before")
     @classmethod
     def _picture_file(cls, value: Any) -> Any:
+        """Check that a path has the suffix of an image and no NUL character."""
         text = str(value) if isinstance(value, Path) else value
         if (
             not isinstance(text, str)

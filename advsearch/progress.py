@@ -85,6 +85,7 @@ class Stages:
         self.progress.stage(title, total, hint=hint, at_most=at_most)
 
     def end(self) -> None:
+        """End the stage that runs, and add its seconds to those of its name."""
         if self._name:
             self.seconds[self._name] = (
                 self.seconds.get(self._name, 0.0)
@@ -174,6 +175,7 @@ class LineProgress:
         written: Callable[[str], str] = str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Write lines to `stream`; `written` formats names of controls in them."""
         self._stream = stream
         self._format_names = written
         self._clock = clock
@@ -329,6 +331,7 @@ class BarProgress:
         hint: str = "",
         at_most: bool = False,
     ) -> None:
+        """Begin a stage: the bar before is full now, and only the newest ones stay visible."""
         for task in self.bars.tasks[-1:]:
             self.bars.update(
                 task.id, total=max(task.completed, 1), completed=max(task.completed, 1)

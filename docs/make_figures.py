@@ -510,9 +510,9 @@ def stored_record() -> dict[str, Any]:
     """Return the record that lies beside the weights in the package; empty if the model
     has not been trained yet.
     """
-    from advsearch.models.reference import RECORD, get_data_folder
+    from advsearch.models.reference import METADATA, get_data_folder
 
-    path = get_data_folder() / RECORD
+    path = get_data_folder() / METADATA
     return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
 
 

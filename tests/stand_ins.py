@@ -102,11 +102,7 @@ def configuration(policy: str = "pgd", **more: Any) -> AttackConfig:
 
 
 def attack_on(
-    problem: Any,
-    config: AttackConfig,
-    policy: Policy[Any],
-    stages: Stages,
-    run: RunDirectory | None = None,
+    problem: Any, config: AttackConfig, policy: Policy[Any], stages: Stages, run: RunDirectory | None = None
 ) -> RunState:
     """Attack a problem of one's own as a configuration describes it."""
     problem.steps, problem.n_draws = choose_search_size(config, problem)

@@ -249,23 +249,6 @@ def test_a_result_is_read_and_shown_without_what_renders() -> None:
     assert broken == []
 
 
-@pytest.mark.parametrize(
-    ("module", "source", "expected"),
-    [
-        ("advsearch.attacks.x", "def f():\n    import mitsuba as mi\n", {"mitsuba"}),
-        ("advsearch.attacks.x", "from ..scene import build", {"advsearch.scene"}),
-        ("advsearch.attacks.x", "from . import domain", {"advsearch.attacks"}),
-        ("advsearch.attacks.x", "from .. import threads", {"advsearch.threads"}),
-        ("advsearch.attacks", "from .domain import Domain", {"advsearch.attacks.domain"}),
-        ("advsearch.x", "from advsearch import __version__, cli", {"advsearch.__version__", "advsearch.cli"}),
-    ],
-)
-def test_the_reader_of_imports_sees_all_of_them(tmp_path: Path, module: str, source: str, expected: set[str]) -> None:
-    path = tmp_path / ("__init__.py" if module == "advsearch.attacks" else "x.py")
-    path.write_text(source)
-    assert imports(module, path) == expected
-
-
 def test_only_the_backend_speaks_mitsuba() -> None:
     """And the probe of `advsearch doctor`; a mesh's names stand once."""
     backend = "advsearch.scene.mitsuba_backend"
@@ -288,16 +271,6 @@ def test_every_picture_is_opened_as_one_of_some_formats() -> None:
         text for _, path in python_files() for text in re.findall(r"Image\.open\([^\n]*", path.read_text("utf-8"))
     ]
     assert len(opened) > 8 and [text for text in opened if "formats=" not in text] == []
-
-
-def test_the_design_in_one_glance() -> None:
-    """As in docs/design.md, "Packages and imports": bottom never reaches top, the command line is the roof."""
-    assert not any("cli" in (rule.rooms or ()) for rule in RULES.values())
-    below: dict[str, set[str]] = {"models": set(), "tasks": {"models"}, "attacks": {"tasks", "statistics"}}
-    for name, rooms in below.items():
-        assert not RENDERER & (RULES[name].packages or RENDERER) and RULES[name].rooms == rooms
-    assert RULES["settings"].rooms == set() and RULES["config"].rooms == {"settings"}
-    assert RULES["report"].forbidden >= {"torch", "mitsuba"} and RULES["scene"].rooms == set()
 
 
 def test_everything_imported_is_a_declared_dependency() -> None:
@@ -400,10 +373,6 @@ NOT_MESSAGES = (
 """Modules that read or write flags themselves, also those of another program, and a style sheet."""
 
 
-DESCRIBING = ("setting", "experiment", "BuiltIn", "PositionalArgument")
-"""Calls whose texts are for the help of the command line."""
-
-
 def texts_of_people(source: str) -> Iterator[tuple[int, str]]:
     """Every text in a module but docstrings and what describes a setting or an experiment: the command line's help."""
     tree = ast.parse(source)
@@ -472,11 +441,6 @@ def test_every_data_file_is_listed_as_package_data() -> None:
             name = path.relative_to(folder).as_posix()
             shipped = any(fnmatch.fnmatch(name, pattern.replace("**/", "*")) for pattern in patterns[package])
             assert shipped or path.is_dir(), f"{name} matches none of {package}'s patterns"
-
-
-def test_metadata_is_in_one_file_only() -> None:
-    assert not re.search(r"^\[project", (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)
-    assert not [name for name in setup_cfg().sections() if name.startswith(("tool:", "mypy", "flake8"))]
 
 
 # -- what is pinned --------------------------------------------------------------------------------------------------

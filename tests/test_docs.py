@@ -7,27 +7,17 @@ import importlib.util
 import inspect
 import re
 import shlex
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-from xml.etree import ElementTree
 
-import check_docs
 import pytest
-import reference_calibration as calibration
 import torch
 import yaml
 from check_docs import DOCS, PAGES, ROOT, blocks, name_of, script
-from PIL import Image
 
 import advsearch
 import advsearch.config
-from advsearch.attacks import (
-    count_planned_renders,
-    make_policy,
-)
+from advsearch.attacks import count_planned_renders, make_policy
 from advsearch.attacks.objectives import check_objective
 from advsearch.cli.flags import make_config
 from advsearch.cli.main import _parse
@@ -58,66 +48,12 @@ from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import resolve_settings
 from advsearch.settings import Config, parse_assignment, read_yaml
 from advsearch.tasks import make_task
-from samples import attack
 
 every_page_with = {
     language: pytest.mark.parametrize("page", having, ids=[name_of(page) for page in having])
     for language in ("sh", "yaml", "python")
     if (having := [page for page in PAGES if any(blocks(page, language))])
 }
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "see `advsearch.scene.nowhere`",
-        "advsearch.errors.NoSuchError is raised",
-        "as benchmarks/nothing.py measures",
-        "the rule (docs/design.md, \"No such heading\")",
-        "the rule (docs/nothing.md)",
-        "as in DESIGN",
-    ],
-)  # fmt: skip
-def test_a_citation_of_what_is_not_there_is_seen(text: str) -> None:
-    assert check_docs.lost_in(text)
-
-
-def test_what_is_there_is_not_called_lost() -> None:
-    text = 'see `advsearch.errors.InputError`, advsearch.scene.renderer, docs/runs.md and docs/design.md, "The\nsearch"'
-    assert not check_docs.lost_in(text)
-    assert all(
-        found.findall(" ".join(text.split())) for found in (check_docs.NAME, check_docs.PATH, check_docs.HEADING)
-    )
-
-
-MISTAKES: list[tuple[Callable[[], Iterator[str]], str, str, str, str]] = [
-    (check_docs.commands, "docs/command-line.md", "| `--epsilon` |", "| `--epsilom` |", "--epsilon"),
-    (check_docs.commands, "docs/command-line.md", "\nadvsearch sweep", "\nadvsearch swep", "advsearch sweep"),
-    (check_docs.controls, "docs/controls/texture.md", "| `resolution` |", "| `size` |", "resolution"),
-    (check_docs.policies, "docs/policies/README.md", "`momentum` (", "`momentus` (", "momentum"),
-    (check_docs.names, "docs/objectives.md", "| `margin` |", "| `margim` |", "margin"),
-    (check_docs.results, "docs/runs.md", "`probability`", "`p`", "probability"),
-    (check_docs.made, "docs/controls/pose.md", ".py: pose", ".py: poses", "PARTS"),
-    (check_docs.numbers, "docs/questions.md", "four times", "five times", "four times"),
-    (check_docs.links, "README.md", "](docs/", "](dox/", "leads nowhere"),
-    (check_docs.words, "docs/runs.md", "a", "colored", "colored"),
-]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    ("check", "file", "right", "wrong", "said"),
-    MISTAKES,
-    ids=[f"{check.__name__}-{said}" for check, *_, said in MISTAKES],
-)
-def test_a_mistake_in_a_file_is_told(
-    check: Callable[[], Iterator[str]], file: str, right: str, wrong: str, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = (ROOT / file).read_text("utf-8")
-    assert right in text
-    read, path = check_docs.read, ROOT / file
-    monkeypatch.setattr(check_docs, "read", lambda one: text.replace(right, wrong) if one == path else read(one))
-    assert [mistake for mistake in check() if said in mistake]
 
 
 # ---- examples -------------------------------------------------------------------------------------------------------
@@ -169,10 +105,7 @@ def check_names(config: Config) -> None:
         make_policy(config.policy_name, **config.policy_options)
         task = make_task(config.task)
         check_objective(
-            config.objective or task.objective,
-            task.name,
-            targeted=config.target is not None,
-            minimise=config.minimise,
+            config.objective or task.objective, task.name, targeted=config.target is not None, minimise=config.minimise
         )
         known = script("make_figures").stored_record()["labels"]
         assert config.model != "reference" or set((config.target or known[0]).split(",")) <= set(known)
@@ -317,12 +250,6 @@ def code_with(page: str, word: str) -> dict[str, Any]:
 
 
 @pytest.mark.docs
-def test_the_question_that_renders_of_the_design_asks_a_problem() -> None:
-    config = AttackConfig(object="mug", controls="pose", resolution=32, denoise="none")
-    assert code_with("design.md", "problem_from_config")["is_right"](SimpleNamespace(config=config)) in (True, False)
-
-
-@pytest.mark.docs
 def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
     renderer = advsearch.load_scene("mug").renderer({"environment": {"exposure": [-2, 0]}}, resolution=32)
     predictor = code_with("development.md", "Predictor")["Dimmed"](renderer, renderer.start, seed=1)
@@ -335,73 +262,3 @@ def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
         lambda view: compare_with_traced(renderer, picture.detach(), still, view, 16, lambda *_: 0.0)
     )
     assert deviation.is_accepted, deviation.reason
-
-
-# ---- the scripts ----------------------------------------------------------------------------------------------------
-
-
-def made_up_record() -> dict[str, Any]:
-    """A record as `tools/reference_model.py` writes it, of a model that is right nine times in ten."""
-    labels = ["ball", "mug", "wine glass"]
-    truth = [index % 3 for index in range(300)]
-    logits = torch.nn.functional.one_hot(torch.tensor(truth), 3).float() * 3.0
-    logits[::10] = logits[::10].roll(1, dims=1)
-    heldout = asdict(calibration.report(logits, truth))
-    views = {"ball": 0.91, "mug": 0.97, "wine-glass": 0.8812}
-    figures = {"pictures": 16000, "epochs": 16, "seed": 0, "temperature": 1.1, "heldout": heldout}
-    return {"schema": 1, "labels": labels, "figures": {**figures, "default_views": views}}
-
-
-@pytest.mark.medium
-def test_the_figures_of_the_reference_model_come_from_its_record() -> None:
-    figures = script("make_figures")
-    record = made_up_record()
-    part = figures.reference(record)
-    assert "| right | 90.0 % (95 % interval 86.0 to 93.2 %) |" in part
-    assert "| training pictures | 16,000, seen 16 times, seed 0 |" in part
-    assert "| wine glass | 90.0 % | ball (10) | 0.881 |" in part
-    wanted = figures.differing(record)
-    assert part in wanted[DOCS / "reference-model.md"]
-    assert wanted[DOCS / "images" / "reliability.svg"] == figures.reliability_diagram(record["figures"]["heldout"])
-
-
-@pytest.mark.medium
-def test_without_a_record_the_page_says_so_and_nothing_is_drawn() -> None:
-    figures = script("make_figures")
-    assert "not been measured" in figures.reference({})
-    assert "not been measured" in figures.reference({"labels": ["a", "b"], "figures": {"pictures": 10}})
-    assert not [path for path in figures.differing({}) if path.suffix == ".svg"]
-
-
-def test_the_reliability_diagram_is_an_svg_whose_bars_are_the_bins() -> None:
-    heldout = made_up_record()["figures"]["heldout"]
-    svg = script("make_figures").reliability_diagram(heldout)
-    root = ElementTree.fromstring(svg)
-    bars = [one for one in root.iter("{http://www.w3.org/2000/svg}rect") if one.get("fill") == "#4477aa"]
-    filled = [one for one in heldout["bins"] if one["count"]]
-    assert len(bars) == 2 * len(filled)
-    accuracy = [float(one.get("height", "nan")) / 300 for one in bars[::2]]
-    assert accuracy == pytest.approx([one["accuracy"] for one in filled], abs=1e-4)
-
-
-def test_a_part_is_exchanged_and_nothing_else() -> None:
-    replaced = script("make_figures").replaced
-    page = "a\n<!-- made by docs/make_figures.py: x -->\nold\n<!-- end of x -->\nb\n"
-    assert replaced(page, "x", "new\n") == page.replace("old", "new")
-    with pytest.raises(ValueError, match="expected one part named 'y'"):
-        replaced(page, "y", "new\n")
-
-
-def test_the_picture_and_the_result_in_the_readme_are_made_from_a_run(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    for name, grey in (("images/clean", 40), ("images/adversarial", 120), ("artifacts/texture", 200)):
-        (run / name).parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (16, 16), (grey, grey, grey)).save(run / f"{name}.png")
-    summary = attack(object="path/to/mug.obj")
-    images = script("make_images")
-    sheet = images.side_by_side(run, summary)
-    centres = [sheet.getpixel((images.SIDE // 2 + number * (images.SIDE + images.GAP), 9)) for number in range(3)]
-    assert centres == [(40, 40, 40), (120, 120, 120), (200, 200, 200)]
-    readme = images.with_adversarial(PAGES[0].read_text("utf-8"), summary)
-    assert "The model calls this mug a vase in 20 of 20 fresh renders" in readme
-    assert "runs/mug-texture-001/report.html\n```\n<!-- end -->" in readme

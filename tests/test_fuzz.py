@@ -39,11 +39,6 @@ def test_a_device_is_one_sentence_on_the_command_line(
     assert f"{name}: expected an" in printed.err.splitlines()[-1] and "got a device" in printed.err.splitlines()[-1]
 
 
-def test_a_case_is_the_same_files_each_time() -> None:
-    for number in range(NUMBERS):
-        assert cases.make(SEED, number) == cases.make(SEED, number)
-
-
 @pytest.mark.medium
 def test_the_fuzz_sees_what_must_not_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = {

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from advsearch.cli.output import InterruptCheckingProgress
-from advsearch.interrupts import DUPLICATE_SECONDS, INTERRUPTS, Interrupts, interruptible, unless_interrupted
+from advsearch.interrupts import INTERRUPTS, Interrupts, interruptible, unless_interrupted
 from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from conftest import ROOT
@@ -162,16 +162,3 @@ def test_a_second_one_ends_native_code_at_once_and_one_that_is_passed_on_does_no
             assert process.stderr is not None and process.stderr.read() == "advsearch: interrupted\n"
         finally:
             process.kill()
-
-
-def test_one_that_is_passed_on_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([5.0, 5.0 + DUPLICATE_SECONDS / 2, 6.0 + DUPLICATE_SECONDS])
-    monkeypatch.setattr("advsearch.interrupts.time.monotonic", lambda: next(times))
-    handler = Interrupts()
-    with pytest.raises(KeyboardInterrupt):
-        handler(2, None)
-    handler(2, None)
-    assert handler.count == 1
-    with pytest.raises(KeyboardInterrupt):
-        handler(2, None)
-    assert handler.count == 2

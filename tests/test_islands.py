@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -35,10 +34,7 @@ OTHER_ISLANDS = {
 }
 """Islands that no table of parts has, with what they are; `advsearch.registry` imports them by name."""
 
-ELSEWHERE = {
-    "advsearch.cli.report": "advsearch.questions.report",
-    "advsearch.testing": "advsearch.questions.test",
-}
+ELSEWHERE = {"advsearch.cli.report": "advsearch.questions.report", "advsearch.testing": "advsearch.questions.test"}
 """Modules that belong to an island, but stand where users or the command line look for them."""
 
 COMMAND_LINE = ("advsearch.cli", "advsearch.cli.main", "advsearch.cli.output")
@@ -198,16 +194,3 @@ def test_without_any_island_the_other_parts_are_there_and_can_be_used() -> None:
         hidden = by_kind.get(name, {name})
         assert left == [part for part in every if module_of[part[0], part[1]] not in hidden], name
     assert set(answers) == {*asked[0], *by_kind}
-
-
-def test_each_name_of_the_interface_has_a_line_in_the_docs() -> None:
-    """With an example; what the examples take from a module is there."""
-    from advsearch import extend
-
-    page = (ROOT / "docs" / "extending.md").read_text("utf-8")
-    section = page[page.index("## What `advsearch.extend` offers") :]
-    assert sorted(set(extend.__all__) - set(re.findall(r"`(\w+)`", section))) == []
-    examples = re.findall(r"`(?:[^`]*[ (])?(\w+)\.(\w+)", section)
-    used = [(module, name) for module, name in examples if module in extend.__all__]
-    assert len(used) > 15
-    assert [pair for pair in used if not hasattr(getattr(extend, pair[0]), pair[1])] == []

@@ -101,11 +101,6 @@ def test_export_rows(sweep_run: Path, tmp_path: Path) -> None:
     assert len((tmp_path / "rows.csv").read_text("utf-8").splitlines()) == 7
 
 
-def test_export_sheets(attack_run: Path, tmp_path: Path) -> None:
-    run_command("export", attack_run, "--format", "print", "--size", "100", "--out", tmp_path / "sheets.pdf")
-    assert (tmp_path / "sheets.pdf").read_bytes()[:4] == b"%PDF"
-
-
 def test_export_mesh(attack_run: Path, tmp_path: Path) -> None:
     run_command("export", attack_run, "--format", "gltf", *CODE, "--out", tmp_path / "object.glb")
     assert (tmp_path / "object.glb").read_bytes()[:4] == b"glTF"

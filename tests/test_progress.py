@@ -14,14 +14,11 @@ import torch
 from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.attacks.trials import choose_spp, count_max_samples
 from advsearch.cli.flags import format_as_flags
-from advsearch.cli.output import format_result as check_text
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import RunState
 from advsearch.experiment import run_experiment as answered
 from advsearch.progress import Stages
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check import check
-from advsearch.questions.check.result import CheckConfig
 from advsearch.questions.precision.result import PrecisionConfig
 from advsearch.questions.region import boxes
 from advsearch.questions.region.result import RegionConfig
@@ -127,29 +124,6 @@ def test_the_samples_of_the_smallest_change_are_those_of_the_clean_scene() -> No
     assert {row.name for row in findings.sample_count.table} == {"clean"} and findings.spp == 16
 
 
-@dataclass
-class OftenWrong(Easy):
-    """Wrong wherever it is moved a little, and in two of three renders where it is not."""
-
-    renders: int = 0
-
-    def _logits(self, u: torch.Tensor, seed: int) -> torch.Tensor:
-        self.renders += 1
-        logits = super()._logits(u, seed)
-        return -logits if self.renders % 3 and (u == 0.5).all() else logits
-
-
-def test_no_smallest_change_is_sought_where_no_change_is_needed() -> None:
-    problem = OftenWrong()
-    blocks = tuple(block for block in problem.domain.blocks if block.epsilon is not None)
-    problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
-    progress, findings = attacked(configuration(smallest=True), problem)
-    assert any(trial.right for trial in findings.first_look), "the first look was not enough to tell"
-    assert sum(trial.right for trial in findings.clean_trials) < len(findings.clean_trials) / 2
-    assert findings.search is None and findings.bracket is None and findings.verification is None
-    assert not progress.named("search 1 of")
-
-
 def test_samples_of_the_ladder_have_a_bound() -> None:
     spent = 0
 
@@ -202,16 +176,6 @@ def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, confi
     progress.check()
     hints = [format_as_flags(one.hint) for one in progress.stages]
     assert any("--" in one for one in hints) and not any("`" in one for one in hints)
-
-
-@pytest.mark.slow
-def test_a_check_counts_what_it_says(tmp_path: Path) -> None:
-    progress = Recorded()
-    asked = {"controls": {"environment.rotation": {}}, "loss": "model", "run": str(tmp_path / "run")}
-    whole = check.run(CheckConfig(**SMALL, **asked), progress=progress)
-    progress.check()
-    assert whole.ending == "done" and whole.gains and len(progress.messages) == len(whole.rows)
-    assert "How a search gets its derivatives" in check_text(whole)
 
 
 # ---- what is stored is not rendered again ---------------------------------------------------------------------------

@@ -71,25 +71,6 @@ def test_a_real_detector_and_a_real_segmenter_are_fooled(case: str, real_data: P
     assert (tmp_path / "run" / "images" / "adversarial-prediction.png").is_file()
 
 
-ELSEWHERE = {"displace": {"cup elsewhere", "cup in a loose box"}, "create": {"dining table elsewhere"}}
-"""By objective: what the detector sees then, of a mug that stands on a table and which it sees where it is before."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("objective", ELSEWHERE)
-def test_a_real_detector_sees_a_box_where_the_object_is_not(objective: str, real_data: Path, tmp_path: Path) -> None:
-    network = real_data / "models" / "ssd_mobilenet_v1_coco_300"
-    command = [sys.executable, "-m", "advsearch", "attack", "--object", "mug", "--task", "detection", "--label", "cup"]
-    command += ["--model", f"{network}.pt2", "--labels", f"{network}.labels.json", "--objective", objective]
-    command += ["--trials", "6", "--verify-spp", "16", "--no-baseline", "--run", str(tmp_path / "run"), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
-    assert summary["ending"] == "found" and summary["clean"]["label"] == "cup"
-    assert summary["clean"]["control"]["correct"] == summary["verified"]["successes"] == 6
-    assert set(summary["verified"]["labels"]) <= ELSEWHERE[objective]
-
-
 THINGS = {
     "detection": ("mug", "ssd_mobilenet_v1_coco_300", "cup"),
     "segmentation": ("bottle", "deeplabv3_mnv2_dm05_pascal_257", "bottle"),
@@ -173,17 +154,6 @@ def mean_margin(rows: list[Row], kind: str) -> float:
     """The mean margin of the rows of one sort."""
     margins = [row.margin for row in rows if row.kind == kind and row.margin is not None]
     return sum(margins) / len(margins)
-
-
-@pytest.mark.slow
-def test_a_real_detector_gives_another_name_where_the_object_is(real_data: Path, tmp_path: Path) -> None:
-    summary, rows = short_attack(real_data, tmp_path / "run", "detection", "texture", "--objective", "mislabel")
-    check_outcome(summary, rows)
-    assert summary["ending"] == "found" and set(summary["verified"]["labels"]).isdisjoint({"cup", "no cup found"})
-    for row in rows:
-        names = boxes_in_place(row.payload)
-        assert ("cup" in names) == (row.kind == "control")
-        assert row.kind == "control" or row.label in names
 
 
 @pytest.mark.medium

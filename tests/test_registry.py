@@ -7,23 +7,15 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from advsearch import registry
-from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.attacks.policies import POLICIES
 from advsearch.catalog import BuiltIn
-from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
-from advsearch.models.loading import SOURCES
 from advsearch.registry import Registry
-from advsearch.scene.importing import readers
-from advsearch.scene.importing.objects import import_object
-from advsearch.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -72,12 +64,6 @@ def test_an_entry_that_does_not_fit_is_named_with_its_package(
     assert list(numbers) == ["one", "mod", "two", "three"] and numbers["three"] == 3  # it disturbs no other
     assert [*numbers.list_usable()] == ["one", "mod", "three"]
     assert numbers.get_help("two").endswith("repair or uninstall the package that declares it.")
-
-
-@pytest.mark.parametrize("known", [CONTROLS, POLICIES, OBJECTIVE_KINDS, TASKS, SOURCES], ids=lambda known: known.group)
-def test_every_registry_is_in_the_page_that_says_how_to_add_to_it(known: Registry[Any]) -> None:
-    assert f"| `{known.group}` |" in (DOCS / "extending.md").read_text("utf-8")
-    assert len(known) > 0 and all(known[name] is not None for name in known)
 
 
 # ---- a package from the pages ---------------------------------------------------------------------------------------
@@ -213,21 +199,3 @@ def test_its_control_exporter_and_reader_work(installed: Path, tmp_path: Path) -
     assert json.loads(answer) == ["fade", {"rows": 2}, "2 margins in margins.txt.", 12]
     assert (tmp_path / "margins.txt").read_text() == "0.5\n-1.5\n"
     assert "broken.off: expected faces with points that are there" in refusal
-
-
-def test_a_reader_that_cannot_be_imported_disturbs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is an installed package: a folder of the Python path with a description of its distribution."""
-    package = tmp_path / "site" / "broken_reader-1.0.dist-info"
-    package.mkdir(parents=True)
-    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-reader\nVersion: 1.0\n")
-    (package / "entry_points.txt").write_text("[advsearch.readers]\nlost = module_that_is_not_there:read\n")
-    monkeypatch.syspath_prepend(str(package.parent))
-    monkeypatch.setattr(readers, "READERS", replace(readers.READERS))  # it looks for packages anew
-
-    assert readers.list_suffixes()[-1] == ".lost"
-    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
-    (tmp_path / "solid.obj").write_text(f"{corners}f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    assert len(import_object(tmp_path / "solid.obj").mesh.faces) == 4
-    (tmp_path / "solid.lost").write_text("anything")
-    with pytest.raises(InputError, match=r"entry point lost = module_that_is_not_there:read .*: cannot be imported"):
-        import_object(tmp_path / "solid.lost")

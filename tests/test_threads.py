@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from advsearch import threads
-from advsearch.errors import InputError
 
 SHOW = (
     "import json, os, sys; from advsearch import threads; assert 'torch' not in sys.modules\n"
@@ -63,16 +62,3 @@ def test_a_file_that_asks_for_very_many_threads_gets_a_few_for_each_core() -> No
         assert threads.configure(1024) == threads.MAX_THREADS_PER_CORE * threads.count_cores()
     finally:
         threads.configure()
-
-
-@pytest.mark.parametrize("wrong", [0, -2])
-def test_fewer_than_one_thread_is_an_error(wrong: int) -> None:
-    with pytest.raises(InputError, match=rf"threads: expected a number of at least 1, got {wrong}"):
-        threads.configure(wrong)
-
-
-def test_the_processor_is_named(tmp_path: Path) -> None:
-    info = tmp_path / "cpuinfo"
-    info.write_text("processor : 0\nmodel name : An  Example CPU\n", encoding="utf-8")
-    assert threads.read_processor_name(info) == "An Example CPU"
-    assert threads.read_processor_name(tmp_path / "none")

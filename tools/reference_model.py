@@ -199,12 +199,12 @@ def evaluate(cache: Path, count: int, seed: int) -> None:
     from advsearch.models import reference
 
     folder = reference.get_data_folder()
-    record = json.loads((folder / reference.RECORD).read_text(encoding="utf-8"))
+    record = json.loads((folder / reference.METADATA).read_text(encoding="utf-8"))
     images, truth = pictures(cache, "heldout", count, seed)
     report = calibration.evaluate(reference.load(folder), images, truth)
     record["figures"]["heldout"] = _rounded(asdict(report))
     record["figures"]["default_views"] = _rounded(default_views())
-    (folder / reference.RECORD).write_text(
+    (folder / reference.METADATA).write_text(
         json.dumps(record, indent=1) + "\n", encoding="utf-8"
     )
     print(

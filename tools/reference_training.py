@@ -20,7 +20,13 @@ from torch import Tensor, nn
 
 from advsearch.errors import InputError, ModelError
 from advsearch.files import JsonValue
-from advsearch.models.reference import INPUT_SIZE, RECORD, WEIGHTS, ReferenceNet, build
+from advsearch.models.reference import (
+    INPUT_SIZE,
+    METADATA,
+    WEIGHTS,
+    ReferenceNet,
+    build,
+)
 from advsearch.questions.harden.networks import Augmentation
 
 WARM_UP = 0.05
@@ -283,7 +289,7 @@ def save(
     net.load_state_dict(dict(state))
     folder.mkdir(parents=True, exist_ok=True)
     weights = folder / WEIGHTS
-    record = folder / RECORD
+    record = folder / METADATA
     tensors = {key: value.contiguous() for key, value in net.state_dict().items()}
     weights.write_bytes(safetensors.save(tensors))
     content = {

@@ -57,6 +57,8 @@ class SceneKeywords(TypedDict, total=False):
     camera: str | Path | None
     set: Mapping[str, float | str | Sequence[float]] | None
     things: str | Path | None
+    backdrop: str | Path | None
+    occluder: str | Path | None
     judge: str | Path
     exposure: float
     resolution: int | str | tuple[int, int] | None

@@ -124,6 +124,10 @@ def load_model(
     task: AnyTask | None = None,
     **options: Unpack[ModelKeywords],
 ) -> Model:
+    """Load a model as `advsearch.models.load_model` does, for a task by name.
+
+    The code that `spec` names may run, since whoever calls this wrote it.
+    """
     allow_named({"model": spec})
     return models.load_model(
         spec, task=None if task is None else make_task(task), **options

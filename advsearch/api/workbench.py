@@ -115,7 +115,7 @@ from advsearch.scene import library as library
 from advsearch.scene.assembly import pose_mesh as pose_mesh
 from advsearch.scene.glb import encode_glb as encode_glb
 from advsearch.scene.grounds import is_paved as is_paved
-from advsearch.scene.importing.files import last_line as last_line
+from advsearch.scene.importing.files import get_last_line as get_last_line
 from advsearch.scene.parts import PluginPart as PluginPart
 from advsearch.scene.parts import make_sphere as make_sphere
 from advsearch.scene.renderer import MAX_SPP as MAX_SPP

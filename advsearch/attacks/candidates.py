@@ -1,8 +1,8 @@
 """What a search may end with: the few best configurations, rendered again with seeds it
 has not used, as the largest of many noisy values is mostly a lucky one (the winner's
 curse); many different failures; and the smallest change, a bracket of scales of all
-budgets, whose upper end passed the trials, and at whose lower end a search found
-nothing.
+budgets: at its upper end a configuration passed the trials, at its lower end a search
+found nothing.
 """
 
 from __future__ import annotations
@@ -19,16 +19,21 @@ from advsearch.errors import InputError
 from advsearch.statistics.intervals import CONFIDENCE
 from advsearch.statistics.sequential import find_threshold
 
-# configurations that differ by less than this in every element are one candidate (an
-# 8-bit level is 4e-3)
+# configurations that differ by less than this in every element count as the same
+# candidate (an 8-bit level is 4e-3)
 SAME = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A configuration (d,) worth a second look: the objective (biased upwards) and
-    success of the render that admitted it, the objectives of its renders since then,
-    -inf where not finite, and how many were a success.
+    """A configuration that is worth further renders.
+
+    Attributes:
+        u: (d,) the configuration.
+        objective: of the render that admitted it, biased upwards.
+        success: whether the model was wrong in that render.
+        repeat_objectives: of its renders since then; -inf if one is not finite.
+        successes: in how many of these the model was wrong.
     """
 
     u: Tensor
@@ -40,19 +45,18 @@ class Candidate:
     @property
     def mean_objective(self) -> float:
         """Mean objective of the new renders; the raw one if there are none."""
-        return (
-            math.fsum(self.repeat_objectives) / len(self.repeat_objectives)
-            if self.repeat_objectives
-            else self.objective
-        )
+        if not self.repeat_objectives:
+            return self.objective
+        return math.fsum(self.repeat_objectives) / len(self.repeat_objectives)
 
     @property
     def success_rate(self) -> float:
-        return (
-            self.successes / len(self.repeat_objectives)
-            if self.repeat_objectives
-            else float(self.success)
-        )
+        """Fraction of the new renders that are a success; of the raw one if there are
+        none.
+        """
+        if not self.repeat_objectives:
+            return float(self.success)
+        return self.successes / len(self.repeat_objectives)
 
     def with_repeat(self, objective: float, success: bool) -> Candidate:
         return replace(
@@ -68,9 +72,10 @@ def add_candidate(
     """Return the pool with `new` in it if it belongs to the best `size` distinct ones,
     best first.
 
-    A success beats what is none, then the objective counts; of two that are nearly the
-    same configuration the better stays. One that is in the pool exactly as it is gets
-    another look by it, as unbiased as those of the ranking.
+    A success beats a candidate without one, then the larger objective wins; of two that
+    are nearly the same configuration the better stays. If exactly the same
+    configuration is in the pool, `new` counts as a repeated render of it, as unbiased
+    as those of the ranking.
     """
     for old in pool:
         if torch.equal(old.u, new.u):
@@ -92,8 +97,10 @@ def add_candidate(
 def replace_worst(
     pool: tuple[Candidate, ...], last: Candidate | None, size: int
 ) -> tuple[Candidate, ...]:
-    """Return the pool, of at most `size`, with the last configuration of a search in
-    it, if need be for its worst.
+    """Return the pool with the last configuration of a search at its end.
+
+    If the pool has `size` candidates, the worst is dropped for it. Without a last
+    configuration, or if that is in the pool already, the pool stays as it is.
     """
     if last is None or any(torch.equal(candidate.u, last.u) for candidate in pool):
         return pool
@@ -103,46 +110,52 @@ def replace_worst(
 def select_contenders(
     pool: tuple[Candidate, ...], shared: int
 ) -> tuple[Candidate, ...]:
-    """Return the winner so far and those that are not clearly worse, in their order:
-    the mean of their differences from the winner, seed by seed, in the last `shared`
-    renders, is larger than the standard error of that mean, and their success rate is
-    no higher. (The race of Maron and Moore 1994, with normal intervals of one deviation
-    in place of Hoeffding's: a search needs the better of two, not a proof.)
+    """Return the best candidate so far and those that are not clearly worse, in order.
+
+    The last `shared` renders of all candidates have the same seeds. With fewer than two
+    of these, or of candidates, nobody is clearly worse. (The race of Maron and Moore
+    1994, with normal intervals of one standard deviation in place of Hoeffding's: a
+    search needs the better of two, not a proof.)
     """
     if shared < 2 or len(pool) < 2:
         return pool
     leader = select_best(pool)
-
-    def is_worse(candidate: Candidate) -> bool:
-        differences = [
-            a - b
-            for a, b in zip(
-                leader.repeat_objectives[-shared:],
-                candidate.repeat_objectives[-shared:],
-                strict=True,
-            )
-        ]
-        if not all(map(math.isfinite, differences)):
-            return not math.isfinite(candidate.mean_objective)
-        mean = math.fsum(differences) / shared
-        variance = math.fsum((difference - mean) ** 2 for difference in differences) / (
-            shared - 1
-        )
-        return candidate.success_rate <= leader.success_rate and mean > math.sqrt(
-            variance / shared
-        )
-
     return tuple(
         candidate
         for candidate in pool
-        if candidate is leader or not is_worse(candidate)
+        if candidate is leader or not _is_clearly_worse(candidate, leader, shared)
     )
+
+
+def _is_clearly_worse(candidate: Candidate, leader: Candidate, shared: int) -> bool:
+    """Return whether a candidate has no higher success rate than the leader, and the
+    leader's objective is greater by more than the standard error of the difference.
+
+    Objectives are compared seed by seed in the last `shared` renders. If one of these
+    is not finite, the candidate is worse if its mean is not finite.
+    """
+    differences = [
+        leader_objective - objective
+        for leader_objective, objective in zip(
+            leader.repeat_objectives[-shared:],
+            candidate.repeat_objectives[-shared:],
+            strict=True,
+        )
+    ]
+    if not all(map(math.isfinite, differences)):
+        return not math.isfinite(candidate.mean_objective)
+    mean = math.fsum(differences) / shared
+    squares = math.fsum((difference - mean) ** 2 for difference in differences)
+    variance = squares / (shared - 1)
+    has_higher_rate = candidate.success_rate > leader.success_rate
+    return not has_higher_rate and mean > math.sqrt(variance / shared)
 
 
 def select_best(pool: tuple[Candidate, ...]) -> Candidate:
     """Return the best candidate: by success rate, then by mean objective.
 
-    Only new renders count, if all candidates have some.
+    Only new renders count. If a candidate has none, the first of the pool is the best,
+    as the pool is sorted by the raw renders.
     """
     if all(candidate.repeat_objectives for candidate in pool):
         return max(
@@ -156,20 +169,25 @@ def _sort_key(candidate: Candidate) -> tuple[bool, float]:
     return candidate.success, candidate.objective
 
 
-# with fewer failures than so many, each of equal weight, no estimate is stated
+# with fewer effective failures than this no estimate is stated
 MIN_EFFECTIVE_FAILURES = 10.0
-# sizes of a bet, each half of the one before; the capital is shared equally among them
+# number of sizes of a bet, 1, 1/2, 1/4, ...; the capital is divided equally among them
 N_BETS = 8
 
 
 @dataclass(frozen=True)
 class FailureRate:
-    """The share of configurations, drawn evenly from the budget, in which one render of
-    the search is a success: the mean of the weighted draws (None where `effective` is
-    under `MIN_EFFECTIVE_FAILURES`, or a draw could not be evaluated); an interval that
-    covers the share in 95 % at least, however the draws were adapted, at any number of
-    them; and how many failures of equal weight would be worth as much: (sum w)^2 / sum
-    w^2 (Kish 1965).
+    """The fraction of configurations, uniform in the budget, at which a single render
+    of the search is a failure of the model.
+
+    Attributes:
+        estimate: mean of the weighted samples; None if `effective` is less than
+            `MIN_EFFECTIVE_FAILURES`, or a sample could not be evaluated.
+        interval: covers the rate with a probability of at least 95 %, however the
+            samples were adapted and whenever one stops.
+        effective: number of failures of equal weight that would be worth as much: (sum
+            w)^2 / sum w^2 (Kish 1965).
+        draws: number of samples.
     """
 
     estimate: float | None
@@ -181,12 +199,13 @@ class FailureRate:
 def estimate_failure_rate(
     weights: Tensor, bounds: Tensor, failed: Tensor, unknown: Tensor
 ) -> FailureRate:
-    """Return what draws from changing densities say of the share of failures under the
-    even one.
+    """Estimate the failure rate under the uniform density from samples of adaptive
+    ones.
 
-    Draw t comes from a density q_t that may depend on all draws before it; x_t = w_t
-    [failed], w_t = 1 / q_t relative to the even density, has the share p as its mean
-    given these. Bets on the difference are fair games if the share is p: the capital of
+    Sample t comes from a density q_t that may depend on all samples before it. x_t =
+    w_t [failed], with the weight w_t = 1 / q_t relative to the uniform density, has the
+    rate p as its mean given these. Bets on the difference are fair games if the rate is
+    p: the capital of
 
         prod_t (1 - c + c x_t / p)
         prod_t (1 + c (p - x_t) / (b_t - p)),  b_t the largest weight that q_t gives,
@@ -196,50 +215,50 @@ def estimate_failure_rate(
     2024, "Estimating means of bounded random variables by betting"). Both are monotone
     in p.
 
-    All are (n,), n at least 1: w_t over 0; b_t, at least 1 and w_t, known before draw
-    t; whether it failed; and whether it is unknown, as it could not be evaluated: the
-    interval holds whatever these are.
+    Args:
+        weights: (n,) w_t, over 0; n is at least 1.
+        bounds: (n,) b_t, at least 1 and at least w_t, known before sample t.
+        failed: (n,) bool.
+        unknown: (n,) bool, samples that could not be evaluated. The interval holds
+            whether they failed or not.
     """
     weights = weights.double()
     bounds = bounds.double()
-    low = weights * (failed & ~unknown)
-    high = weights * (failed | unknown)
-    sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
-    limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
+    # x_t if no unknown sample failed, and if all of them did
+    lower_x = weights * (failed & ~unknown)
+    upper_x = weights * (failed | unknown)
+    bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]  # (bets, 1)
+    log_limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
 
-    def against_low(p: float) -> bool:
-        return (
-            float(torch.log(1.0 - sizes + sizes * low / p).sum(dim=1).logsumexp(dim=0))
-            >= limit
-        )
+    def is_too_low(p: float) -> bool:
+        log_factors = torch.log(1.0 - bet_sizes + bet_sizes * lower_x / p)  # (bets, n)
+        return float(log_factors.sum(dim=1).logsumexp(dim=0)) >= log_limit
 
-    def against_high(p: float) -> bool:
-        return (
-            float(
-                torch.log1p(sizes * (p - high) / (bounds - p))
-                .sum(dim=1)
-                .logsumexp(dim=0)
-            )
-            >= limit
-        )
+    def is_too_high(p: float) -> bool:
+        log_factors = torch.log1p(bet_sizes * (p - upper_x) / (bounds - p))
+        return float(log_factors.sum(dim=1).logsumexp(dim=0)) >= log_limit
 
-    total = float(low.sum())
-    effective = total**2 / float(low.square().sum()) if total else 0.0
-    stated = effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any())
-    ends = find_threshold(lambda p: not against_low(p)), find_threshold(against_high)
-    return FailureRate(
-        min(1.0, total / len(low)) if stated else None, ends, effective, len(low)
-    )
+    total = float(lower_x.sum())
+    effective = total**2 / float(lower_x.square().sum()) if total else 0.0
+    estimate = None
+    if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
+        estimate = min(1.0, total / len(lower_x))
+    lower = find_threshold(lambda p: not is_too_low(p))
+    upper = find_threshold(is_too_high)
+    return FailureRate(estimate, (lower, upper), effective, draws=len(lower_x))
 
 
-MOST = 24  # failures that a result lists, at most
+MAX_FAILURES = 24  # maximum number of failures in a result
 
 
 @dataclass(frozen=True, eq=False)
 class FoundFailure:
-    """A configuration (d,) that a search claims to be a success, the objective of its
-    one render, biased upwards, and where the others lie that it stands for: both ends
-    in u, by position.
+    """A failure that a search claims, and the others that it stands for.
+
+    Attributes:
+        u: (d,) the configuration.
+        objective: of its single render, biased upwards.
+        ranges: (low, high) of the failures that it stands for, by index in u.
     """
 
     u: Tensor
@@ -249,10 +268,15 @@ class FoundFailure:
 
 @dataclass(frozen=True, eq=False)
 class Failures:
-    """What a search knows of different failures: at most `MOST` of them; the positions
-    in u of what tells cells apart; how many cells fail, were seen and are there
-    (without cells, draws, and None); and how large a part of all configurations fails,
-    where that can be told.
+    """What a search knows of different failures.
+
+    Attributes:
+        examples: at most `MAX_FAILURES` of them.
+        over: indices in u of the parameters that span the cells.
+        n_failures: number of cells that fail; of samples, if there are no cells.
+        n_visited: number of cells, or samples, that were evaluated.
+        n_cells: number of cells in all; None if there are none.
+        failure_rate: fraction of all configurations that fail, if it can be estimated.
     """
 
     examples: tuple[FoundFailure, ...]
@@ -268,14 +292,14 @@ def select_diverse(
     objectives: Sequence[float],
     is_periodic: Tensor,
     is_discrete: Tensor,
-    limit: int = MOST,
+    limit: int = MAX_FAILURES,
 ) -> list[int]:
     """Return the indices of points that differ most, the worst first.
 
-    After the worst, each is the farthest from all before it; of equally far points the
-    worse goes first. This is the greedy choice of k centers, whose largest distance is
-    at most twice the smallest possible (Gonzalez 1985, "Clustering to minimize the
-    maximum intercluster distance").
+    After the worst, each is the point whose distance from the nearest one before it is
+    largest; of equally far points the worse goes first. This is the greedy choice of k
+    centers, whose largest distance is at most twice the smallest possible (Gonzalez
+    1985, "Clustering to minimize the maximum intercluster distance").
 
     Args:
         points: (n, k), in fractions of each range.
@@ -284,26 +308,22 @@ def select_diverse(
         is_discrete: (k,) bool, discrete choices: different options lie 1 apart.
         limit: maximum number of indices.
     """
+    # the worst first, so that the first of equally far points is the worst
     order = sorted(range(len(points)), key=lambda number: -objectives[number])
     points = points[order].double()
+    # (n,) distance to the nearest selected point; infinite before there is one
     nearest_distance = torch.full((len(points),), torch.inf, dtype=torch.float64)
     selected = list[int]()
     for _ in range(min(limit, len(points))):
         farthest = int(nearest_distance.argmax())
         selected.append(farthest)
-        distance_to_chosen = (points - points[farthest]).abs()
-        distance_to_chosen = torch.where(
-            is_periodic,
-            torch.minimum(distance_to_chosen, 1.0 - distance_to_chosen),
-            distance_to_chosen,
+        difference = (points - points[farthest]).abs()  # (n, k)
+        difference = torch.where(
+            is_periodic, torch.minimum(difference, 1.0 - difference), difference
         )
-        distance_to_chosen = torch.where(
-            is_discrete, (distance_to_chosen > 0.0).double(), distance_to_chosen
-        )
-        nearest_distance = torch.minimum(
-            nearest_distance, distance_to_chosen.norm(dim=1)
-        )
-        nearest_distance[selected] = -1.0
+        difference = torch.where(is_discrete, (difference > 0.0).double(), difference)
+        nearest_distance = torch.minimum(nearest_distance, difference.norm(dim=1))
+        nearest_distance[selected] = -1.0  # never again
     return [order[number] for number in selected]
 
 
@@ -312,41 +332,45 @@ SMALLEST_SCALE = 1e-3  # no smaller scale than this is tried
 
 MAX_SEARCHES = 12
 
-MAX_CONFIRMATIONS = (
-    6  # steps outwards that the confirmation of the upper end takes at most
-)
+MAX_CONFIRMATIONS = 6  # steps outwards of `confirm_bracket`
 
 LENGTH_RATIO = 1.0 + (RATIO - 1.0) / 5.0
-"""A configuration's length is bisected until the ends are within this: a fifth of the
-bracket's ratio.
+"""Ratio of the bounds at which the bisection of a configuration's length ends; it
+exceeds 1 by a fifth of what `RATIO` does.
 """
 
 MAX_CHECKS = 1 + math.ceil(
     math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(LENGTH_RATIO))
 )
-"""Configurations that go through the trials after a search, at most: what it found, and
-those of the bisection.
+"""Maximum number of configurations that go through the trials after a search: its best
+one, and those of the bisection.
 """
 
 Search = Callable[[Domain, int], Tensor]
-"""(domain, round) -> the best configuration a search finds there; round numbers its
-seeds.
+"""(domain, round) -> the best configuration a search finds there; seeds depend on the
+round.
 """
 
 Passes = Callable[[Tensor, int], bool]
-"""(u, check) -> whether a configuration passes the trials; check numbers its seeds."""
+"""(u, check) -> whether a configuration passes the trials; seeds depend on the check.
+"""
 
 Guess = Callable[[Tensor], bool]
-"""u -> whether a configuration would probably pass: a guess that costs next to
-nothing.
-"""
+"""u -> whether a configuration would probably pass, without trials."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bracket:
-    """Where the smallest scale lies: a search found nothing at `low` (0 where none has
-    failed), and `u` (d,) passes at `high`, infinity where nothing did; of the search
-    `found_by`; if `confirm_bracket` it has passed again with new seeds.
+    """The bounds of the smallest scale.
+
+    Attributes:
+        low: largest scale at which a search found nothing; 0 if none has failed.
+        high: smallest scale at which a configuration passed; infinity if none did.
+        u: (d,) the configuration at `high`; None if there is none.
+        searches: number of searches so far.
+        checks: number of configurations that went through the trials so far.
+        found_by: index of the search that found `u`, before it was shortened.
+        confirmed: whether `u` has passed again with new seeds (`confirm_bracket`).
     """
 
     low: float
@@ -364,14 +388,19 @@ class Bracket:
 
 
 def scale_domain(domain: Domain, scale: float) -> Domain:
-    """Return the domain with every budget multiplied by `scale`, in (0, 1]."""
-    names = (
+    """Return the domain with every budget multiplied by `scale`, in (0, 1].
+
+    Raises:
+        InputError: a block has no budget.
+    """
+    names = [
         block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None
-    )
-    if bare := [name or "a block" for name in dict.fromkeys(names)]:
+    ]
+    if names:
+        unbounded = [name or "a block" for name in dict.fromkeys(names)]
         raise InputError(
             "smallest: expected controls with a budget (texture, geometry, patch, "
-            f"...), got {', '.join(bare)}, "
+            f"...), got {', '.join(unbounded)}, "
             "whose parameters have ranges and no epsilon; leave it out"
         )
     blocks = tuple(
@@ -400,15 +429,22 @@ def find_smallest_change(
        its length, to the shortest that passes: a handful of trials, no search.
     3. A search at half the scale reached, then at the geometric mean of the bracket's
        ends; each configuration that passes is shortened as in 2, each that fails raises
-       the lower end; until it is closed, or after `MAX_SEARCHES`.
+       the lower end; until the bracket is closed, or after `MAX_SEARCHES`.
 
     For a linear model and a gradient policy the first search points the right way and 2
     ends within its own step of the optimum, so that the result is within `RATIO` of the
     closed form.
 
-    `likely` says where 2 begins, and from where it goes on in growing steps; None to
-    bisect from the whole length. The bracket is not `closed` if the searches did not
-    suffice.
+    Args:
+        search: finds the best configuration of a domain.
+        passes: runs the trials of a configuration.
+        domain: with the full budgets.
+        likely: guesses where the bisection of 2 begins, which then goes on in growing
+            steps; None to bisect from the full length.
+
+    Returns:
+        The bracket. It is not `is_closed` if the searches did not suffice; if nothing
+        passed in the full budget, its `low` is 1 and its `u` None.
     """
     u = search(domain, 0)
     state = Bracket(0.0, math.inf, None, 1, 1)
@@ -420,9 +456,11 @@ def find_smallest_change(
         and state.high > RATIO * state.low
         and state.high > SMALLEST_SCALE
     ):
-        scale = (
-            state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
-        )
+        if state.low == 0.0:
+            scale = state.high / 2.0
+        else:
+            scale = math.sqrt(state.low * state.high)
+        # Near the end, take the scale that closes the bracket if nothing is found.
         if state.high <= RATIO**2 * state.low:
             scale = max(scale, state.high / RATIO)
         u = search(scale_domain(domain, scale), state.searches)
@@ -430,21 +468,23 @@ def find_smallest_change(
         if has_passed:
             state = replace(state, found_by=state.searches)
         state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
-        state = (
-            _shorten(state, u, scale, passes, domain, likely)
-            if has_passed
-            else replace(state, low=scale)
-        )
+        if has_passed:
+            state = _shorten(state, u, scale, passes, domain, likely)
+        else:
+            state = replace(state, low=scale)
     return state
 
 
 def confirm_bracket(
     bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2
 ) -> Bracket:
-    """Return the bracket with its upper end moved out until the configuration there
-    passes so many times in a row: what lies exactly on the edge passes its trials by
-    chance. So it is tried again with new seeds; where it fails, the change grows by a
-    fortieth, in `MAX_CONFIRMATIONS`, the last of which is returned untried.
+    """Return the bracket with its upper end moved outwards until the configuration
+    there passes `times` times in a row with new seeds.
+
+    What lies exactly on the edge passes its trials by chance. If it fails, its change
+    is lengthened by the square root of `RATIO`, about 2.5 %, and it is tried again. The
+    scale never exceeds 1. After `MAX_CONFIRMATIONS` the bracket is returned unconfirmed, with a
+    configuration that was lengthened once more and not tried.
     """
     if bracket.u is None:
         return bracket
@@ -473,9 +513,18 @@ def _shorten(
 ) -> Bracket:
     """Bisect the length of a configuration that passes.
 
-    It ends when the bounds are within `LENGTH_RATIO` of each other. With `likely`, the
-    first length tried is the shortest that it takes for passing; steps from there grow,
-    but never beyond the middle of the bounds.
+    Lengths are scales of the budgets, bisected in their logarithm until the bounds are
+    within `LENGTH_RATIO` of each other. With `likely`, the first length that is tried
+    is about the shortest that it expects to pass; from there the steps grow, squared
+    each time, but never beyond the middle of the bounds.
+
+    Args:
+        state: the bracket, whose lower end is the lower bound.
+        u: (d,) the configuration that passes.
+        length: its scale.
+        passes: runs the trials of a configuration.
+        domain: with the full budgets.
+        likely: guesses whether a configuration passes, or None.
     """
     low = max(state.low, SMALLEST_SCALE * length)
     high = length
@@ -483,32 +532,38 @@ def _shorten(
     checks = state.checks
 
     def shrink_to(scale: float) -> Tensor:
-        """Return the configuration at a scale of the budgets."""
         return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
-    middle = math.sqrt(high * low)
-    stride = math.inf
+    trial_length = math.sqrt(high * low)
+    max_step = math.inf  # the largest factor from a bound to the next length
     if likely is not None:
-        guess_low = low
-        guess_high = high
-        stride = LENGTH_RATIO
-        while guess_high > LENGTH_RATIO * guess_low:
-            middle = math.sqrt(guess_high * guess_low)
-            guess_low, guess_high = (
-                (guess_low, middle)
-                if likely(shrink_to(middle))
-                else (middle, guess_high)
-            )
-        middle = math.sqrt(guess_high * guess_low)
+        max_step = LENGTH_RATIO
+        trial_length = _guess_shortest(likely, shrink_to, low, high)
     while high > LENGTH_RATIO * low:
-        shorter_u = shrink_to(middle)
+        shorter_u = shrink_to(trial_length)
         if passes(shorter_u, checks):
             shortest_u = shorter_u
-            high = middle
-            middle = max(math.sqrt(high * low), high / stride)
+            high = trial_length
+            trial_length = max(math.sqrt(high * low), high / max_step)
         else:
-            low = middle
-            middle = min(math.sqrt(high * low), low * stride)
-        stride = stride * stride
+            low = trial_length
+            trial_length = min(math.sqrt(high * low), low * max_step)
+        max_step = max_step * max_step
         checks = checks + 1
     return replace(state, high=high, u=shortest_u, checks=checks)
+
+
+def _guess_shortest(
+    likely: Guess, shrink_to: Callable[[float], Tensor], low: float, high: float
+) -> float:
+    """Return about the shortest length between two bounds that is likely to pass.
+
+    `shrink_to` returns the configuration of a length.
+    """
+    while high > LENGTH_RATIO * low:
+        middle = math.sqrt(high * low)
+        if likely(shrink_to(middle)):
+            high = middle
+        else:
+            low = middle
+    return math.sqrt(high * low)

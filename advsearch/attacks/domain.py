@@ -23,14 +23,17 @@ NORMS: tuple[str, ...] = get_args(Norm)
 
 TOLERANCE = 2e-6
 """How far outside its budget float32 rounding may put a configuration, absolute in u
-and relative to the radius; beside `Block.rounding`, which adds up in an l2 norm.
+and relative to the radius; besides `Block.compute_rounding`, which adds up in an l2
+norm.
 """
 
 
 @dataclass(frozen=True)
 class Block:
-    """One contiguous slice of u and how far it may go. InputError: a value is outside
-    what is said here.
+    """One contiguous slice of u and how far it may go.
+
+    Raises:
+        InputError: a value is outside the limits below.
     """
 
     size: int  # number of elements, at least 1
@@ -50,11 +53,11 @@ class Block:
     """
     name: str = ""  # of its parameter, e.g. "pose.yaw"
     options: int = 0
-    """Over 0 for a discrete choice among so many: u means option floor(u * options).
-    Such a block has size 1, norm "box" and the whole unit interval; it has no direction
-    that is uphill.
+    """Number of options of a discrete choice; 0 for numbers. u means option
+    floor(u * options). A choice has size 1, norm "box" and the bounds [0, 1]; it has no
+    uphill direction.
     """
-    # length of one whole step in a "box", over 0; None for half the diagonal of the
+    # length of one unit step in a "box", over 0; None for half the diagonal of the
     # bounds
     reach: float | None = None
 
@@ -106,21 +109,24 @@ class Block:
 
     @property
     def radius(self) -> float:
-        """The length of one whole step, in the block's own norm: epsilon, or the reach
-        in a box; never more than the bounds let the start move.
+        """The length of one unit step, in the block's own norm (Euclidean in a box).
+
+        In a ball it is epsilon, at most the diameter of the bounds in that norm. In a
+        box it is the reach, by default half the diagonal.
         """
         width = self.high - self.low
+        diagonal = width * math.sqrt(self.size)
         if self.norm == "box":
-            return (
-                0.5 * width * math.sqrt(self.size) if self.reach is None else self.reach
-            )
-        reach = width if self.norm == "linf" else width * math.sqrt(self.size)
-        return min(float(self.epsilon or 0.0), reach)
+            return 0.5 * diagonal if self.reach is None else self.reach
+        diameter = width if self.norm == "linf" else diagonal
+        return min(float(self.epsilon or 0.0), diameter)
 
     @property
     def compute_rounding(self) -> float:
-        """What rounding all elements of u to float32 may add to the l2 norm: half of
-        the last bit of 1 for each, all the same way where a texture has one colour.
+        """What rounding all elements of u to float32 may add to the l2 norm.
+
+        It is half of the last bit of 1 for each element: they may all be rounded the
+        same way, as in a texture of one colour.
         """
         return 0.5 * torch.finfo(torch.float32).eps * math.sqrt(self.size)
 
@@ -131,15 +137,15 @@ class Domain:
 
     Raises:
         InputError: sizes do not add up, a cost is under 0, the start is not finite or
-            outside the bounds, or `first` lies outside.
+            outside the bounds, or `restart_point` lies outside.
     """
 
-    # (d,) float32, the clean configuration, inside every block's bounds; a copy is kept
+    # (d,) float32, the clean configuration, inside every block's bounds; it is copied
     start: Tensor
     blocks: tuple[Block, ...]  # consecutive slices of u that add up to d
     gradient_cost: int = 0
-    """Pictures that one whole gradient costs on top of the one it belongs to: 0 for an
-    adjoint, two for each number with central differences.
+    """Renders that one full gradient costs besides that of the configuration itself: 0
+    for an adjoint, two for each number with central differences.
     """
     # whether `evaluate` understands "free", the part of a gradient that costs nothing
     partial_gradients: bool = False
@@ -147,12 +153,12 @@ class Domain:
     """Whether evaluations are free of noise: equal configurations have equal objectives
     and gradients, as where a matrix predicts the pictures (docs/transport.md).
     """
-    # whether they are but for the conditions that each draws anew from a bank
-    # (docs/transport.md)
+    # whether evaluations are free of noise, but each draws its conditions anew from a
+    # bank (docs/transport.md)
     draws_conditions: bool = False
-    first: Tensor | None = None
-    """(d,) where a policy should begin, if not at the start; it moves no ball. For
-    those that begin several times.
+    restart_point: Tensor | None = None
+    """(d,) where a policy should begin, if not at the start; norm balls stay around the
+    start. For policies that begin several times.
     """
     lower: Tensor = field(init=False, repr=False)
     upper: Tensor = field(init=False, repr=False)
@@ -196,15 +202,15 @@ class Domain:
             if block.norm == "linf" and block.epsilon is not None:
                 lower[part].clamp_(min=start[part] - block.epsilon)
                 upper[part].clamp_(max=start[part] + block.epsilon)
-        if self.first is not None and not self.contains(self.first):
+        if self.restart_point is not None and not self.contains(self.restart_point):
             raise InputError(
-                "first: expected a configuration of the domain; project it"
+                "restart_point: expected a configuration of the domain; project it"
             )
 
     @property
-    def begin(self) -> Tensor:
-        """(d,) where a policy should begin: `first`, or else the start."""
-        return self.start if self.first is None else self.first
+    def initial_point(self) -> Tensor:
+        """(d,) where a policy should begin: `restart_point`, or else the start."""
+        return self.start if self.restart_point is None else self.restart_point
 
     @property
     def dim(self) -> int:
@@ -216,19 +222,17 @@ class Domain:
         """The name of each element of u: "pose.yaw"; "camera.target.0" of several
         numbers.
         """
-        numbered = [
-            (block, number) for block in self.blocks for number in range(block.size)
-        ]
-        return [
-            block.name + (f".{number}" if block.size > 1 else "")
-            for block, number in numbered
-        ]
+        names = []
+        for block in self.blocks:
+            if block.size == 1:
+                names.append(block.name)
+            else:
+                names += [f"{block.name}.{number}" for number in range(block.size)]
+        return names
 
     @property
     def options(self) -> Tensor:
-        """(d,) how many options each element of u has that is a discrete choice; 0 of a
-        number.
-        """
+        """(d,) int64, number of options of each element of u; 0 if it is a number."""
         sizes = torch.tensor([block.size for block in self.blocks], dtype=torch.long)
         return torch.tensor(
             [block.options for block in self.blocks], dtype=torch.long
@@ -242,10 +246,12 @@ class Domain:
 
     def list_block_slices(self) -> list[tuple[Block, slice]]:
         """Return every block with its slice of u."""
-        ends = [0, *accumulate(block.size for block in self.blocks)]
+        boundaries = [0, *accumulate(block.size for block in self.blocks)]
         return [
-            (block, slice(*bounds))
-            for block, bounds in zip(self.blocks, pairwise(ends), strict=True)
+            (block, slice(begin, end))
+            for block, (begin, end) in zip(
+                self.blocks, pairwise(boundaries), strict=True
+            )
         ]
 
     def project(self, u: Tensor) -> Tensor:
@@ -267,6 +273,7 @@ class Domain:
                 wrapped = block.low + torch.remainder(
                     u[part] - block.low, block.high - block.low
                 )
+                # rounding of the sum may leave the bounds
                 wrapped.clamp_(block.low, block.high)
                 projected[part] = torch.where(
                     u[part] == projected[part], projected[part], wrapped
@@ -277,23 +284,17 @@ class Domain:
         """Return how far u lies outside: 0 inside, infinity where u has NaN or infinite
         elements.
 
-        The largest of the distances past a bound, and of the excess of an l2 norm over
-        its radius and what rounding may add (divided by the radius where that is over
-        1).
+        It is the largest of the distances past a bound and of the excesses of l2 norms.
+        An excess is what a norm has beyond its radius and what rounding may add; it is
+        divided by the radius if that is over 1.
         """
         excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
         for block, part in self.list_block_slices():
             if block.norm == "l2" and block.epsilon is not None:
-                norm = math.sqrt(
-                    float(
-                        (u[part] - self.start[part]).square_().sum(dtype=torch.float64)
-                    )
-                )
-                excess = max(
-                    excess,
-                    (norm - block.epsilon - block.compute_rounding)
-                    / max(1.0, block.epsilon),
-                )
+                squares = (u[part] - self.start[part]).square_()
+                norm = math.sqrt(float(squares.sum(dtype=torch.float64)))
+                norm_excess = norm - block.epsilon - block.compute_rounding
+                excess = max(excess, norm_excess / max(1.0, block.epsilon))
         return math.inf if math.isnan(excess) else max(0.0, excess)
 
     def contains(self, u: Tensor, tolerance: float = TOLERANCE) -> bool:
@@ -326,7 +327,9 @@ class Domain:
                     noise.round_()
                 if block.norm != "l2" or block.epsilon is None:
                     u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
-                elif extreme:  # far beyond the ball, in a direction of random signs
+                elif extreme:
+                    # far beyond the ball in a direction of random signs; the projection
+                    # below brings it to the surface
                     far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
                     u[part] = self.start[part] + (noise * 2.0 - 1.0) * far_distance
                 else:  # uniform in the ball (Muller 1959)
@@ -340,9 +343,10 @@ class Domain:
         return torch.stack(samples)
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
-        """Return one whole step (d,) from u uphill: the displacement that a linear
-        objective likes most, in each block's norm, from the gradient (d,), finite. Add
-        a multiple of it to u and project. All are float32.
+        """Return one unit step (d,) from u uphill, by the gradient (d,), finite.
+
+        It is the displacement of the block's radius in the block's norm that increases
+        a linear objective most. Add a multiple of it to u and project. All are float32.
 
         - "linf": radius * sign(gradient);
         - "l2": radius * gradient / ||gradient||;
@@ -362,19 +366,19 @@ class Domain:
                 step[part] *= block.radius
                 continue
             if block.norm == "box" and not block.periodic:
-                out = ((u[part] >= block.high) & (slope > 0)) | (
-                    (u[part] <= block.low) & (slope < 0)
-                )
-                slope = slope.masked_fill(out, 0.0)
+                points_out_above = (u[part] >= block.high) & (slope > 0)
+                points_out_below = (u[part] <= block.low) & (slope < 0)
+                slope = slope.masked_fill(points_out_above | points_out_below, 0.0)
+            # Divided by the largest element first, so that its square is no overflow;
+            # then the norm is at least 1, unless the slope is zero.
             slope = slope / slope.abs().amax().clamp_min(torch.finfo(slope.dtype).tiny)
-            step[part] = slope * (
-                block.radius / max(float(torch.linalg.vector_norm(slope)), 1.0)
-            )
+            norm = max(float(torch.linalg.vector_norm(slope)), 1.0)
+            step[part] = slope * (block.radius / norm)
         return step
 
 
 def option_center(u: Tensor, options: Tensor | int) -> Tensor:
-    """Return the middle of the option's share of [0, 1] in which u lies."""
+    """Return the center of the option that u lies in; option i of n is [i/n, (i+1)/n)."""
     return (torch.floor(u * options).clamp_(max=options - 1) + 0.5) / options
 
 
@@ -393,9 +397,9 @@ def project_l2_box(
 ) -> Tensor:
     """Project onto the intersection of an l2 ball and a box.
 
-    The result is the one nearest point, argmin_p ||p - u|| subject to ||p - centre|| <=
-    radius and low <= p <= high. Clipping and then rescaling is not that point, and for
-    a box that cuts deep it is far from it.
+    The result is the nearest point, argmin_p ||p - u|| subject to ||p - centre|| <=
+    radius and low <= p <= high. Clipping and then rescaling does not give that point,
+    and for a box that cuts deep it is far from it.
 
     The optimality conditions give p(t) = clip(centre + t (u - centre), low, high) with
     one multiplier t in (0, 1], t = 1 if p(1) lies in the ball. Otherwise t solves
@@ -414,6 +418,7 @@ def project_l2_box(
     over 0. The point is rounded towards the centre, so that rounding leaves no ball.
     Points inside come back bit for bit; projecting again changes at most the last bits.
     """
+    # v_i^2 and room_i^2 in chunks, and their sums
     squares = []
     rooms = []
     squared_distance = 0.0
@@ -427,7 +432,9 @@ def project_l2_box(
         squared_distance_in_box += float(rooms[-1].sum(dtype=torch.float64))
     if squared_distance_in_box <= (radius * (1.0 + ROUNDING_SLACK)) ** 2:
         return u.clamp(low, high)
-    s = _solve_multiplier(squares, rooms, radius, radius**2 / squared_distance)
+    # Without the box this would be the solution; with it, g is smaller there.
+    initial_s = radius**2 / squared_distance
+    s = _solve_multiplier(squares, rooms, radius, initial_s)
     return _move_towards(center, u, math.sqrt(s), low, high)
 
 
@@ -436,7 +443,11 @@ def _solve_multiplier(
 ) -> float:
     """Return s with g(s) = radius^2 by Newton's method, see `project_l2_box`.
 
-    `squares` and `rooms` are v_i^2 and room_i^2 in chunks; `s` is where it begins.
+    Args:
+        squares: v_i^2 in chunks.
+        rooms: room_i^2 in chunks.
+        radius: of the ball.
+        s: where Newton's method begins, not above the solution.
     """
     for _ in range(_MAX_ITERATIONS):
         value = 0.0
@@ -455,7 +466,11 @@ def _solve_multiplier(
 def _move_towards(
     center: Tensor, u: Tensor, t: float, low: float, high: float
 ) -> Tensor:
-    """Return clip(center + t (u - center), low, high), rounded towards the center."""
+    """Return clip(center + t (u - center), low, high), rounded towards the center.
+
+    An element that float32 rounded away from the center is moved back by one unit in
+    the last place, so that no norm exceeds the radius.
+    """
     moved = torch.empty_like(u)
     for out, u_chunk, center_chunk in zip(
         torch.split(moved, CHUNK),
@@ -472,8 +487,11 @@ def _move_towards(
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """A normal distribution with independent elements, projected onto the domain: the
-    mean (d,) float32, inside it, and the deviation (d,) float32, at least 0.
+    """A normal distribution with independent elements, projected onto the domain.
+
+    Attributes:
+        mean: (d,) float32, inside the domain.
+        deviation: (d,) float32, standard deviation of each element, at least 0.
     """
 
     mean: Tensor
@@ -490,8 +508,8 @@ class Distribution:
 
 
 def compute_half_widths(domain: Domain) -> Tensor:
-    """Return (d,) float32, over 0: how far each element may go while all others go as
-    far.
+    """Return (d,) float32, over 0: how far each element may go if all others of its
+    block go equally far.
 
     - "box": half of the bounds' distance, or the block's reach over the square root of
     its size if that is given;
@@ -509,9 +527,7 @@ def compute_half_widths(domain: Domain) -> Tensor:
 
 
 def find_periodic(domain: Domain) -> Tensor:
-    """Return (d,) bool: the elements that may leave their bounds, because there they
-    come round again.
-    """
+    """Return (d,) bool: whether an element is periodic, so that u wraps at its bounds."""
     sizes = torch.tensor([block.size for block in domain.blocks], dtype=torch.long)
     return torch.tensor(
         [block.periodic for block in domain.blocks], dtype=torch.bool
@@ -522,11 +538,11 @@ def find_periodic(domain: Domain) -> Tensor:
 # Points that can be reached in any order by their number: draws from the unit cube, and
 # products of axes.
 #
-# Draw number n is the same point whoever asks for it when:
+# Draw number n is the same point in whatever order draws are requested:
 #
 # - "sobol": scrambled Sobol points (Owen 1998; Joe and Kuo 2008) in nets of 65,536,
-# each scrambled by a seed of its
-#   own, so that no draw is far from the beginning of its net;
+#   each scrambled by a seed of its own, so that no draw is far from the beginning of
+#   its net;
 # - "random": independent uniform points, in blocks with a seed of their own.
 #
 # A product is never built. Its last axis runs fastest, as the digits of a number do:
@@ -547,13 +563,33 @@ Float64Array = NDArray[np.float64]
 
 
 class SampleSequence:
-    """Points of [0, 1)^dimensions by number, by a sampler of `SAMPLERS`; their streams
-    are called `name`.
+    """Points of [0, 1)^dimensions by number.
+
+    The latest block of points is cached, and so is the engine of its Sobol net.
+
+    Attributes:
+        dimensions: numbers of a point.
+        _rows: points of a block, a power of two.
+        _block: (rows, dimensions) the latest block.
+        _block_index: its index; -1 before the first.
+        _engine: generator of the Sobol net with the index `_net`.
+        _n_sampled: points that it has generated so far.
     """
 
     def __init__(
         self, dimensions: int, sampler: str, seed: int, name: str = "draws"
     ) -> None:
+        """Prepare a sequence of points, of which none is computed yet.
+
+        Args:
+            dimensions: numbers of a point; may be 0.
+            sampler: one of `SAMPLERS`.
+            seed: of the points.
+            name: of the stream of random numbers; other names have other points.
+
+        Raises:
+            InputError: an unknown sampler, or too many dimensions for it.
+        """
         if sampler not in SAMPLERS:
             raise InputError(
                 f"sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}"
@@ -588,20 +624,23 @@ class SampleSequence:
             block_index, first_row = divmod(first, self._rows)
             n_rows = min(self._rows - first_row, end - first)
             if block_index != self._block_index:
-                rng = np.random.default_rng(stream(self._seed, self._name, block_index))
-                shape = (self._rows, self.dimensions)
-                self._block = (
-                    self._sample_sobol(block_index)
-                    if self._sampler == "sobol"
-                    else rng.random(shape)
-                )
+                if self._sampler == "sobol":
+                    self._block = self._sample_sobol(block_index)
+                else:
+                    seed = stream(self._seed, self._name, block_index)
+                    rng = np.random.default_rng(seed)
+                    self._block = rng.random((self._rows, self.dimensions))
                 self._block_index = block_index
             blocks.append(self._block[first_row : first_row + n_rows])
             first += n_rows
         return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
 
     def _sample_sobol(self, block_index: int) -> Float64Array:
-        """Return a block of points of a scrambled Sobol net, (rows, dimensions)."""
+        """Return a block of points of a scrambled Sobol net, (rows, dimensions).
+
+        The engine goes on from the block before if that is of the same net; otherwise
+        it begins again and skips the points before this block.
+        """
         # takes a quarter of a second, and few runs draw from nets
         from scipy.stats import qmc
 
@@ -624,6 +663,8 @@ class SampleSequence:
 class SeedSequence:
     """Seeds of one stream by number, many at once: much faster than
     `advsearch.seeds.stream` for every one.
+
+    The latest block of `SEEDS` seeds is cached.
     """
 
     def __init__(self, root: int, name: str) -> None:
@@ -646,8 +687,12 @@ class SeedSequence:
 
 @dataclass(frozen=True)
 class ProductIndex:
-    """The product of axes with so many values each, at least 1; the last runs fastest.
-    No axis at all has one point.
+    """The product of axes: numbers its points from 0, the last axis running fastest.
+
+    Attributes:
+        sizes: number of values of each axis, at least 1. Without an axis there is one
+            point.
+        count: number of points.
     """
 
     sizes: tuple[int, ...]
@@ -661,7 +706,7 @@ class ProductIndex:
         object.__setattr__(self, "count", math.prod(self.sizes))
 
     def digits(self, index: int) -> tuple[int, ...]:
-        """Return the place of a point on every axis."""
+        """Return the index of a point on every axis."""
         if not 0 <= index < self.count:
             raise IndexError(
                 f"expected a point from 0 to {self.count - 1}, got {index}"
@@ -673,6 +718,7 @@ class ProductIndex:
         return tuple(reversed(digits))
 
     def index(self, digits: Sequence[int]) -> int:
+        """Return the number of the point with these indices on the axes."""
         number = 0
         for size, digit in zip(self.sizes, digits, strict=True):
             number = number * size + digit
@@ -680,9 +726,10 @@ class ProductIndex:
 
 
 def split_into_batches(first: int, count: int, size: int) -> Iterator[range]:
-    """Yield the numbers from `first` to `count` in batches that begin at multiples of
-    `size`, so that they are those of somebody who started at 0; the first may be the
-    rest of one.
+    """Yield the numbers from `first` up to `count`, exclusive, in batches of `size`.
+
+    Batches begin at multiples of `size`, as if the first number were 0; so the first
+    batch may be the rest of one, and the last may be shorter.
     """
     while first < count:
         last = min(count, (first // size + 1) * size)

@@ -1,5 +1,5 @@
-"""What passes between a scene, a search and a trial: one question, its evaluation, and
-the contract of a policy: three functions over a state that is passed and never kept, so
+"""What passes between a scene, a search and a trial: a query, its evaluation, and the
+contract of a policy: three functions over a state that is passed and never stored, so
 that it can be shared, wrapped, replayed and resumed.
 """
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from advsearch.attacks.candidates import Failures
 
 WhichGradient = bool | Literal["free"]
-"""Which derivative is wanted: none, all of it, or only what costs no extra render, with
-zeros elsewhere.
+"""Which derivative is requested: none (False), all of it (True), or "free": only the
+elements that cost no extra render, with zeros elsewhere.
 """
 
 Phase = Literal["search", "ranking"]
 
 MAX_QUERIES = 1024
 MAX_COORDINATES = 2**21
-"""Queries that are asked at once, and the numbers that their configurations have
-together, at most.
+"""Largest number of queries in a batch, and of the elements of all their
+configurations together.
 """
 
 
@@ -208,19 +208,19 @@ class Proposal:
     samples: int = 1
 
     def max_cost(self, domain: Domain) -> int:
-        """Return the renders that this takes at most."""
-        return self.samples * (
-            1 + (domain.gradient_cost if self.gradient is True else 0)
-        )
+        """Return the renders that this takes at most; a "free" gradient takes none."""
+        gradient_cost = domain.gradient_cost if self.gradient is True else 0
+        return self.samples * (1 + gradient_cost)
 
     def limit_cost(self, domain: Domain, renders_left: int) -> Proposal:
-        """Return the proposal as far as `renders_left` renders, at least 1, allow: no
-        more samples than these, and no gradient after which no render would be left to
+        """Return the proposal as far as `renders_left` renders, at least 1, allow it.
+
+        It has no more samples than these, and no gradient that would leave no render to
         use it.
         """
-        proposal = (
-            replace(self, samples=renders_left) if self.samples > renders_left else self
-        )
+        proposal = self
+        if self.samples > renders_left:
+            proposal = replace(self, samples=renders_left)
         if proposal.gradient and proposal.max_cost(domain) >= renders_left:
             return replace(proposal, gradient=False)
         return proposal
@@ -228,9 +228,13 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Counts:
-    """What a policy had to do about evaluations, for the summary of a run: gradients of
-    which single numbers were outliers and cut (`pgd.clip_gradient`), those shortened as
-    a whole, and steps that were taken back (`rejected`).
+    """What a policy had to do about evaluations, for the summary of a run.
+
+    Attributes:
+        cut: gradients of which single elements were outliers and were clipped
+            (`pgd.clip_gradient`).
+        shortened: gradients that were too long and were scaled down.
+        rejected: steps that were taken back.
     """
 
     cut: int = 0
@@ -249,8 +253,7 @@ NO_COUNTS = Counts()
 
 
 Evaluated = Sequence[tuple[Tensor, Evaluation]]
-"""Configurations with what a render of each said, in the order in which they were
-proposed.
+"""Configurations (d,) with their evaluations, in the order in which they were proposed.
 """
 
 
@@ -289,7 +292,7 @@ class Policy(ABC, Generic[State]):
         """Return the state before the first proposal.
 
         Args:
-            domain: where to search; begin at `domain.begin`.
+            domain: where to search; begin at `domain.initial_point`.
             generator: the search's source of randomness, to draw a seed from; use
                 `seeded` for numbers later on.
             steps: how many renders there will be at most, those of gradients included:

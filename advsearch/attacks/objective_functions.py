@@ -27,8 +27,8 @@ from advsearch.errors import InputError
 from advsearch.tasks.classification import (
     Labels,
     compute_largest_logit,
-    compute_target_lead,
-    compute_wrong_lead,
+    compute_misclassification_margin,
+    compute_target_margin,
     make_class_mask,
 )
 
@@ -52,14 +52,14 @@ def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     unbounded, and with a gradient of one at every confidence (Carlini and Wagner 2017,
     f_6 without its hinge). Ties share the gradient.
     """
-    return compute_wrong_lead(logits, labels)
+    return compute_misclassification_margin(logits, labels)
 
 
 def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where
     the prediction is in T.
     """
-    return compute_target_lead(logits, target)
+    return compute_target_margin(logits, target)
 
 
 def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
@@ -151,6 +151,7 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 
 
 def _compute_log_odds(logits: Tensor, group: Tensor) -> Tensor:
+    """Return the log-odds (N,) of a prediction in a group of classes (C,) bool."""
     group_logit = logits.masked_fill(~group, -math.inf).logsumexp(dim=1)
     return group_logit - logits.masked_fill(group, -math.inf).logsumexp(dim=1)
 
@@ -165,10 +166,19 @@ def _softplus(x: Tensor) -> Tensor:
 
 
 def _sort_logits(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor]:
-    """Return the 4 largest logits (3, if there are no more), (N, 3 or 4), in falling
-    order, the classes of a group taken for a single one with their largest, and the
-    distance (N,) from the largest to the smallest of all. Refuses a label set that
-    leaves fewer than two other classes.
+    """Return the largest logits, if the classes of a group count as a single one.
+
+    Args:
+        logits: (N, C).
+        group: (C,) bool; the logit of the group is the largest of its classes.
+        setting: the group's, for messages.
+
+    Returns:
+        The 4 largest logits in descending order, (N, 4), or (N, 3) if there are only 3;
+        and the distance (N,) from the largest to the smallest of all.
+
+    Raises:
+        InputError: there are fewer than two other classes.
     """
     size = int(group.sum())
     others = int((~group).sum())
@@ -235,14 +245,16 @@ def feature_distance(
 
     Args:
         features: differentiable; called once here, and once more per evaluation.
-            InputError: not (N, F), or not finite.
-        clean: (H, W, 3) or (N, H, W, 3): the clean picture, or several renders of it,
+        clean: (H, W, 3) or (N, H, W, 3): the clean image, or several renders of it,
             whose features are averaged. Take as little noise as you can afford: noise
             of the search's own renders is a distance as well.
 
     Returns:
         An objective (logits, images, labels) -> (N,), at least 0 but for h, that looks
         at the images only.
+
+    Raises:
+        InputError: features are not (N, F), or not finite.
     """
     reference = _compute_reference(features, clean)
     length = torch.linalg.vector_norm(reference)
@@ -282,9 +294,9 @@ def cosine_distance(
 
     def objective(output: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
         displacement = functional.normalize(output, dim=1) - reference.to(output)
-        distance: Tensor = displacement.square().sum(
-            dim=1
-        ) / 2.0 + displacement @ start_direction.to(output)
+        squared_length = displacement.square().sum(dim=1)
+        along_start = displacement @ start_direction.to(output)
+        distance: Tensor = squared_length / 2.0 + along_start
         return distance
 
     return objective

@@ -1,5 +1,5 @@
-"""What a search maximises; what counts as success is another thing (`advsearch.tasks`,
-docs/objectives.md).
+"""What a search maximises; what counts as success is defined by the task
+(`advsearch.tasks`, docs/objectives.md).
 
 An objective is a callable `(output, images, truth) -> values`, the larger the nearer to
 what the search is after:
@@ -153,13 +153,17 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
 
 
 def wrap_objective(function: Callable[..., Tensor]) -> Objective:
-    """Wrap a user's function: a scalar becomes (1,), and a wrong type, shape or a lost
-    gradient is an InputError.
+    """Wrap a user's function as an objective whose mistakes are explained.
 
-    The function returns (N,), or a scalar, for which it is called with one picture at a
-    time. A label set of one class comes as (N,) int64, as torch's losses take it. It
-    gets copies, which it may write into. What it raises itself passes through. NaN
-    values pass too: a search has a rule for them.
+    The function returns (N,), or a scalar; if it returns a scalar for several images,
+    it is called with one image at a time. A label set of a single class is passed as
+    (N,) int64, as torch's losses take it. All arguments are copies, which it may write
+    into. What it raises itself passes through, but for torch losses that are passed
+    several labels. NaN values pass too: a search has a rule for them.
+
+    Raises:
+        InputError: (when the objective is called) a wrong type or shape, or a lost
+            gradient.
     """
     name = get_name(function)
     signature = read_signature(function)
@@ -384,6 +388,10 @@ class ObjectiveKind:
 
 
 def _ignore_inputs(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
+    """Return a function without further inputs as an objective, which may be passed
+    some.
+    """
+
     def plain(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
@@ -562,12 +570,13 @@ def get_objective(
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
     kind = _find_kind(objective)
-    by_task = False
-    ours = kind is not None and _BUILT_IN_KINDS.get(kind.name) is kind
+    takes_logits_of_task = False
+    is_built_in = kind is not None and _BUILT_IN_KINDS.get(kind.name) is kind
     if kind is None:
         function = wrap_objective(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
-        return kind.of_task(task) if ours else _pass_copies(kind.of_task(task))
+        # It knows target and direction itself.
+        return kind.of_task(task) if is_built_in else _pass_copies(kind.of_task(task))
     elif kind.of_features is not None:
         if features is None or clean is None:
             raise InputError(
@@ -577,53 +586,59 @@ def get_objective(
                 "features=advsearch.models.features.features_of(model), clean=picture)"
             )
         function = _ignore_inputs(kind.of_features(features, clean))
-        function = function if ours else _pass_copies(function)
+        if not is_built_in:
+            function = _pass_copies(function)
     else:
         form = kind.form(targeted=targeted)
-        function = _ignore_inputs(form) if ours else wrap_objective(form)
+        function = _ignore_inputs(form) if is_built_in else wrap_objective(form)
         compares_features = isinstance(task, Classification) and not task.reads_logits
-        by_task = compares_features or (
+        takes_logits_of_task = compares_features or (
             isinstance(task, ClassTask) and bool(task.nothing_classes)
         )
-    looks = kind is None and targeted
+    # The direction of a user's function is checked once, at its first gradient.
+    must_check_direction = kind is None and targeted
 
-    def sought(
+    def oriented_objective(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
-        nonlocal looks
-        wanted = task.target if targeted else truth
-        value = function(
-            task.as_logits(output, wanted) if by_task else output, images, wanted, more
-        )
+        nonlocal must_check_direction
+        labels = task.target if targeted else truth
+        function_output = output
+        if takes_logits_of_task:
+            function_output = task.as_logits(output, labels)
+        value = function(function_output, images, labels, more)
         if (
-            looks
+            must_check_direction
             and value.requires_grad
             and isinstance(output, Tensor)
             and output.ndim == 2
             and output.requires_grad
         ):
-            looks = False
-            _warn_of_direction(get_name(objective), value, output, wanted)  # type: ignore[arg-type]
+            must_check_direction = False
+            _warn_of_direction(get_name(objective), value, output, labels)  # type: ignore[arg-type]
         return -value if task.minimise else value
 
-    return sought
+    return oriented_objective
 
 
 def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -> None:
-    """Warn of a user's function that falls as the target's logit rises."""
+    """Warn of a user's function that falls as the target's logit rises.
+
+    Args:
+        name: of the function.
+        values: (N,) of it, with a graph.
+        output: (N, classes) logits.
+        target: indices of classes; anything else is not checked.
+    """
     (slope,) = torch.autograd.grad(
         values.sum(), output, retain_graph=True, allow_unused=True
     )
-    classes = (
-        [index for index in target if isinstance(index, int)]
-        if isinstance(target, tuple)
-        else []
-    )
-    if (
-        slope is not None
-        and classes
-        and bool((slope[:, classes].sum(dim=1) < 0.0).all())
-    ):
+    classes = []
+    if isinstance(target, tuple):
+        classes = [index for index in target if isinstance(index, int)]
+    if slope is None or not classes:
+        return
+    if bool((slope[:, classes].sum(dim=1) < 0.0).all()):
         warnings.warn(
             f"objective {name!r} falls as the target becomes more likely, and an "
             "objective is maximised: the search "
@@ -640,11 +655,19 @@ def check_objective(
     targeted: bool = False,
     minimise: bool = False,
 ) -> None:
-    """Check, before anything is loaded, that there is such an objective and that it can
-    do what is asked: for the task of that name, with a target or where a right
-    prediction is sought. Raises UnknownNameError, or InputError: neither a name nor a
-    function of three arguments; an objective of another task; a target to minimise; an
-    objective of features with either of them.
+    """Check an objective before anything is loaded.
+
+    Args:
+        objective: a name, or a function.
+        task: name of the task.
+        targeted: whether a target is sought.
+        minimise: whether a right prediction is sought.
+
+    Raises:
+        UnknownNameError: there is no objective of that name.
+        InputError: it is neither a name nor a function of such arguments, or is one of
+            another task; a target is to be minimised; or an objective of features has a
+            target or is minimised.
     """
     if targeted and minimise:
         raise InputError(

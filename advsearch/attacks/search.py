@@ -59,14 +59,13 @@ class StepRecord:
     gradient_norm: float  # l2 norm of the gradient after cleaning; NaN without one
     non_finite: int  # gradient elements that had to be set to zero
     seconds: float  # that the evaluation took
-    # pictures that all evaluations so far took together, this one included
+    # renders that all evaluations so far took together, this one included
     renders: int = 0
     samples: int = 1  # as of `Proposal`
 
 
-IsOutOfTime = Callable[
-    [int], bool
-]  # whether the time is over after so many evaluations
+IsOutOfTime = Callable[[int], bool]
+"""Number of evaluations so far -> whether the time is over."""
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 """Called after every evaluation, ranking included, with its record, u, and the (usable)
@@ -87,9 +86,10 @@ class SearchResult:
     nothing could be evaluated, or one of these renders was not finite.
     """
     claimed_objective: float  # the raw objective in the search, biased upwards
-    # share of its new renders (else of its one raw render) that the model got wrong
+    # fraction of its new renders (else of its single raw render) that the model got
+    # wrong
     success_rate: float
-    # INTERRUPTED; FOUND if that share is at least a half; else why the search stopped
+    # INTERRUPTED; FOUND if that rate is at least a half; else why the search stopped
     ending: Ending
     stopped: Ending  # why the loop stopped, whatever it had found
     history: tuple[StepRecord, ...]  # one record per evaluation of the search itself
@@ -102,12 +102,12 @@ class SearchResult:
     non_finite_elements: int
     seconds: float  # total time, evaluations included
     agreement: tuple[float, ...] = ()
-    """Cosines of gradients with those before them, in their order: what noise and the
-    way between left of them; none for gradients of zero.
+    """Cosine similarities of each gradient with the one before, in their order: 1 less
+    what noise and the step between them changed. Gradients of zero are left out.
     """
     # what the policy had to do about gradients and steps
     counts: Counts = field(default_factory=Counts)
-    # what the policy found beside `best_u`, if it finds a distribution
+    # what the policy found besides `best_u`, if it finds a distribution
     distribution: Distribution | None = None
     # what the policy knows of different failures, if it looks for them
     failures: Failures | None = None
@@ -140,16 +140,17 @@ def search(
 
     1. Until `steps` renders are spent: the policy proposes as many configurations as do
        not wait for each other; they are checked against the domain and evaluated, each
-       with a new seed (docs/design.md, "The search"); the policy is told. An evaluation
-       costs `Proposal.cost` renders at most. What cannot be paid is not asked for.
+       with a new seed (docs/design.md, "The search"); then the policy is updated. An
+       evaluation costs `Proposal.max_cost` renders at most. What the budget cannot pay
+       is not requested.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times
        more, with new seeds that are the same for all, without gradient. The best by
        these renders is what the search found (see `candidates`). With `candidates=0`,
-       for an objective without noise, the raw best is what it found. Where evaluations
-       draw conditions (`Domain.drawn`), the raw best had easy ones, and the last
-       configuration, to which all of them led, takes the place of the worst candidate.
+       for an objective without noise, the raw best is what it found. If evaluations
+       draw conditions (`Domain.draws_conditions`), the raw best had easy ones; so the
+       last configuration, to which all of them led, replaces the worst candidate.
        Those that are not clearly worse than the best by then are rendered again, up to
-       `max_extra_repeats` times more (see `candidates.contenders`).
+       `max_extra_repeats` times more (see `candidates.select_contenders`).
 
     A policy that does not handle discrete choices is wrapped in `Choices` where the
     domain has some.
@@ -160,21 +161,23 @@ def search(
 
     Args:
         evaluate: renders and judges configurations.
+        domain: where to search.
+        policy: proposes the configurations.
         steps: renders of the search, at least 1; as many evaluations where no gradient
-            costs any. By default all are spent: the worst case is wanted, not the
-            first.
-        seed, noise: root seeds of the search's own randomness, and of the renders; at
-            least 0.
-        candidates, repeats, max_extra_repeats: see above; they cost at most `candidates
-            * (repeats
-            + close)` renders more.
+            costs any. All are spent: the worst case is wanted, not the first failure.
+        seed: root seed of the policy's randomness, at least 0.
+        candidates: number of configurations that are rendered again, see above.
+        repeats: renders of each of them.
+        max_extra_repeats: further renders of each. All these cost at most `candidates *
+            (repeats + max_extra_repeats)` renders more.
         on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this,
             over 0; None for no limit. There is always one evaluation, and step 2 comes
             on top. Policies still plan for `steps`.
-        is_out_of_time: says, after so many evaluations, whether the time is over; in
-            place of `seconds`, for a run that goes on.
+        is_out_of_time: returns whether the time is over; in place of `seconds`, for a
+            run that is resumed.
         kind: of the queries.
+        render_seed: root seed of the noise of the renders, at least 0.
 
     Raises:
         InputError: steps, candidates, repeats, max_extra_repeats or seconds out of
@@ -213,25 +216,40 @@ def search(
                 _rank(log, steps, repeats, max_extra_repeats)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
-    best_candidate = (
-        select_best(log.pool) if log.pool else Candidate(domain.start, math.nan, False)
-    )
-    claimed = best_candidate.success_rate >= 0.5 and stopped is not Ending.INTERRUPTED
+    return _make_result(log, stopped, time.perf_counter() - started)
+
+
+def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
+    """Return what a search found, by its log.
+
+    An interrupted batch is passed to the policy as far as it was evaluated. An
+    interrupted search claims nothing, whatever it found.
+
+    Args:
+        log: of the search.
+        stopped: why it stopped.
+        seconds: that it took.
+    """
+    best = Candidate(log.domain.start, math.nan, False)
+    if log.pool:
+        best = select_best(log.pool)
+    best_objective = math.nan
+    if math.isfinite(best.mean_objective):
+        best_objective = best.mean_objective
+    is_claimed = best.success_rate >= 0.5 and stopped is not Ending.INTERRUPTED
     final_policy = None
     state = None
     if log.state is not None:
         final_policy = log.policy
         state = log.state
-        if final_policy is not None and log.evaluated_batch:  # a batch that was cut
+        if final_policy is not None and log.evaluated_batch:
             state = final_policy.update(state, log.evaluated_batch)
     return SearchResult(
-        best_u=best_candidate.u,
-        best_objective=best_candidate.mean_objective
-        if math.isfinite(best_candidate.mean_objective)
-        else math.nan,
-        claimed_objective=best_candidate.objective,
-        success_rate=best_candidate.success_rate,
-        ending=Ending.FOUND if claimed else stopped,
+        best_u=best.u,
+        best_objective=best_objective,
+        claimed_objective=best.objective,
+        success_rate=best.success_rate,
+        ending=Ending.FOUND if is_claimed else stopped,
         stopped=stopped,
         history=tuple(record for record in log.records if record.phase == "search"),
         ranking=tuple(record for record in log.records if record.phase == "ranking"),
@@ -239,7 +257,7 @@ def search(
         gradients=log.gradients,
         non_finite_objectives=log.non_finite,
         non_finite_elements=sum(record.non_finite for record in log.records),
-        seconds=time.perf_counter() - started,
+        seconds=seconds,
         agreement=tuple(log.agreement),
         counts=Counts() if final_policy is None else final_policy.counts(state),
         distribution=(
@@ -251,8 +269,27 @@ def search(
 
 @dataclass(eq=False)
 class _Log:
-    """Evaluates, checks, counts and remembers; the only thing in a search that
-    changes.
+    """The state of a search, the only thing in it that changes.
+
+    Attributes:
+        evaluate: answers queries.
+        domain: of the search.
+        on_step: called after every evaluation.
+        size: maximum number of candidates.
+        kind: of the queries.
+        render_seed: root seed of their noise.
+        pool: the best candidates so far, the best first.
+        last: the latest configuration with a finite objective.
+        best: largest raw objective so far; NaN before there is one.
+        records: of all evaluations so far.
+        gradients: number of gradients that were requested.
+        non_finite: number of objectives that were not finite.
+        renders: that all evaluations took.
+        previous_gradient: (d,) the latest that is not zero.
+        agreement: cosine similarities of each gradient with the one before.
+        policy: that proposes, wrapped in `Choices` if need be.
+        state: of the policy, after its latest proposals.
+        evaluated_batch: evaluations of these that the policy has not got yet.
     """
 
     evaluate: Evaluate
@@ -260,7 +297,7 @@ class _Log:
     on_step: OnStep | None
     size: int
     kind: str
-    noise: int
+    render_seed: int
     pool: tuple[Candidate, ...] = ()
     last: Candidate | None = None
     best: float = math.nan
@@ -268,100 +305,116 @@ class _Log:
     gradients: int = 0
     non_finite: int = 0
     renders: int = 0
-    before: Tensor | None = None
+    previous_gradient: Tensor | None = None
     agreement: list[float] = field(default_factory=list)
     policy: Policy[Any] | None = None
     state: Any = None
     evaluated_batch: list[tuple[Tensor, Evaluation]] = field(default_factory=list)
 
-    def evaluated(
+    def evaluate_and_record(
         self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase
     ) -> Iterator[Evaluation]:
-        """Have proposals evaluated, each with the seed of an index, and take note of
-        each as it comes.
+        """Yield the evaluations of proposals, each recorded before it is yielded.
+
+        Args:
+            proposals: to evaluate.
+            indices: number of the seed of each in the stream of the search.
+            phase: of the search.
         """
         queries = list[Query]()
         started = time.perf_counter()
         for number, (proposal, index) in enumerate(
             zip(proposals, indices, strict=True), len(self.records)
         ):
-            u = proposal.u.clone()
-            seed = stream(self.noise, self.kind, index)
-            gradient_request = proposal.gradient
-            queries.append(
-                Query(
-                    u,
-                    seed,
-                    self.kind,
-                    number,
-                    phase,
-                    gradient_request,
-                    proposal.samples,
-                )
+            query = Query(
+                proposal.u.clone(),
+                seed=stream(self.render_seed, self.kind, index),
+                kind=self.kind,
+                number=number,
+                phase=phase,
+                gradient=proposal.gradient,
+                samples=proposal.samples,
             )
+            queries.append(query)
         for proposal, query, raw in zip(
             proposals, queries, self.evaluate(queries), strict=True
         ):
             seconds = time.perf_counter() - started
             _check_evaluation(raw, proposal, self.domain)
             evaluation = raw.sanitize()
-            self.gradients += bool(proposal.gradient)
-            self.renders += raw.cost
-            if not evaluation.is_finite:
-                self.non_finite += 1
-            elif phase == "search":
-                self.best = (
-                    max(evaluation.objective, self.best)
-                    if self.best == self.best
-                    else evaluation.objective
-                )
-                candidate = Candidate(
-                    proposal.u, evaluation.objective, evaluation.success
-                )
-                self.pool = add_candidate(self.pool, candidate, self.size)
-                self.last = candidate
-            self.records.append(
-                StepRecord(
-                    step=query.number,
-                    seed=query.seed,
-                    phase=phase,
-                    objective=evaluation.objective
-                    if evaluation.is_finite
-                    else math.nan,
-                    best=self.best,
-                    success=evaluation.success,
-                    step_size=proposal.step_size,
-                    gradient_norm=math.nan
-                    if evaluation.gradient is None
-                    else float(evaluation.gradient.norm()),
-                    non_finite=evaluation.non_finite,
-                    seconds=seconds,
-                    renders=self.renders,
-                    samples=proposal.samples,
-                )
-            )
-            gradient = evaluation.gradient
-            if gradient is not None and bool(gradient.any()):
-                if self.before is not None:
-                    self.agreement.append(
-                        float(
-                            torch.cosine_similarity(
-                                gradient, self.before, dim=0, eps=1e-30
-                            )
-                        )
-                    )
-                self.before = gradient
+            self._count(proposal, evaluation, phase)
+            self.records.append(self._make_record(proposal, query, evaluation, seconds))
+            self._measure_agreement(evaluation.gradient)
             if self.on_step is not None:
                 self.on_step(self.records[-1], *copy_value((proposal.u, evaluation)))
             yield evaluation
             started = time.perf_counter()
 
+    def _count(self, proposal: Proposal, evaluation: Evaluation, phase: Phase) -> None:
+        """Count the costs of an evaluation; one of the search may be a candidate."""
+        if proposal.gradient:
+            self.gradients += 1
+        self.renders += evaluation.cost
+        if not evaluation.is_finite:
+            self.non_finite += 1
+        elif phase == "search":
+            is_first = math.isnan(self.best)
+            if is_first or evaluation.objective >= self.best:
+                self.best = evaluation.objective
+            candidate = Candidate(proposal.u, evaluation.objective, evaluation.success)
+            self.pool = add_candidate(self.pool, candidate, self.size)
+            self.last = candidate
+
+    def _make_record(
+        self, proposal: Proposal, query: Query, evaluation: Evaluation, seconds: float
+    ) -> StepRecord:
+        """Return the record of an evaluation, which is counted already."""
+        objective = math.nan
+        if evaluation.is_finite:
+            objective = evaluation.objective
+        gradient_norm = math.nan
+        if evaluation.gradient is not None:
+            gradient_norm = float(evaluation.gradient.norm())
+        assert query.phase is not None
+        return StepRecord(
+            step=query.number,
+            seed=query.seed,
+            phase=query.phase,
+            objective=objective,
+            best=self.best,
+            success=evaluation.success,
+            step_size=proposal.step_size,
+            gradient_norm=gradient_norm,
+            non_finite=evaluation.non_finite,
+            seconds=seconds,
+            renders=self.renders,
+            samples=proposal.samples,
+        )
+
+    def _measure_agreement(self, gradient: Tensor | None) -> None:
+        """Compare a gradient (d,) that is not zero with the one before."""
+        if gradient is None or not bool(gradient.any()):
+            return
+        if self.previous_gradient is not None:
+            cosine = torch.cosine_similarity(
+                gradient, self.previous_gradient, dim=0, eps=1e-30
+            )
+            self.agreement.append(float(cosine))
+        self.previous_gradient = gradient
+
 
 def _explore(
-    log: _Log, policy: Policy[Any], steps: int, seed: int, late: IsOutOfTime
+    log: _Log,
+    policy: Policy[Any],
+    steps: int,
+    seed: int,
+    is_out_of_time: IsOutOfTime,
 ) -> Ending:
-    """Let the policy propose until the budget is spent or something ends it sooner;
-    return what.
+    """Let the policy propose until the budget is spent, or it has nothing more to
+    propose, or the time is over, or objectives are not finite; return which.
+
+    The end of the time counts as that of the budget. The log has the policy's state
+    and the evaluations since then, so that an interrupted search can use them.
     """
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name = policy.name
@@ -385,19 +438,18 @@ def _explore(
         batch = _limit_batch(proposals, log.domain, steps - log.renders)
         log.state = state
         log.evaluated_batch = []
-        is_out_of_time = False
         first = len(log.records)
-        evaluations = log.evaluated(batch, range(first, first + len(batch)), "search")
+        indices = range(first, first + len(batch))
+        evaluations = log.evaluate_and_record(batch, indices, "search")
         for proposal, evaluation in zip(batch, evaluations, strict=True):
             log.evaluated_batch.append((proposal.u, evaluation))
             n_non_finite = 0 if evaluation.is_finite else n_non_finite + 1
             if n_non_finite == NON_FINITE_LIMIT:
                 return Ending.NON_FINITE
-            if is_out_of_time := late(len(log.records)):
-                break
-        if is_out_of_time:
-            break
-        state = log.state = policy.update(state, log.evaluated_batch)
+            if is_out_of_time(len(log.records)):
+                return Ending.BUDGET_SPENT
+        state = policy.update(state, log.evaluated_batch)
+        log.state = state
         log.evaluated_batch = []
     return Ending.BUDGET_SPENT
 
@@ -419,33 +471,46 @@ def _limit_batch(
     return batch
 
 
-def _rank(log: _Log, first: int, repeats: int, close: int) -> None:
-    """Render every candidate again, all with the same new seeds, and those that are
-    close once more and once more.
+def _rank(log: _Log, first: int, repeats: int, max_extra_repeats: int) -> None:
+    """Render every candidate again, all with the same new seeds.
+
+    Then those that are not clearly worse than the best are rendered once more each,
+    until a single one is left, or `max_extra_repeats` times. The others are dropped
+    from the pool.
+
+    Args:
+        log: of the search, whose pool changes.
+        first: number of the first new seed.
+        repeats: renders of every candidate.
+        max_extra_repeats: renders of those that remain.
     """
     end = first + repeats
-    for indices in (
-        range(first, end),
-        *(range(index, index + 1) for index in range(end, end + close)),
-    ):
-        if indices[0] >= end:
-            log.pool = select_contenders(log.pool, indices[0] - first)
-            if len(log.pool) < 2:
-                break
-        pool = log.pool
-        proposals = [Proposal(candidate.u) for candidate in pool for _ in indices]
-        evaluations = log.evaluated(proposals, [*indices] * len(pool), "ranking")
-        for position, candidate in enumerate(pool):
-            for evaluation in islice(evaluations, len(indices)):
-                candidate = candidate.with_repeat(
-                    evaluation.objective, evaluation.success
-                )
-                log.pool = (*log.pool[:position], candidate, *pool[position + 1 :])
+    _repeat_candidates(log, range(first, end))
+    for index in range(end, end + max_extra_repeats):
+        log.pool = select_contenders(log.pool, index - first)
+        if len(log.pool) < 2:
+            break
+        _repeat_candidates(log, range(index, index + 1))
+
+
+def _repeat_candidates(log: _Log, indices: range) -> None:
+    """Render all candidates with the seeds of these indices.
+
+    The pool is updated after every render, so that an interrupted search has all.
+    """
+    pool = log.pool
+    proposals = [Proposal(candidate.u) for candidate in pool for _ in indices]
+    evaluations = log.evaluate_and_record(proposals, [*indices] * len(pool), "ranking")
+    for position, candidate in enumerate(pool):
+        repeated = candidate
+        for evaluation in islice(evaluations, len(indices)):
+            repeated = repeated.with_repeat(evaluation.objective, evaluation.success)
+            log.pool = (*log.pool[:position], repeated, *pool[position + 1 :])
 
 
 def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
-    """Raise RuntimeError unless a configuration of the domain was proposed; a policy
-    that leaves it has a bug.
+    """Raise RuntimeError if a policy proposed something that is no configuration of the
+    domain, which is a bug.
     """
     u = proposal.u
     if proposal.samples < 1:
@@ -469,8 +534,8 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
 def _check_evaluation(
     evaluation: Evaluation, proposal: Proposal, domain: Domain
 ) -> None:
-    """Raise RuntimeError unless a gradient came as it was asked for, at the cost that
-    the domain said.
+    """Raise RuntimeError unless an evaluation has the gradient that was requested, and
+    took as many renders as the domain states.
     """
     gradient = evaluation.gradient
     u = proposal.u

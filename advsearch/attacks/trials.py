@@ -75,10 +75,17 @@ def make_margin_function(
     n_images: int = 0,
     draws_conditions: bool = False,
 ) -> MarginsOf:
-    """Return the margins of one configuration, its scores with their sign turned, under
-    the conditions that the scene comes with, or under those `draws_conditions` by the
-    seeds; the rows of all sample counts are numbered together, and the first `n_images`
-    pictures of each are wanted.
+    """Return a function that renders a configuration and returns its margins.
+
+    A margin is the negative of the task's score, so it is over 0 if the model is right.
+
+    Args:
+        evaluate: answers queries.
+        kind: of the queries, which are numbered across all sample counts.
+        u: (d,) the configuration.
+        n_images: how many images of each sample count are requested, the first ones.
+        draws_conditions: whether conditions are sampled by the seeds; else they are
+            those that the scene comes with.
     """
     n_rendered = Counter[int]()
 
@@ -107,10 +114,17 @@ def make_margin_function(
 
 @dataclass(frozen=True)
 class Rung:
-    """The margins of one configuration at one sample count: their mean, how far it may
-    lie on the other side of the true one (Student's t) in 5 % of all cases, after all
-    looks together, its drift from the rung below, NaN at the first, and whether more
-    samples would leave it on its side of zero; see `choose_spp`.
+    """The margins of one configuration at one sample count.
+
+    Attributes:
+        name: of the configuration.
+        spp: samples per pixel.
+        mean: of the margins.
+        half_width: of the one-sided 95 % interval of the mean (Student's t), all looks
+            together.
+        drift: of the mean from the rung below; NaN at the first.
+        is_settled: whether more samples would not change the sign of the mean; see
+            `choose_spp`.
     """
 
     name: str
@@ -123,9 +137,14 @@ class Rung:
 
 @dataclass(frozen=True)
 class SampleCount:
-    """The samples a pixel to verify with; whether all margins are shown to stay on
-    their sides (if not, it is the last rung of the ladder); a row for each
-    configuration and rung that was measured, in this order; and renders spent.
+    """The number of samples per pixel to verify with.
+
+    Attributes:
+        spp: samples per pixel.
+        converged: whether all margins have settled; if not, `spp` is the last rung of
+            the ladder.
+        table: a row for each configuration and rung that was measured, in this order.
+        renders: that the measurement took.
     """
 
     spp: int
@@ -152,8 +171,8 @@ def choose_spp(
     - m + (m - m'), where the margin would be if noise took once more as much as it took
       from the rung below to here: the error that is left falls with the sample count,
       so it is smaller than the change that led here,
-    - every single render of the rung; and, where these are fewer than the trials, m
-    even with the deviation of one.
+    - every single render of the rung; and, if these are not as many as the trials, m
+      even with the standard deviation of a single render.
 
     A margin at zero never settles: its verdict depends on the noise. About 5 % settle
     on the wrong side at most: 5.1 % of those that are hardest to tell
@@ -186,20 +205,23 @@ def choose_spp(
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
     table = list[Rung]()
-    renders = 0
-    reached = 1
-    looks = list_look_sizes(trials)
+    n_renders = 0
+    highest_rung = 1
+    look_sizes = list_look_sizes(trials)
     for name, render in margins.items():
-        margins_of_rungs = _climb_ladder(render, seed, ladder, looks, trials)
+        margins_of_rungs = _climb_ladder(render, seed, ladder, look_sizes, trials)
         below: list[float] = []
+        # only the rungs that were rendered, from the first on
         for spp, at_rung in zip(ladder, margins_of_rungs, strict=False):
-            table.append(_summarize_rung(name, spp, at_rung, below, len(looks), trials))
+            table.append(
+                _summarize_rung(name, spp, at_rung, below, len(look_sizes), trials)
+            )
             below = at_rung
-        renders = renders + sum(map(len, margins_of_rungs))
-        reached = max(reached, len(margins_of_rungs) - 1)
+        n_renders += sum(map(len, margins_of_rungs))
+        highest_rung = max(highest_rung, len(margins_of_rungs) - 1)
         if not table[-1].is_settled:
-            return SampleCount(ladder[-1], False, tuple(table), renders)
-    return SampleCount(ladder[reached], True, tuple(table), renders)
+            return SampleCount(ladder[-1], False, tuple(table), n_renders)
+    return SampleCount(ladder[highest_rung], True, tuple(table), n_renders)
 
 
 def _summarize_rung(
@@ -217,8 +239,8 @@ def _summarize_rung(
         spp: samples per pixel.
         at_rung: margins of the rung.
         below: margins of the rung below; empty at the first.
-        looks: how often one looks.
-        trials: that will follow; 0 where other trials follow.
+        looks: number of looks at a rung.
+        trials: that will follow; 0 if other trials follow.
     """
     mean = fmean(at_rung)
     half_width = (
@@ -236,31 +258,45 @@ def _climb_ladder(
     margins: MarginsOf,
     seed: int,
     ladder: Sequence[int],
-    looks: Sequence[int],
+    look_sizes: Sequence[int],
     trials: int,
 ) -> list[list[float]]:
-    """Return the margins of one configuration at each rung, up to that at which it
-    settles or none above can.
+    """Return the margins of one configuration at each rung that was rendered.
+
+    It ends at the rung at which the configuration settles, or when no later look can
+    settle it. Each look renders what is missing at its rung and at the rung below.
+
+    Args:
+        margins: renders the configuration.
+        seed: root seed.
+        ladder: samples per pixel of the rungs, ascending.
+        look_sizes: renders of a rung after which one looks, ascending.
+        trials: that will follow; 0 if other trials follow.
     """
-    values: list[list[float]] = [[] for _ in ladder]
-    looks_at_rungs = list(product(range(1, len(ladder)), looks))
-    for number, (level, count) in enumerate(looks_at_rungs):
+    margins_of_rungs: list[list[float]] = [[] for _ in ladder]
+    n_looks = len(look_sizes)
+    looks = list(product(range(1, len(ladder)), look_sizes))
+    for look_index, (level, count) in enumerate(looks):
         if not any(
-            _may_settle(values, ladder, *later, len(looks))
-            for later in looks_at_rungs[number:]
+            _may_settle(margins_of_rungs, ladder, *later_look, n_looks)
+            for later_look in looks[look_index:]
         ):
             break
-        if not _may_settle(values, ladder, level, count, len(looks)):
+        if not _may_settle(margins_of_rungs, ladder, level, count, n_looks):
             continue
         for rung in (level - 1, level):
-            if new := [
-                stream(seed, "sample count", number)
-                for number in range(len(values[rung]), count)
-            ]:
-                values[rung] += margins(ladder[rung], new)
-        if _is_settled(values[level], values[level - 1], len(looks), trials):
+            n_rendered = len(margins_of_rungs[rung])
+            if n_rendered < count:
+                new_seeds = [
+                    stream(seed, "sample count", number)
+                    for number in range(n_rendered, count)
+                ]
+                margins_of_rungs[rung] += margins(ladder[rung], new_seeds)
+        if _is_settled(
+            margins_of_rungs[level], margins_of_rungs[level - 1], n_looks, trials
+        ):
             break
-    return [measured for measured in values if measured]
+    return [rendered for rendered in margins_of_rungs if rendered]
 
 
 def _is_settled(
@@ -273,8 +309,8 @@ def _is_settled(
     Args:
         at_rung: margins of a rung.
         below: margins of the rung below.
-        looks: how often one looks, which share the 5 %.
-        trials: that will follow; 0 where other trials follow.
+        looks: number of looks, which share the 5 %.
+        trials: that will follow; 0 if other trials follow.
     """
     mean = fmean(at_rung)
     count = min(len(at_rung), len(below))
@@ -302,9 +338,17 @@ def _may_settle(
 ) -> bool:
     """Return whether `count` renders at a rung may show that the margin has settled.
 
-    The mean may be off by its standard error, and may move on by as much as it has
-    moved before. Deviations stay; at rungs that were not rendered they fall with the
-    root of the samples.
+    This is a forecast from the renders so far. The mean may be off by its standard
+    error, and may move on by as much as it has moved before. Standard deviations stay;
+    at rungs that were not rendered they fall with the root of the samples. Margins on
+    both sides of zero at the rung rule it out.
+
+    Args:
+        values: margins of each rung; empty of one that was not rendered.
+        ladder: samples per pixel of the rungs.
+        level: index of the rung.
+        count: renders there.
+        looks: number of looks, which share the 5 %.
     """
     rendered_rungs = [rung for rung in range(level + 1) if values[rung]]
     if not rendered_rungs:
@@ -330,25 +374,25 @@ def _may_settle(
 
 
 def list_look_sizes(trials: int = 0) -> tuple[int, ...]:
-    """Return after how many renders of a rung one looks, see `choose_spp`."""
-    return (
-        (*LOOK_SIZES, trials)
-        if LOOK_SIZES[-1] < trials <= MAX_LOOK_SIZE
-        else LOOK_SIZES
-    )
+    """Return after how many renders of a rung one looks, see `choose_spp`.
+
+    The number of trials is one more look if it is above the others, but not too large.
+    """
+    if LOOK_SIZES[-1] < trials <= MAX_LOOK_SIZE:
+        return (*LOOK_SIZES, trials)
+    return LOOK_SIZES
 
 
 def count_max_samples(
     configurations: int, ladder: Sequence[int] = LADDER, trials: int = 0
 ) -> int:
-    """Return the samples a pixel that `choose_spp` renders in all, at most: where only
-    the last rung settles it.
+    """Return the maximum number of samples per pixel that `choose_spp` renders in all.
+
+    It is reached if only the last look at the last rung settles every configuration.
     """
-    return (
-        configurations * list_look_sizes(trials)[-1] * sum(ladder)
-        if len(ladder) > 1
-        else 0
-    )
+    if len(ladder) == 1:
+        return 0
+    return configurations * list_look_sizes(trials)[-1] * sum(ladder)
 
 
 def _compute_deviation(values: Sequence[float]) -> float:
@@ -359,8 +403,11 @@ def _compute_deviation(values: Sequence[float]) -> float:
 
 
 def _compute_quantile(count: int, looks: int) -> float:
-    """Of Student's t, for one end of the interval of a mean of so many values at one of
-    the looks.
+    """Return the quantile of Student's t for one bound of the interval of a mean.
+
+    Args:
+        count: number of values.
+        looks: number of looks, which share the 5 % equally.
     """
     return float(stdtrit(count - 1, 1.0 - (1.0 - CONFIDENCE) / looks))
 
@@ -370,11 +417,11 @@ def _compute_quantile(count: int, looks: int) -> float:
 
 # conditions under which each configuration is rendered at each sample count
 N_CONDITIONS = 30
-MAX_MOVED_FRACTION = (
-    0.05  # share of the conditions that more samples may carry over zero
-)
+# fraction of the conditions whose margin more samples may carry over zero
+MAX_MOVED_FRACTION = 0.05
 OVER_LADDER = LADDER[:3]  # sample counts to try
-# samples of a check over those of the searches, at most, beyond the second rung
+# limit of the samples of a check beyond the second rung, as a multiple of those of the
+# searches
 MAX_SAMPLE_RATIO = 2
 
 FloatArray = npt.NDArray[np.float64]
@@ -398,12 +445,12 @@ def limit_ladder(
 def choose_rate_spp(
     margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = OVER_LADDER
 ) -> SampleCount:
-    """Climb a ladder of sample counts until more of them would leave the share of
-    conditions with a margin below zero where it is, of each configuration; return the
-    highest rung that one of them needed.
+    """Climb a ladder of sample counts with each configuration until more samples would
+    not change the fraction of conditions with a margin below zero; return the highest
+    rung that one of them needed.
 
     Each is rendered under the same `N_CONDITIONS` at a rung and at the one below. It
-    has settled where the mean change of the margin, taken once more and at either end
+    has settled if the mean change of the margin, taken once more and at either end
     of its 95 % interval (Student's t), would carry at most `MAX_MOVED_FRACTION` of the
     conditions over zero (`estimate_moved_fraction`). The error that is left falls with
     the sample count, so it is smaller than the change that led here
@@ -413,54 +460,54 @@ def choose_rate_spp(
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
     table = list[Rung]()
-    reached = 1
+    highest_rung = 1
     seeds = [stream(seed, "sample count", number) for number in range(N_CONDITIONS)]
     for name, render in margins.items():
-        margins_below: FloatArray | None = None
+        below: FloatArray | None = None
         for index, spp in enumerate(ladder):
-            margins_at_rung = np.array(render(spp, seeds), dtype=np.float64)
-            half_width = (
-                stdtrit(len(margins_at_rung) - 1, CONFIDENCE)
-                * margins_at_rung.std(ddof=1)
-                / math.sqrt(len(margins_at_rung))
-            )
-            drift = (
-                math.nan
-                if margins_below is None
-                else float(margins_at_rung.mean() - margins_below.mean())
-            )
-            settled = (
-                margins_below is not None
-                and estimate_moved_fraction(margins_at_rung, margins_below)
-                <= MAX_MOVED_FRACTION
-            )
-            table.append(
-                Rung(
-                    name,
-                    spp,
-                    float(margins_at_rung.mean()),
-                    float(half_width),
-                    drift,
-                    settled,
-                )
-            )
-            if settled:
-                reached = max(reached, index)
+            at_rung = np.array(render(spp, seeds), dtype=np.float64)
+            table.append(_summarize_conditions(name, spp, at_rung, below))
+            if table[-1].is_settled:
+                highest_rung = max(highest_rung, index)
                 break
-            margins_below = margins_at_rung
-        else:
+            below = at_rung
+        else:  # not even the last rung has settled
             return SampleCount(
                 ladder[-1], False, tuple(table), N_CONDITIONS * len(table)
             )
-    return SampleCount(ladder[reached], True, tuple(table), N_CONDITIONS * len(table))
+    return SampleCount(
+        ladder[highest_rung], True, tuple(table), N_CONDITIONS * len(table)
+    )
+
+
+def _summarize_conditions(
+    name: str, spp: int, at_rung: FloatArray, below: FloatArray | None
+) -> Rung:
+    """Return the row of a configuration under many conditions at one sample count.
+
+    Args:
+        name: of the configuration.
+        spp: samples per pixel.
+        at_rung: (n,) margins of the rung, by condition.
+        below: (n,) margins of the rung below; None at the first.
+    """
+    quantile = stdtrit(len(at_rung) - 1, CONFIDENCE)
+    half_width = quantile * at_rung.std(ddof=1) / math.sqrt(len(at_rung))
+    drift = math.nan
+    is_settled = False
+    if below is not None:
+        drift = float(at_rung.mean() - below.mean())
+        is_settled = estimate_moved_fraction(at_rung, below) <= MAX_MOVED_FRACTION
+    mean = float(at_rung.mean())
+    return Rung(name, spp, mean, float(half_width), drift, is_settled)
 
 
 def estimate_moved_fraction(at_rung: FloatArray, below: FloatArray) -> float:
     """Return the fraction of conditions that more samples may carry over zero.
 
-    The mean change of the margins (n,) from one rung to the next is taken once more.
-    The margins are smoothed by normal kernels of Silverman's width. NaN where a margin
-    is no number.
+    The mean change of the margins (n,) from the rung below is taken once more, at the
+    end of its 95 % interval that carries more over zero. The distribution of margins is
+    smoothed by normal kernels of Silverman's width. NaN if a margin is no number.
     """
     change = at_rung - below
     width = 0.9 * at_rung.std(ddof=1) * len(at_rung) ** -0.2
@@ -470,5 +517,7 @@ def estimate_moved_fraction(at_rung: FloatArray, below: FloatArray) -> float:
     half_width = quantile * change.std(ddof=1) / math.sqrt(len(at_rung))
     mean_change = change.mean()
     shifts = np.array([0.0, mean_change - half_width, mean_change + half_width])
+    # smoothed fraction of conditions with a margin over zero, by shift (3,); the width
+    # is 0 if all margins are equal
     fractions = ndtr((at_rung + shifts[:, None]) / max(width, 1e-12)).mean(axis=1)
     return float(np.abs(fractions[1:] - fractions[0]).max())

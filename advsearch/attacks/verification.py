@@ -1,6 +1,6 @@
-"""The independent re-check of what a search found (docs/design.md, "Verification"):
-fresh seeds, enough samples, 8 bits, a task that judges, and a control group of the
-clean configuration. A verdict's rule stands here only.
+"""The independent check of what a search found (docs/design.md, "Verification"): fresh
+seeds, enough samples, 8 bits, a task that judges, and a control group of the clean
+configuration. The rule of a verdict stands here only.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ class Ending(Enum):
         return ending
 
 
-# of trials in which a claim must hold, and the clean control be right: 14 of 14, 19 of
-# 20
+# percentage of the trials in which a claim must hold, and of those in which the clean
+# configuration must be right: 14 of 14, 19 of 20
 PASS_PERCENT = 95
-# of conditions in which a claim must hold, of those in which the clean configuration is
-# right
+# percentage of the conditions in which a claim must hold, among those in which the
+# clean configuration is right
 PASS_PERCENT_OVER = 90
 
 TRIAL_LOOKS = 14, 23
-"""Trials after which a verdict may stand, where nobody asked for a number: `found`
-takes 14 of 14, or 22 of 23.
+"""Trials after which a verdict may stand, if the user set no number: `found` takes 14
+of 14, or 22 of 23.
 
 What holds in 75 % or less is found in 2.4 % of all cases at most, as by 19 of 20, and
 the interval of what is found begins at 77 %, by 19 of 20 at 75 %.
@@ -81,9 +81,10 @@ the interval of what is found begins at 77 %, by 19 of 20 at 75 %.
 
 OVER_EARLY = {30: 30, 60: 59, 100: 95, 150: 141}
 OVER_LOOKS = *OVER_EARLY, 200
-"""Trials over many conditions after which a verdict may stand, where nobody asked for a
-number: of those that count at all but the last, with the successes of `OVER_EARLY`, and
-of all at the last.
+"""Trials over many conditions after which a verdict may stand, if the user set no
+number. All but the last are numbers of trials that count (the clean configuration is
+right), with the successes that `OVER_EARLY` has for them; the last is one of all
+trials.
 
 What holds in 85 % or less is found in 3.3 % of all cases at most, and in 2.6 % by 180
 of 200 alone.
@@ -117,24 +118,24 @@ class Rule:
     """
 
     def count_needed(self, trials: int, *, early: bool = False) -> int:
-        """Return how many of `trials` must succeed: the percentage, rounded up, and
-        never under `fewest`. Of conditions, `early` asks for those of `OVER_EARLY`:
-        more of them could follow.
+        """Return how many of `trials` must succeed.
+
+        It is the percentage, rounded up, and at least `min_trials`. At an `early` look
+        over conditions, after which more trials could follow, it is that of
+        `OVER_EARLY`.
         """
-        return max(
-            OVER_EARLY[trials]
-            if early and self.is_conditional
-            else self.count_percent(trials),
-            self.min_trials,
-        )
+        n_required = self.count_percent(trials)
+        if early and self.is_conditional:
+            n_required = OVER_EARLY[trials]
+        return max(n_required, self.min_trials)
 
     def count_allowed_failures(self, trials: int) -> int:
         return trials - self.count_needed(trials)
 
     @property
     def min_trials(self) -> int:
-        """Trials under which nothing is verified: even without a failure their interval
-        begins under `MIN_RATE`.
+        """Smallest number of trials that can verify anything: if as many succeed as the
+        percentage needs, the interval of the rate begins at `MIN_RATE` at least.
         """
         return next(
             n
@@ -143,32 +144,40 @@ class Rule:
         )
 
     def count_percent(self, trials: int) -> int:
+        """Return the percentage of a number of trials, rounded up."""
         return -(-self.percent * trials // 100)
 
     def is_success(self, trial: Judgement, clean: Judgement) -> bool:
-        """Whether a trial counts beside that of the clean configuration with the same
-        seed: which has to be right, so that what the noise does by itself does not
-        count; where it may be wrong, the trial has the larger score.
+        """Return whether a trial is a success, given the clean trial of the same seed.
+
+        With a control group, the clean trial has to be right, so that failures by noise
+        alone do not count. Without one, the trial needs a larger score than the clean.
         """
-        return trial.success and (
-            clean.right if self.has_control else trial.score > clean.score
-        )
+        if not trial.success:
+            return False
+        return clean.right if self.has_control else trial.score > clean.score
 
     def count_valid(self, clean: Sequence[Judgement]) -> int:
-        """Return how many trials count, beside these of the clean configuration."""
-        return (
-            sum(trial.right for trial in clean) if self.is_conditional else len(clean)
-        )
+        """Return how many trials count, given the clean trials of the same seeds.
+
+        Over conditions, only those count in which the clean configuration is right.
+        """
+        if not self.is_conditional:
+            return len(clean)
+        return sum(trial.right for trial in clean)
 
     def is_already_wrong(self, clean: Trials) -> bool:
-        """Whether a clean configuration is no start at all: right in less than half of
-        its trials.
+        """Return whether the clean configuration is right in less than half of its
+        trials, so that there is nothing to attack; False without a control group.
         """
         return self.has_control and 2 * clean.successes < clean.trials
 
     def decide(self, successes: int, trials: int) -> bool | None:
-        """Return what so many trials of one configuration say: success, none, or None
-        where it depends on the noise.
+        """Return whether a configuration is a success by its trials; None if that
+        depends on the noise.
+
+        It does if there are both more successes and more failures than the rule allows
+        of failures.
         """
         if min(successes, trials - successes) > self.count_allowed_failures(trials):
             return None
@@ -178,20 +187,23 @@ class Rule:
         self, search: Ending, clean: Trials, adversarial: Trials
     ) -> Ending:
         """Return the run's ending from the search's ending and the trials of both
-        groups: FOUND if both reach what the rule needs, whatever the search itself
-        believed.
+        groups.
+
+        It is FOUND if both reach what the rule needs, also if the search claimed
+        nothing. An interrupted search stays interrupted. Over conditions, or without a
+        control group, the clean trials need not reach the percentage.
         """
         if search is Ending.INTERRUPTED:
             return search
         if self.is_already_wrong(clean):
             return Ending.ALREADY_WRONG
-        enough = adversarial.successes >= self.count_needed(adversarial.trials)
-        control = (
+        is_verified = adversarial.successes >= self.count_needed(adversarial.trials)
+        is_control_right = (
             not self.has_control
             or self.is_conditional
             or clean.successes >= self.count_needed(clean.trials)
         )
-        if control and enough:
+        if is_control_right and is_verified:
             return Ending.FOUND
         return Ending.NOT_VERIFIED if search is Ending.FOUND else search
 
@@ -209,11 +221,11 @@ seed.
 class Verification:
     """What the trials say."""
 
-    ending: Ending  # the run's; FOUND only if `Rule.verdict` says so
+    ending: Ending  # the run's; see `Rule.decide_ending`
     reason: str  # one sentence with the numbers behind it
     u: Tensor  # (d,) the configuration verified, projected into its budget again
     clean_counts: Trials  # right predictions of the control group
-    adversarial_counts: Trials  # successes, by `Rule.succeeded`
+    adversarial_counts: Trials  # successes, by `Rule.is_success`
     # every single trial, in the order of their seeds
     clean_trials: tuple[Judgement, ...]
     # likewise; of curtailed ones this group is the shorter
@@ -230,6 +242,7 @@ class Verification:
 
     @property
     def valid_trials(self) -> tuple[Judgement, ...]:
+        """The adversarial trials that count; all of them if none does."""
         trials = zip(self.adversarial_trials, self.outcomes, strict=True)
         return (
             tuple(trial for trial, outcome in trials if outcome is not None)
@@ -254,19 +267,26 @@ def run_trials(
     n_images: int = 0,
     is_decided: Callable[[Sequence[Judgement]], bool] | None = None,
 ) -> tuple[Judgement, ...]:
-    """Render and judge one configuration (d,) `trials` times, trial k with seed k of
-    the stream "verification" of the root `seed`: two groups of one root get the same
-    seeds, which is what a control group needs.
+    """Render and judge one configuration in several trials; return the new ones.
+
+    Trial k has the seed k of the stream "verification" of the root seed: two groups of
+    one root get the same seeds, which is what a control group needs.
 
     Args:
         evaluate: answers the queries; see `Query`.
-        spp, trials: samples a pixel, and how many trials there are then; under 1 they
-            are an InputError.
-        n_done: how many of them there are already, which are left out.
-        first_index: the number of the first of all.
-        kind: of their rows.
-        n_images: the pictures of the first so many are wanted.
-        is_decided: asked after every trial, ends them sooner.
+        u: (d,) the configuration.
+        spp: samples per pixel.
+        seed: root seed.
+        trials: number of trials, those that are done included.
+        n_done: number of trials that are done already; they are not repeated.
+        first_index: index k of the first trial.
+        kind: of the queries.
+        n_images: how many images are requested, those of the first trials.
+        is_decided: called with the new trials after each of them; if it returns True,
+            no more follow.
+
+    Raises:
+        InputError: `spp` or `trials` is less than 1.
     """
     if trials < 1:
         raise InputError(f"trials: expected at least 1, got {trials}")
@@ -319,34 +339,37 @@ def verify(
     control group.
 
     Several numbers of trials, such as `TRIAL_LOOKS`, are looks: the trials end at the
-    first at which that is found. Over conditions, those that count are looked at
-    (`OVER_LOOKS`), and the last look is at all.
+    first look at which the claim is found to hold. Over conditions, a look is at that
+    many trials that count (`OVER_LOOKS`), and the last look at that many in all.
 
     Curtailed trials end with the first failure that is one more than the rule allows of
     all of them. The verdict is that of all trials, whatever the rest would have said,
     and the Clopper-Pearson interval of those that were made still covers the rate as
     often as it says: it contains the exact interval of that stopping rule, under which
     an outcome is the better the later it stops (Jennison and Turnbull 1983). Trials
-    with several looks are always curtailed, but have at least `Rule.fewest`, so that
-    they say something of the rate; that their intervals cover it is shown by the
+    with several looks are always curtailed, but have at least `Rule.min_trials`, so
+    that they say something of the rate; that their intervals cover it is shown by the
     probability of every outcome (`benchmarks/verdicts.py`).
 
     Args:
-        evaluate, spp, keep, begin: as of `run_trials`; of a configuration that was
-            chosen by trials, fresh ones begin after these.
+        evaluate: answers the queries.
         domain: the budget; the clean configuration is its start.
         u: (d,) the adversarial configuration; projected into the domain again.
         claim: the search's ending.
+        spp: samples per pixel.
         seed: root seed. Must not be one that the search rendered with through the same
             stream.
-        trials: per group; or rising numbers, see above.
+        trials: per group; or ascending numbers, see above.
         clean: the first trials of the clean configuration, where `run_trials` has run
             them with the same spp and seed (one control group serves the attack and its
             baseline); what is missing is run here.
         rule: what counts as a success, and which ending it is.
-        kind, control: of the rows of its trials, and of those of the clean
-            configuration.
-        curtailed: see above; where of what was found only the verdict matters.
+        kind: of the queries of the adversarial configuration.
+        control_kind: of those of the clean configuration.
+        n_images: how many images of the adversarial trials are requested.
+        curtailed: see above; for a claim of which only the verdict matters.
+        first_index: index of the first trial; if the configuration was chosen by
+            trials, fresh ones begin after these.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     has_several_looks = len(looks) > 1
@@ -356,17 +379,16 @@ def verify(
     done = list[Judgement]()
 
     def has_failed(new_trials: Sequence[Judgement]) -> bool:
-        """Whether too many trials fail for any look."""
-        tried = [*done, *new_trials]
+        """Return whether too many trials fail for the claim to hold at any look."""
+        all_trials = [*done, *new_trials]
         n_total = looks[-1] if has_several_looks else rule.count_valid(clean_trials)
-        n_failures = _list_outcomes(rule, tried, clean_trials).count(False)
-        return len(tried) >= min_trials and n_failures > rule.count_allowed_failures(
-            n_total
-        )
+        n_failures = _list_outcomes(rule, all_trials, clean_trials).count(False)
+        has_too_many = n_failures > rule.count_allowed_failures(n_total)
+        return len(all_trials) >= min_trials and has_too_many
 
     run = partial(run_trials, evaluate, spp=spp, seed=seed, first_index=first_index)
     run_clean = partial(run, domain.start, kind=control_kind)
-    until = has_failed if curtailed or has_several_looks else None
+    is_decided = has_failed if curtailed or has_several_looks else None
     for look in looks:
         count = _extend_clean_trials(clean_trials, run_clean, rule, look, looks[-1])
         done += run(
@@ -375,7 +397,7 @@ def verify(
             n_done=len(done),
             kind=kind,
             n_images=n_images,
-            is_decided=until,
+            is_decided=is_decided,
         )
         is_early = count < looks[-1]
         is_success = _is_found(
@@ -408,10 +430,10 @@ def _extend_clean_trials(
     look: int,
     max_trials: int,
 ) -> int:
-    """Run clean trials until `look` of them count; return how many there are.
+    """Run clean trials until `look` of them count; return how many there are then.
 
-    Under conditions, clean trials that are wrong do not count, so that more are run, up
-    to `max_trials`.
+    Over conditions, clean trials that are wrong do not count, so that more are run, up
+    to `max_trials`. New trials are appended to `clean_trials`.
     """
     count = look
     clean_trials += run_clean(trials=count, n_done=len(clean_trials))
@@ -432,8 +454,10 @@ def _is_found(
     spp: int,
     is_early: bool,
 ) -> bool:
-    """Return whether enough trials succeed, and the clean configuration is not
-    wrong.
+    """Return whether enough trials succeed at a look, and the clean configuration is
+    not wrong already.
+
+    The look is at the first `count` trials; `is_early` is whether more could follow.
     """
     clean_looked_at = clean_trials[:count]
     n_needed = rule.count_needed(rule.count_valid(clean_looked_at), early=is_early)

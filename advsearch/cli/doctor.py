@@ -104,13 +104,13 @@ def doctor(args: argparse.Namespace) -> int:
         )
     console.print(table)
     console.print()
-    for part in (part for part in parts if part.fix):
-        console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
-    console.print(
-        "Everything that is necessary works."
-        if good
-        else "[red]Something necessary does not work.[/]"
-    )
+    for part in parts:
+        if part.fix:
+            console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
+    if good:
+        console.print("Everything that is necessary works.")
+    else:
+        console.print("[red]Something necessary does not work.[/]")
     return 0 if good else FELL_SHORT
 
 
@@ -375,6 +375,7 @@ def check_disk(folder: Path) -> Component:
 
 
 def check_hardware() -> Component:
+    """Check cores and memory; little memory is a warning."""
     cores = threads.count_cores()
     memory = 0  # where the system does not tell
     with suppress(AttributeError, ValueError, OSError):

@@ -112,6 +112,11 @@ def read_file_config(
 
 
 def _format_inside(scene: str) -> str:
+    """Return the names in a scene file that can be the object, as an error lists them.
+
+    Raises:
+        InputError: there is none.
+    """
     # late: another thing has this name here
     from advsearch.scene.importing.files import format_name
 

@@ -52,12 +52,12 @@ def file(args: argparse.Namespace) -> int:
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with open_command_progress(as_json=True, quiet=False):
         # late: another thing has this name here
-        from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, contents
+        from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_contents
 
         if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
             facts, lines = _describe_mitsuba_file(args.file, out)
         else:
-            inside = contents(Path(args.file))
+            inside = list_contents(Path(args.file))
             facts, lines = _describe_mesh_file(args.file, inside)
             if out is not None:
                 advsearch.render(
@@ -190,6 +190,16 @@ def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
 
 
 def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
+    """Describe what advsearch understands of a Mitsuba file; render it if `out` is given.
+
+    The first shape that is no light stands for the object.
+
+    Returns:
+        What is in the file, for JSON; and the lines of the text.
+
+    Raises:
+        InputError: an image is requested, but no shape can be the object.
+    """
     # late: another thing has this name here
     from advsearch.scene.mitsuba_backend.scene_files import read_contents
 

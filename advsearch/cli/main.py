@@ -385,6 +385,10 @@ def _run_and_tell(words: list[str]) -> int:
 
 
 def _run(words: list[str]) -> int:
+    """Run the command that the words of the command line name; return its exit status.
+
+    Permission to run the code that `--code` names is given here, for the process.
+    """
     name = words[0] if words and not words[0].startswith("-") else None
     if name == "plan":
         raise InputError(
@@ -404,14 +408,18 @@ def _run(words: list[str]) -> int:
 
 
 def _parse(words: list[str], command: str | None) -> argparse.Namespace:
+    """Parse the words of the command line.
+
+    Only the flags of `command` are made, since making all of them takes half a second.
+    Without a command the help is printed and the process ends.
+    """
     parser, subparsers = without_commands()
     for name in list_commands():
         add_command(subparsers, name, with_arguments=name == command)
     args, unknown = parser.parse_known_args(_join_negative_axis(words))
     if unknown:
-        raise _unknown_argument(
-            unknown[0], subparsers.choices[args.command] if args.command else parser
-        )
+        command_parser = subparsers.choices[args.command] if args.command else parser
+        raise _unknown_argument(unknown[0], command_parser)
     if args.command is None:
         parser.print_help()
         parser.exit()
@@ -496,6 +504,11 @@ def add_command(
 
 
 def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputError:
+    """Return the error for an argument that a parser does not know.
+
+    It suggests, in this order: `--object` before a bare word, the command whose flag it
+    is, a flag that is spelled alike or a word for the same thing.
+    """
     # late, so that --help answers at once
     from advsearch.calls import suggest_keyword
     from advsearch.config import CONFIGS
@@ -504,9 +517,9 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
     name = argument.partition("=")[0]
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
     if not name.startswith("--"):
-        hint = (
-            f"; for the object write --object {argument}" if "--object" in known else ""
-        )
+        hint = ""
+        if "--object" in known:
+            hint = f"; for the object write --object {argument}"
         return InputError(
             f"expected flags, got {argument!r}{hint}; see {parser.prog} --help"
         )
@@ -523,15 +536,13 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
     meant, reason = suggest_keyword(
         name[2:].replace("-", "_"), [flag[2:] for flag in known]
     )
+    text = f"{parser.prog} has no {name}"
+    if meant:
+        text += f"; did you mean {' or '.join(f'--{flag}' for flag in meant)}?"
+    if reason:
+        text += f" ({reason})"
     if meant or reason:
-        hint = (
-            f"; did you mean {' or '.join(f'--{flag}' for flag in meant)}?"
-            if meant
-            else ""
-        )
-        return InputError(
-            f"{parser.prog} has no {name}{hint}{f' ({reason})' if reason else ''}"
-        )
+        return InputError(text)
     return UnknownNameError("flag", name, set(known))
 
 

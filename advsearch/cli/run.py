@@ -136,9 +136,8 @@ def resume(args: argparse.Namespace) -> int:
     if only := [part.text for part in read_python_only(path)]:
         raise InputError(
             f"{path}: cannot resume from here: {', '.join(only)} existed only in the "
-            "Python session of the run; call "
-            "the same function with the same arguments again, an attack with "
-            "`resume=True`"
+            "Python session of the run; call the same function with the same arguments "
+            "again, an attack with `resume=True`"
         )
     return run_file(path / CONFIG, changes, args, resumed=path)
 
@@ -176,11 +175,9 @@ def runs(args: argparse.Namespace) -> int:
                 run.answer,
             ]
         )
-    text = (
-        output.align_columns(rows)
-        if listed
-        else (f"no runs in {folder}/ yet; advsearch attack makes one")
-    )
+    text = f"no runs in {folder}/ yet; advsearch attack makes one"
+    if listed:
+        text = output.align_columns(rows)
     output.print_answer(
         args.json, {"command": "runs", "runs": [vars(run) for run in listed]}, text
     )

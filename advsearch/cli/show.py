@@ -64,6 +64,7 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def show(args: argparse.Namespace) -> int:
+    """Show a run, or a control, policy, task or recipe that is given by kind and name."""
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError(
             "--picture: draws the pictures of one run, after its text; "
@@ -136,31 +137,29 @@ def find_photographs(run: Path) -> Any:
 
 
 def _show_unfinished(run: ListedRun, as_json: bool) -> int:
-    go_on = (
-        output.make_resume_command(run.path)
-        if run.begun and run.state == "stopped"
-        else None
-    )
+    """Show a run without a result: how far it is, and how it can be resumed."""
+    resume_command = None
+    if run.begun and run.state == "stopped":
+        resume_command = output.make_resume_command(run.path)
     subject = run.command
     if run.object:
-        subject += (
-            f" of {run.object}, {' and '.join(run.controls) or 'nothing searched'}"
-        )
-    state_text = {"running": "A process is working on it"}.get(
-        run.state, "It was stopped before its end"
-    )
+        searched = " and ".join(run.controls) or "nothing searched"
+        subject += f" of {run.object}, {searched}"
+    state_text = "It was stopped before its end"
+    if run.state == "running":
+        state_text = "A process is working on it"
     row_counts = ", ".join(f"{number} of {kind}" for kind, number in run.kinds.items())
     lines = [
         f"{run.name}: {subject}.",
         f"{state_text}; evaluations kept so far: {row_counts or 'none'}.",
     ]
-    if go_on is not None:
-        lines += ["", f"Go on with: {go_on}"]
+    if resume_command is not None:
+        lines += ["", f"Go on with: {resume_command}"]
     elif run.state == "stopped":
         lines += ["", "It has no run.yaml, so it can't be resumed; start again."]
     return output.print_answer(
         as_json,
-        {**vars(run), "run": run.path, "ending": None, "resume": go_on},
+        {**vars(run), "run": run.path, "ending": None, "resume": resume_command},
         "\n".join(lines),
     )
 
@@ -169,6 +168,7 @@ PLURALS = {"control": "controls", "policy": "policies", "task": "tasks"}
 
 
 def _show_declared(kind: str, name: str, as_json: bool) -> int:
+    """Show the parameters and options of a control, policy or task."""
     with open_command_progress(as_json=True, quiet=False):
         registry = _registry(PLURALS[kind])  # takes seconds
     allow_named({"controls": name} if kind == "control" else {})
@@ -245,6 +245,7 @@ def _format_searched(parameter: Parameter) -> str:
 
 
 def _make_choice_row(choice: Choice) -> dict[str, str]:
+    """Return the row of a table for a setting of a control, with its allowed values."""
     allowed = ", ".join(choice.options)
     if choice.whole:
         allowed = f"{choice.whole[0]} to {choice.whole[1]}"
@@ -393,11 +394,9 @@ def _registry(kind: str) -> Any:
     output.add_flags,
 )
 def list_all(args: argparse.Namespace) -> int:
-    kinds = (
-        [kind for kind in REGISTRIES if kind != CASES]
-        if args.kind == "all"
-        else [args.kind]
-    )
+    kinds = [args.kind]
+    if args.kind == "all":
+        kinds = [kind for kind in REGISTRIES if kind != CASES]
     with open_command_progress(as_json=True, quiet=False):
         names = {kind: list_names(kind) for kind in kinds}
     tables = {

@@ -88,18 +88,15 @@ def make_unknown_control_error(
 
     It says of which control the name is a parameter, or else the hint.
     """
-    usable = CONTROLS.list_usable().items()
     owners = [
         name
-        for name, control in usable
+        for name, control in CONTROLS.list_usable().items()
         if any(parameter.name == kind for parameter in control.parameters)
     ]
-    explanation = (
-        f"It is a parameter: write {' or '.join(f'{name}.{kind}' for name in owners)}."
-        if owners
-        else hint
-    )
-    return UnknownNameError("control", kind, {*CONTROLS, *instances}, explanation)
+    if owners:
+        parameters = " or ".join(f"{name}.{kind}" for name in owners)
+        hint = f"It is a parameter: write {parameters}."
+    return UnknownNameError("control", kind, {*CONTROLS, *instances}, hint)
 
 
 def parse_control_name(
@@ -112,9 +109,10 @@ def parse_control_name(
 def _parse_name(
     control_name: str, settings: dict[str, object]
 ) -> tuple[str, str, str | None]:
-    """Return kind, instance name and single parameter.
+    """Return kind, instance name and single parameter (None without one).
 
-    Takes "kind" out of the settings.
+    A name is KIND, KIND:NAME, KIND.PARAMETER or KIND.PARAMETER:NAME; any name if the
+    settings have a "kind", which is taken out of them; or that of a class of controls.
     """
     kind, colon, name = control_name.partition(":")
     kind, dot, parameter = kind.partition(".")
@@ -169,12 +167,10 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
         raise UnknownNameError(
             f"parameter of control {control.kind}", parameter, parameter_by_name
         )
-    found_parameter = parameter_by_name[parameter]
-    return (
-        {"choices": list(found_parameter.options)}
-        if found_parameter.options
-        else list(found_parameter.search or (found_parameter.low, found_parameter.high))
-    )
+    declared = parameter_by_name[parameter]
+    if declared.options:
+        return {"choices": list(declared.options)}
+    return list(declared.search or (declared.low, declared.high))
 
 
 def check_control_settings(
@@ -213,14 +209,13 @@ def merge_control_settings(
         if not dot or kind not in CONTROLS:
             by_control.setdefault(name, {}).update(control_settings)
             continue
+        # kind.parameter, kind:name.parameter or kind.parameter:name
         parameter, colon, instance = rest.partition(":")
-        target = by_control.setdefault(head + colon + instance, {})
-        target.update(
-            {
-                parameter: _get_default_range(CONTROLS[kind], parameter),
-                **control_settings,
-            }
-        )
+        control_name = head + colon + instance
+        default_range = _get_default_range(CONTROLS[kind], parameter)
+        # what the settings state of the parameter wins
+        new_settings = {parameter: default_range, **control_settings}
+        by_control.setdefault(control_name, {}).update(new_settings)
     return by_control
 
 
@@ -259,9 +254,14 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
 def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     """Let controls prepare a scene, bind them to it and compose them.
 
-    There may be none, or only fixed ones. Raises InputError: two controls of one name,
-    one that the scene cannot take, or one that leaves out what was requested of the
-    scene.
+    There may be none, or only fixed ones. All controls prepare the scene before any is
+    bound to it. Values of the clean scene that controls replace become adjusted
+    defaults of the space, in the order of the controls; an environment among them, or
+    one that a control has put into the scene, becomes that of the space.
+
+    Raises:
+        InputError: two controls of one name, one that the scene cannot take, or one
+            that leaves out what was requested of the scene.
     """
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
@@ -282,6 +282,8 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
                 "given to another mesh than the "
                 f"object; {able} can, as in pose:{control.name}"
             )
+    if scene.backdrop_photograph is not None:
+        _check_controls_in_photograph(controls, scene.backdrop_photograph.spec)
     described = scene
     adjusted = list[AdjustedDefault]()
     for control in controls:
@@ -292,28 +294,26 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         if control.mesh != OBJECT:
             control.get_mesh(scene)
     bound = tuple(control.bind(scene) for control in controls)
-    adjusted = sorted(
-        [
-            *adjusted,
-            *(
-                adjusted_default
-                for control in bound
-                for adjusted_default in control.adjusted_defaults
-            ),
-        ],
-        key=lambda adjusted_default: names.index(adjusted_default.control),
-    )
-    lit_by = [
-        str(adjusted_default.used)
-        for adjusted_default in adjusted
-        if adjusted_default.parameter == ENVIRONMENT
+    for control in bound:
+        adjusted += control.adjusted_defaults
+    adjusted.sort(key=lambda default: names.index(default.control))
+    environments = [
+        str(default.used) for default in adjusted if default.parameter == ENVIRONMENT
     ]
-    lit_by += (
-        [scene.environment_spec]
-        if scene.environment_spec != described.environment_spec
-        else []
-    )
-    return Space(bound, scene, tuple(adjusted), lit_by[0] if lit_by else None)
+    if scene.environment_spec != described.environment_spec:
+        environments.append(scene.environment_spec)
+    environment = environments[0] if environments else None
+    return Space(bound, scene, tuple(adjusted), environment)
+
+
+def _check_controls_in_photograph(controls: Sequence[Control], spec: str) -> None:
+    """Raise InputError if a control would not be true of what a photograph shows."""
+    for control in controls:
+        if control.photograph_refusal:
+            raise InputError(
+                f"`controls` {control.name} and `backdrop={spec}` contradict each "
+                f"other: {control.photograph_refusal}; leave one of the two out"
+            )
 
 
 def __getattr__(name: str) -> Any:

@@ -42,6 +42,7 @@ class BackgroundControl(Control):
     """A plain colour behind the object; the environment keeps lighting it."""
 
     kind = "background"
+    photograph_refusal = "the photograph is the background"
     amount = "what"
     parameters = (
         Parameter.named(

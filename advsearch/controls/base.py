@@ -122,9 +122,13 @@ def _describe_adjustment(value: AdjustedDefault) -> str:
 def list_replaced_settings(
     control: str, before: SceneDescription, after: SceneDescription
 ) -> Iterator[AdjustedDefault]:
-    """Yield what a control has replaced in a scene and nobody has described.
+    """Yield the values of a scene that a control replaced although they were defaults.
 
-    Raises InputError: it was requested.
+    They are the environment, and the settings that have another value after the control
+    has prepared the scene than before.
+
+    Raises:
+        InputError: the user set a value that was replaced.
     """
     if after.environment is not None and after.environment is not before.environment:
         check_single_environment(after.parts, f"`controls` {control}")
@@ -279,6 +283,8 @@ class Control:
             taken where there are several.
         competes_with_ambient: whether it throws light that ambient light weakens, see
             `ambient`.
+        photograph_refusal: why it would not be true of a scene that is rendered into a
+            photograph; empty if it is.
 
     Raises:
         UnknownNameError: no such parameter or choice.
@@ -295,6 +301,7 @@ class Control:
     travels: ClassVar[bool] = False
     competes_with_ambient: ClassVar[bool] = False
     amount: ClassVar[str | None] = None
+    photograph_refusal: ClassVar[str] = ""
     on_top: bool = False
     name: str
     scene: SceneDescription
@@ -505,9 +512,10 @@ class Control:
         return bound
 
     def fit(self) -> None:
-        """Set `start`, `groups` and `moved` for `self.scene`.
+        """Set `slots`, `start`, `groups` and `adjusted_defaults` for `self.scene`.
 
-        Raises InputError: a setting of the control is impossible in this scene.
+        Raises:
+            InputError: a setting of the control is impossible in this scene.
         """
         slots = list[Slot]()
         begin = 0
@@ -522,6 +530,7 @@ class Control:
             dtype=torch.float32,
         )
         self.groups = tuple(self._group(slot) for slot in slots if slot.n_coordinates)
+        # (d,) lower bound and width of the range of each coordinate, see `values`
         ranges = [
             slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0)
             for slot in slots
@@ -529,14 +538,14 @@ class Control:
         low_and_span = torch.tensor(
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
-        widths = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
-        self._low, self._span = low_and_span.T.repeat_interleave(widths, dim=1)
+        counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
+        self._low, self._span = low_and_span.T.repeat_interleave(counts, dim=1)
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter as this scene has it.
 
-        Its default is its value in the unchanged scene; its search range, unit, shape
-        and estimators are those that it has there.
+        Its default is its value in the unchanged scene. A control may also give it the
+        search range, unit, shape and estimators that it has there.
         """
         value = self.scene.values.get(self.setting_name(parameter))
         return parameter if value is None else replace(parameter, default=value)
@@ -553,12 +562,16 @@ class Control:
         """Return the value of a parameter in the scene as it was described.
 
         That is its default, unless that changes the scene. The parameter is as
-        `in_scene` has it.
+        `resolve_parameter` returned it.
         """
         return parameter.default
 
     def get_spec(self, parameter: Parameter) -> Spec:
-        """Return what a parameter, as `in_scene` has it, is set to."""
+        """Return what a parameter, as `resolve_parameter` returned it, is set to.
+
+        A parameter that the user did not set is fixed at its default if another one was
+        given a range, or if it has no search range; else it is searched.
+        """
         if parameter.name in self.specs:
             return self.specs[parameter.name]
         if self.has_requested_search or parameter.search is None:
@@ -604,7 +617,11 @@ class Control:
     def _list_adjusted_defaults(self) -> Iterator[AdjustedDefault]:
         """Yield the values of the clean scene that the start does not have.
 
-        Raises InputError: one of them was requested.
+        Values that the user fixed are not among them, nor is anything but the `amount`
+        of a control that has one, as it hides the rest.
+
+        Raises:
+            InputError: the user set one of them for the scene.
         """
         for slot in self.slots:
             parameter = slot.parameter
@@ -684,12 +701,10 @@ class Control:
 
     @property
     def budget(self) -> Budget:
-        """The budget of the whole slice: that of its largest group."""
-        return (
-            max(self.groups, key=lambda group: group.size).budget
-            if self.groups
-            else FULL_RANGE
-        )
+        """The budget of the slice of u: that of its largest group."""
+        if not self.groups:
+            return FULL_RANGE
+        return max(self.groups, key=lambda group: group.size).budget
 
     @property
     def refines(self) -> frozenset[str]:
@@ -708,7 +723,8 @@ class Control:
         values: dict[str, Tensor] = {}
         if not self.slots:
             return values
-        # at once, but for what is searched on a logarithmic scale
+        # of all coordinates at once; those with a logarithmic scale or a distribution
+        # are interpolated one by one below
         linear = self._low.to(u) + self._span.to(u) * u
         for slot in self.slots:
             parameter = slot.parameter
@@ -721,9 +737,10 @@ class Control:
                     value = linear[coordinates]
                 values[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
-            constant = (
-                spec.value if isinstance(spec, Fixed) else spec.select(u[slot.offset])
-            )
+            if isinstance(spec, Fixed):
+                constant = spec.value
+            else:
+                constant = spec.select(u[slot.offset])
             values[parameter.name] = _to_tensor(constant, slot, u.device)
         return values
 
@@ -751,7 +768,7 @@ class Control:
         return self.scene_inputs(self.values(u), so_far)
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
-        """Return what the values make of the finished picture; see `picture`."""
+        """Return what the values make of the finished image; see `apply_to_image`."""
         return image
 
     def apply_to_image(self, u: Tensor, image: Tensor) -> Tensor:
@@ -775,8 +792,9 @@ class Control:
     ) -> dict[str, Value]:
         """Describe a configuration by a few named values with units.
 
-        Small enough for one row of a table; a function of its arguments alone, which
-        are those of `inputs`.
+        They are the values of the parameters that are not fixed, without images, and
+        those of `measured`. Names are `<control>.<parameter>`, with an index for an
+        element of a vector. Arguments are those of `inputs`.
         """
         values = self.values(u.detach())
         described: dict[str, Value] = {}
@@ -792,8 +810,8 @@ class Control:
             elif value.ndim == 0:
                 described[name] = make_value(value, parameter.unit)
             else:
-                for k, number in enumerate(value):
-                    described[f"{name}.{k}"] = make_value(number, parameter.unit)
+                for index, number in enumerate(value):
+                    described[f"{name}.{index}"] = make_value(number, parameter.unit)
         for name, measurement in self.measured(values, so_far).items():
             described[f"{self.name}.{name}"] = measurement
         return described
@@ -804,13 +822,12 @@ class Control:
         Each is (k,) or (), in the parameter's unit, and differentiable in u.
         """
         values = self.values(u)
-        declared = [slot.parameter for slot in self.slots]
-        named = [
-            parameter.name
-            for parameter in declared
-            if not parameter.options and len(parameter.shape) < 2
-        ]
-        return {name: values[name] for name in named}
+        numbers = {}
+        for slot in self.slots:
+            parameter = slot.parameter
+            if not parameter.options and len(parameter.shape) < 2:
+                numbers[parameter.name] = values[parameter.name]
+        return numbers
 
     def get_printable_colors(self, u: Tensor) -> Tensor | None:
         """Return the searched colors that a printer would print; None without any.
@@ -824,7 +841,7 @@ class Control:
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return images worth storing; see `artifacts`."""
+        """Return images worth storing; see `get_artifact_images`."""
         return {}
 
     def get_artifact_images(
@@ -839,7 +856,7 @@ class Control:
     def kept_files(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, bytes]:
-        """Return other files worth storing; see `files`."""
+        """Return other files worth storing; see `get_artifact_files`."""
         return {}
 
     def get_artifact_files(

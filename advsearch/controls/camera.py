@@ -64,6 +64,9 @@ class CameraControl(Control):
     """An orbit around the object, the lens, and the exposure."""
 
     kind = "camera"
+    photograph_refusal = (
+        "the photograph was taken from one place, through one lens, at one exposure"
+    )
     parameters = (
         *CAMERA[:-1],
         _moving(
@@ -134,8 +137,13 @@ class CameraControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Check the settings against the scene, and add the lens that they need.
 
-        Raises InputError: the scene has another camera, two settings are the same
-        thing, or its lens does not support one.
+        Distortion coefficients need a camera model: without one, a pinhole's is added.
+        An aperture or a focus needs a thin lens, in a scene without a camera model. If
+        the camera would always drive against the traffic, a remark is added.
+
+        Raises:
+            InputError: the scene has another camera, two settings are the same thing,
+                or its lens does not support one.
         """
         if scene.camera != ORBIT_CAMERA:
             raise InputError(
@@ -211,8 +219,11 @@ class CameraControl(Control):
         return "shift_x" in self.specs or "shift_y" in self.specs
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter with the default and the range of the scene's own
-        camera.
+        """Return a parameter with the default and the range of the scene's own camera.
+
+        Defaults are those of the scene's lens and pose. The range is the preset's, if
+        the scene has one; around a road vehicle it is that of heights of road users in
+        place of the elevation; a distance has a multiple of its default.
         """
         parameter = adapt_length_unit(
             super().resolve_parameter(parameter), self.scene.object.metres is not None
@@ -225,37 +236,25 @@ class CameraControl(Control):
             default = scene.camera_model.values[name]
         elif name in ("distance", "focus", "sizes"):
             fixed_lens_scene = self._with_fixed_lens()
-            distance = float(
-                np.linalg.norm(
-                    camera_to_world(fixed_lens_scene)[:3, 3]
-                    - compute_center(fixed_lens_scene)
-                )
-            )
+            camera_position = camera_to_world(fixed_lens_scene)[:3, 3]
+            offset = camera_position - compute_center(fixed_lens_scene)
+            distance = float(np.linalg.norm(offset))
             default = distance * (1.0 if name == "sizes" else scene.metres)
         elif name == "height":
-            default = (
-                float(camera_to_world(self._with_fixed_lens())[2, 3]) * scene.metres
-            )
+            camera_height = float(camera_to_world(self._with_fixed_lens())[2, 3])
+            default = camera_height * scene.metres
         elif name == "focal_length":
-            default = (
-                SENSOR_WIDTH
-                / 2.0
-                / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
-            )
+            half_fov = math.radians(scene.number("camera.fov")) / 2.0
+            default = SENSOR_WIDTH / 2.0 / math.tan(half_fov)
         preset = PRESETS.get(scene.preset)
-        if preset is not None:
+        if preset is not None and name == "azimuth":
+            reach = preset.search_azimuth
             scene_azimuth = scene.number("camera.azimuth")
-            azimuth_range = (
-                (0.0, 360.0)
-                if preset.search_azimuth >= 180.0
-                else (
-                    scene_azimuth - preset.search_azimuth,
-                    scene_azimuth + preset.search_azimuth,
-                )
-            )
-            search = (
-                azimuth_range if name == "azimuth" else preset.search_ranges.get(name)
-            )
+            search = (scene_azimuth - reach, scene_azimuth + reach)
+            if reach >= 180.0:
+                search = (0.0, 360.0)
+        elif preset is not None:
+            search = preset.search_ranges.get(name)
         elif is_road_vehicle(scene.object) and name == "elevation":
             search = None
         elif is_road_vehicle(scene.object) and name == "height":
@@ -265,13 +264,18 @@ class CameraControl(Control):
         return replace(parameter, default=default, search=search)
 
     def setting_name(self, parameter: Parameter) -> str:
-        same = {"focal_length": "camera.fov", "sizes": "camera.distance"}
-        return same.get(parameter.name, super().setting_name(parameter))
+        equivalent_settings = {"focal_length": "camera.fov", "sizes": "camera.distance"}
+        return equivalent_settings.get(parameter.name, super().setting_name(parameter))
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the camera's pose, lens, focus, shift and exposure."""
+        """Return the camera's pose, lens, focus, shift and exposure.
+
+        The distance is that of `sizes` or `distance`, if the user set one of them, or
+        the scene's setting; else the object is framed as the field of view requires. A
+        camera model has its own numbers in place of the field of view and the shift.
+        """
         scene = self.scene
         fov = values["fov"]
         if "focal_length" in self.specs:
@@ -310,7 +314,12 @@ class CameraControl(Control):
     def _compute_model_numbers(
         self, model: CameraModel, values: Values, fov: Tensor
     ) -> Tensor:
-        """Return the numbers (17,) of the camera's model."""
+        """Return the numbers (17,) of the camera's model, in the order of
+        `NUMBER_NAMES`.
+
+        A model without a name is a pinhole whose focal lengths are those of the field
+        of view; coefficients that were set replace the model's.
+        """
         model_values = {
             name: torch.tensor(value) for name, value in model.values.items()
         }
@@ -346,11 +355,15 @@ class CameraControl(Control):
         return self.scene
 
     def _compute_pose(self, values: Values, distance: Tensor) -> Tensor:
-        """Return the pose (4, 4) on the orbit, at a distance () in object sizes."""
+        """Return the pose (4, 4) on the orbit, at a distance () in object sizes.
+
+        If the height counts, the elevation follows from it: if the user set the height,
+        or if neither height nor elevation is set and the scene states a height or it is
+        searched.
+        """
         azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
         elevation = torch.deg2rad(values["elevation"])
         roll = torch.deg2rad(values["roll"])
-        # above the ground, so that the elevation follows
         keeps_height = "height" in self.specs
         if not {"elevation", "height"} & self.specs.keys():
             is_height_searched = any(

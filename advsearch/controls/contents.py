@@ -62,13 +62,12 @@ WATER_TINT = (0.86, 0.94, 0.95)
 # how fast coffee and milk make water opaque: a tenth of them hides half of the vessel's
 # floor
 OPACITY_RATE = 7.0
-SUM_TOLERANCE = 1e-6  # how far proportions may miss one
-DISK_RADIUS_FRACTION = (
-    0.995  # the disc ends this close to the wall, as a share of its distance
-)
+SUM_TOLERANCE = 1e-6  # of the sum of proportions, which is 1
+# radius of the disk as a fraction of the distance of the wall
+DISK_RADIUS_FRACTION = 0.995
 SINKING_LEVEL = 0.02
-"""Below this level the disc is drawn together and sunk into the floor, so that an empty
-vessel shows none of it.
+"""Below this level the disk shrinks and sinks into the floor, so that an empty vessel
+shows none of it.
 """
 LIQUID_MATERIAL = assets.Material(roughness=0.08, specular=0.5)
 
@@ -90,7 +89,10 @@ class Vessel:
 
 @lru_cache(maxsize=8)
 def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
-    """Find the inside of an object in its default pose; None if it is no vessel."""
+    """Find the inside of an object in its default pose; None if it is no vessel.
+
+    The wall is found by level rays from the axis of the largest basin, at even heights.
+    """
     mesh = asset.mesh
     basin = _find_basin(mesh)
     if basin is None:
@@ -98,9 +100,11 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     axis, floor, rim = basin
     depth = rim - floor
     heights = np.linspace(floor, floor + FILL_LIMIT * depth, WALL_ROWS)
-    # a ray along a flat floor would see anything
-    lowest = floor + 0.004 * depth
-    rows = [_find_wall(mesh, axis, max(float(height), lowest)) for height in heights]
+    # just above the floor, since a ray along a flat floor might hit anything
+    min_height = floor + 0.004 * depth
+    rows = [
+        _find_wall(mesh, axis, max(float(height), min_height)) for height in heights
+    ]
     distances, faces = zip(*rows, strict=True)
     radii = _fill_missed_radii(np.stack(distances))
     if radii is None:
@@ -143,10 +147,12 @@ def _mean_face_color(
 
 
 def _find_basin(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float] | None:
-    """Find the largest basin of a mesh.
+    """Find the largest basin of a mesh: where most water would stand.
 
     Returns:
-        Its axis (2,), its floor and its rim; None if there is none worth the name.
+        Its axis (2,), which is the center of the water seen from above, and the heights
+            of its floor and its rim; None if it is too shallow or its opening too
+            small.
     """
     corner, cell, ground = _compute_height_map(mesh)
     water = _fill_with_water(ground)
@@ -203,6 +209,7 @@ def _draw_edges(
         positions: (F, 3, 2) of the corners, in cells.
         heights: (F, 3) of the corners.
     """
+    # 9 points of each edge
     for fraction in np.linspace(0.0, 1.0, 9):
         for begin, end in ((0, 1), (1, 2), (2, 0)):
             edge = positions[:, end] - positions[:, begin]
@@ -238,11 +245,14 @@ def _fill_with_water(ground: assets.Float64Array) -> assets.Float64Array:
 def _find_wall(
     mesh: assets.Mesh, axis: assets.Float64Array, height: float
 ) -> tuple[assets.Float64Array, assets.IntArray]:
-    """Cast level rays from the axis at one height, in COLUMNS directions.
+    """Cast level rays from the axis at a height, in K = `WALL_DIRECTIONS` directions.
+
+    A face is cut at the height into a segment; a ray hits a segment if its ends lie on
+    different sides of the ray's line, in front of the axis.
 
     Returns:
-        Distance (COLUMNS,) of the first surface in each direction, infinite where there
-        is none; and its face, or -1.
+        Distance (K,) of the first surface in each direction, infinite if there is none;
+        and its face (K,), or -1.
     """
     face, first_end, second_end = _cut_faces(mesh, height)
     if not len(face):
@@ -251,7 +261,7 @@ def _find_wall(
     second_end = second_end - axis
     angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
     ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    # on which side of each ray the ends are, (COLUMNS, S)
+    # (K, S) cross products, whose signs are the sides of each ray that the ends are on
     first_side = ray[:, :1] * first_end[:, 1] - ray[:, 1:] * first_end[:, 0]
     second_side = ray[:, :1] * second_end[:, 1] - ray[:, 1:] * second_end[:, 0]
     is_crossed = (first_side > 0.0) != (second_side > 0.0)
@@ -277,14 +287,15 @@ def _cut_faces(
     corners = corners[face]
     is_above = is_above[face]
     index = np.arange(len(face))
-    # the corner that is on its side of the plane by itself
-    single = np.where(
+    # (S,) the corner that is on its side of the plane by itself
+    apex_corner = np.where(
         is_above.sum(axis=1) == 1, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
     )
-    apex = corners[index, single]
+    apex = corners[index, apex_corner]
     ends = []
     for step in (1, 2):
-        other = corners[index, (single + step) % 3]
+        other = corners[index, (apex_corner + step) % 3]
+        # never divided by 0
         rise = np.where(other[:, 2] == apex[:, 2], 1.0, other[:, 2] - apex[:, 2])
         fraction = (height - apex[:, 2]) / rise
         ends.append(apex[:, :2] + fraction[:, None] * (other[:, :2] - apex[:, :2]))
@@ -293,6 +304,15 @@ def _cut_faces(
 
 class ContentsControl(Control):
     """What a vessel is filled with, and how high: water, coffee and milk.
+
+    Proportions add up to 1 at every point of the unit box: a stick of length 1 is cut
+    into them, one ingredient after the other, and a coordinate is where it is cut in
+    the range that is possible there.
+
+    Attributes:
+        proportion_bounds: lower and upper bound of each ingredient: those that were
+            set; all that the others leave, if it is searched; or the rest, if it is
+            not.
 
     Raises:
         InputError: proportions that cannot add up to one.
@@ -333,8 +353,6 @@ class ContentsControl(Control):
         Raises InputError: they cannot add up to 1.
         """
         super().__init__(name, **settings)
-        # of every ingredient: as set; free if not set and searched; or what the others
-        # leave
         self.proportion_bounds = self._read_bounds()
         least_total = sum(lower for lower, _ in self.proportion_bounds.values())
         self._check_total(least_total)
@@ -342,6 +360,7 @@ class ContentsControl(Control):
             isinstance(self.specs.get(name), Range) for name in INGREDIENTS
         )
         rest = max(0.0, 1.0 - least_total)
+        # If nothing is searched, the first of these that is not set has all the rest.
         for name in ("coffee", "water", "milk"):
             if name in self.proportion_bounds:
                 continue
@@ -383,14 +402,17 @@ class ContentsControl(Control):
         """
         largest_total = sum(upper for _, upper in self.proportion_bounds.values())
         all_set = len(self.proportion_bounds) == len(INGREDIENTS)
-        too_little = all_set and largest_total < 1.0 - SUM_TOLERANCE
-        if least_total <= 1.0 + SUM_TOLERANCE and not too_little:
+        is_too_little = all_set and largest_total < 1.0 - SUM_TOLERANCE
+        if least_total <= 1.0 + SUM_TOLERANCE and not is_too_little:
             return
         stated = []
         for name in INGREDIENTS:
             if name in self.proportion_bounds:
-                ends = dict.fromkeys(f"{end:g}" for end in self.proportion_bounds[name])
-                stated.append(f"{name} {' to '.join(ends)}")
+                # a dict, so that equal bounds are named once
+                bounds = dict.fromkeys(
+                    f"{bound:g}" for bound in self.proportion_bounds[name]
+                )
+                stated.append(f"{name} {' to '.join(bounds)}")
         raise InputError(
             f"`controls` {self.name}: expected proportions of water, milk and "
             f"coffee that add up to 1, got {', '.join(stated)}; "
@@ -467,18 +489,22 @@ class ContentsControl(Control):
     # ---- proportions
 
     def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        """Return where the stick may be cut, from 0 to 1 of what is possible there."""
+        """Return the range of an ingredient's cut, from 0 to 1 of what is possible
+        there.
+
+        The last ingredient with a range has no cut: it is what the others leave.
+        """
         if parameter.name not in INGREDIENTS:
             return super().get_spec(parameter)
-        free = [
-            name
-            for name in INGREDIENTS
-            if self.proportion_bounds[name][1] > self.proportion_bounds[name][0]
-        ]
-        return Range(0.0, 1.0) if parameter.name in free[:-1] else Fixed(0.0)
+        ranged = []
+        for name in INGREDIENTS:
+            lower, upper = self.proportion_bounds[name]
+            if upper > lower:
+                ranged.append(name)
+        return Range(0.0, 1.0) if parameter.name in ranged[:-1] else Fixed(0.0)
 
     def cut_proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Cut the stick: return proportions that add up to one; differentiable.
+        """Return proportions that add up to one, by ingredient; differentiable.
 
         Args:
             cuts: coordinates in [0, 1] by ingredient.
@@ -507,7 +533,8 @@ class ContentsControl(Control):
     def _possible_range(self, name: str, left: Tensor) -> tuple[Tensor, Tensor]:
         """Return the least and the largest proportion () that an ingredient may have.
 
-        Those after it have to make up one.
+        They are its own bounds, as far as the ingredients after it can make up the
+        rest.
 
         Args:
             name: of the ingredient.
@@ -537,27 +564,30 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
         vessel_color: linear reflectance (3,) of the vessel's inside.
     """
     amounts = dict(zip(INGREDIENTS, proportions, strict=True))
-    absorbed = proportions.new_zeros(3)
-    scattered = proportions.new_tensor(1e-6)
+    absorption = proportions.new_zeros(3)
+    scattering = proportions.new_tensor(1e-6)  # not 0, of pure water
     for name, reflectance in REFLECTANCE.items():
-        deep = proportions.new_tensor(reflectance)
-        scattering = amounts[name] * SCATTERING[name]
-        absorbed = absorbed + scattering * (1.0 - deep).square() / (2.0 * deep)
-        scattered = scattered + scattering
-    ratio = absorbed / scattered
-    milky = 1.0 + ratio - (ratio.square() + 2.0 * ratio + 1e-9).sqrt()
+        deep_reflectance = proportions.new_tensor(reflectance)
+        part = amounts[name] * SCATTERING[name]
+        # K / S of the ingredient, by its reflectance at infinite depth
+        absorption_ratio = (1.0 - deep_reflectance).square()
+        absorption = absorption + part * absorption_ratio / (2.0 * deep_reflectance)
+        scattering = scattering + part
+    ratio = absorption / scattering
+    # reflectance of an infinitely deep mixture; 1e-9 keeps the derivative finite at 0
+    mixed_color = 1.0 + ratio - (ratio.square() + 2.0 * ratio + 1e-9).sqrt()
     opacity = 1.0 - torch.exp(-OPACITY_RATE * (amounts["milk"] + amounts["coffee"]))
-    return opacity * milky + (1.0 - opacity) * vessel_color * proportions.new_tensor(
-        WATER_TINT
-    )
+    floor_color = (1.0 - opacity) * vessel_color * proportions.new_tensor(WATER_TINT)
+    return opacity * mixed_color + floor_color
 
 
 def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
-    """Return the vertices (1 + COLUMNS, 3) of the liquid's surface, the middle first.
+    """Return the vertices (1 + K, 3) of the liquid's surface, the center first.
 
-    In mesh coordinates. The wall's distance is interpolated between the heights at
-    which it is known, so the vertices are differentiable in the level, with kinks at
-    those heights.
+    They are in mesh coordinates, K = `WALL_DIRECTIONS`. The wall's distance is
+    interpolated between the heights at which it is known, so the vertices are
+    differentiable in the level, with kinks at those heights. Below `SINKING_LEVEL` the
+    surface shrinks and sinks into the floor.
     """
     heights = torch.from_numpy(vessel.heights).to(level)
     radii = torch.from_numpy(vessel.radii).to(level)
@@ -566,7 +596,7 @@ def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     radius = (
         torch.lerp(radii[row], radii[row + 1], position - row) * DISK_RADIUS_FRACTION
     )
-    # 1 above the level at which the disk is drawn together
+    # size of the disk: 1 above the level at which it begins to shrink
     opening = (level / SINKING_LEVEL).clamp(1e-3, 1.0)
     depth = heights[-1] - heights[0]
     height = heights[0] + level * depth - (1.0 - opening) * SINKING_LEVEL * depth
@@ -575,7 +605,6 @@ def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     )
     circle = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
     rim = circle * (radius * opening)[:, None]
-    flat = torch.cat([rim.new_zeros(1, 2), rim]) + torch.from_numpy(vessel.axis).to(
-        level
-    )
-    return torch.cat([flat, height.expand(len(flat), 1)], dim=1)
+    axis = torch.from_numpy(vessel.axis).to(level)
+    positions = torch.cat([rim.new_zeros(1, 2), rim]) + axis  # (1 + K, 2)
+    return torch.cat([positions, height.expand(len(positions), 1)], dim=1)

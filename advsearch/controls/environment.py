@@ -53,6 +53,9 @@ class EnvironmentControl(Control):
     """
 
     kind = "environment"
+    photograph_refusal = (
+        "the photograph was taken in one light, and shows its own surroundings"
+    )
     parameters = (
         Parameter.named(
             "which",
@@ -94,26 +97,24 @@ class EnvironmentControl(Control):
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters, with the files that `which` names among its
-        options.
+        """Return the parameters, with files of the setting `which` among its options.
+
+        The setting is a name, a list of names, or a mapping with "choices".
         """
         which, *others = cls.parameters
         setting = settings.get("which") if isinstance(settings, Mapping) else None
-        setting = setting.get("choices") if isinstance(setting, Mapping) else setting
-        names = (
-            [setting]
-            if isinstance(setting, str) or not isinstance(setting, Sequence)
-            else setting
-        )
+        if isinstance(setting, Mapping):
+            setting = setting.get("choices")
+        names = setting
+        if isinstance(setting, str) or not isinstance(setting, Sequence):
+            names = [setting]
         files = [
             name
             for name in names
             if isinstance(name, str) and name not in which.options and is_path(name)
         ]
-        return (
-            replace(which, options=tuple(dict.fromkeys((*which.options, *files)))),
-            *others,
-        )
+        options = tuple(dict.fromkeys((*which.options, *files)))
+        return (replace(which, options=options), *others)
 
     def check_choices(self) -> None:
         epsilon = self.chosen["epsilon"]
@@ -126,10 +127,11 @@ class EnvironmentControl(Control):
             )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Take a fixed environment for the scene's own.
+        """Give the scene the first allowed environment, if its own is not allowed and
+        `which` is fixed or has a file.
 
-        So is the first of several where these are files, and the scene's own is none of
-        them.
+        Otherwise the scene keeps its own, which it must have. Notes of files, and one
+        on the ground that photographs of environments stand on, become remarks.
         """
         spec = self.specs.get("which")
         allowed = self.list_allowed_values("which", SCENE_ENVIRONMENT)
@@ -139,60 +141,57 @@ class EnvironmentControl(Control):
             if _is_file(name)
         }
         notes = [note for asset in maps.values() for note in asset.warnings]
-        if (
+        is_own_allowed = (
             SCENE_ENVIRONMENT in allowed
             or self._find_scene_environment_name(scene) is not None
-            or not (isinstance(spec, Fixed) or maps)
-        ):
-            lit = scene.require_environment(f"`controls` {self.name}")
-            if (
-                maps
-                and scene.photograph is None
-                and not lit.photographed
-                and scene.number("ground.size") > 0.0
-            ):
+        )
+        if not is_own_allowed and (isinstance(spec, Fixed) or maps):
+            name = str(allowed[0])
+            scene = replace(
+                scene, environment=_load_environment(name), environment_spec=name
+            )
+        else:
+            own = scene.require_environment(f"`controls` {self.name}")
+            shows_photograph = scene.photograph is not None or own.photographed
+            if maps and not shows_photograph and scene.number("ground.size") > 0.0:
                 names = ", ".join(Path(name).name for name in maps)
                 notes.append(
                     f"{names}: the object stands on the scene's table there, too; "
                     "ground.kind=photograph shows the "
                     "floor of each picture instead"
                 )
-        else:
-            name = str(allowed[0])
-            scene = replace(
-                scene, environment=_load_environment(name), environment_spec=name
-            )
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter; the default of `which` is the scene's own environment.
 
-        It has its name where only that is allowed.
+        That is `SCENE_ENVIRONMENT`, or its name if the user allows it by name only.
         """
         if parameter.name != "which":
             return super().resolve_parameter(parameter)
-        control_environment = (
-            None
-            if SCENE_ENVIRONMENT in self.list_allowed_values("which", SCENE_ENVIRONMENT)
-            else self._find_scene_environment_name(self.scene)
-        )
-        return replace(parameter, default=control_environment or SCENE_ENVIRONMENT)
+        default: str | None = SCENE_ENVIRONMENT
+        if not self._allows_scene_environment:
+            default = self._find_scene_environment_name(self.scene)
+        return replace(parameter, default=default or SCENE_ENVIRONMENT)
+
+    @property
+    def _allows_scene_environment(self) -> bool:
+        """Whether `SCENE_ENVIRONMENT` is among the allowed values of `which`."""
+        return SCENE_ENVIRONMENT in self.list_allowed_values("which", SCENE_ENVIRONMENT)
 
     def setting_name(self, parameter: Parameter) -> str:
-        return (
-            ENVIRONMENT
-            if parameter.name == "which"
-            else super().setting_name(parameter)
-        )
+        if parameter.name == "which":
+            return ENVIRONMENT
+        return super().setting_name(parameter)
 
     def get_scene_value(self, parameter: Parameter) -> ParameterValue:
-        if parameter.name != "which" or SCENE_ENVIRONMENT in self.list_allowed_values(
-            "which", SCENE_ENVIRONMENT
-        ):
+        """Return the value in the scene as it was described; of `which` the name of
+        its environment, unless the default stands for that.
+        """
+        if parameter.name != "which" or self._allows_scene_environment:
             return parameter.default
-        return (
-            self._find_scene_environment_name(self.scene) or self.scene.environment_spec
-        )
+        name = self._find_scene_environment_name(self.scene)
+        return name or self.scene.environment_spec
 
     def _find_scene_environment_name(self, scene: SceneDescription) -> str | None:
         """Return the name of the scene's own environment among the options.
@@ -218,7 +217,11 @@ class EnvironmentControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the map (H, W, 3) of linear radiance."""
+        """Return the map (H, W, 3) of linear radiance.
+
+        The scene's rotation and exposure are in its own map already, so that only the
+        differences from them are applied.
+        """
         name = self.instance_parameters[0].options[int(values["which"])]
         device = values["rotation"].device
         is_scene_map = name == SCENE_ENVIRONMENT or _is_scene_environment(
@@ -268,25 +271,27 @@ def _load_environment(name: str) -> EnvironmentAsset:
     if not _is_file(name):
         return library.load_environment(name)
     try:
-        about = os.stat(name)
+        status = os.stat(name)
     except OSError:
-        return import_environment(name)  # which says what is wrong
+        return import_environment(name)  # which raises the error
     return _read_environment(
-        os.path.realpath(name), name, about.st_mtime_ns, about.st_size
+        os.path.realpath(name), name, status.st_mtime_ns, status.st_size
     )
 
 
 @lru_cache(maxsize=64)
 def _read_environment(real_path: str, name: str, *version: int) -> EnvironmentAsset:
+    """Return the environment in a file; cached by its path, time and size."""
     return import_environment(name)
 
 
 @lru_cache(maxsize=64)
 def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
-    """Return the scene's own map, or another one, (H, W, 3) linear radiance.
+    """Return the scene's own map (None), or that of another environment, (H, W, 3)
+    linear radiance.
 
-    Another one is as bright as keeps the exposure of the image; the ground stays of the
-    same kind.
+    If the scene is metered, another map is scaled so that the metered gain of the image
+    stays that of the scene.
     """
     scene_environment = scene.require_environment("the environment")
     if asset is None:
@@ -294,11 +299,9 @@ def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor
     other_scene = replace(
         scene, environment=replace(asset, photographed=scene_environment.photographed)
     )
-    factor = (
-        compute_metered_gain(other_scene) / compute_metered_gain(scene)
-        if scene.metered
-        else 1.0
-    )
+    factor = 1.0
+    if scene.metered:
+        factor = compute_metered_gain(other_scene) / compute_metered_gain(scene)
     return torch.from_numpy(asset.radiance.copy()) * factor
 
 

@@ -57,18 +57,15 @@ as what they cover.
 BANDWIDTH = 1.8  # standard deviation of the kernel, in cells
 # largest displacement gradient along a face; below 1 no face can turn over
 MAX_FACE_STRAIN = 0.7
-MAX_WALL_STRAIN = (
-    0.5  # largest change of the distance between two walls, as a share of it
-)
-MAX_WALL_DISTANCE = (
-    0.3  # walls further apart than this, in extents, are not held together
-)
-MAX_OPPOSITE_COSINE = (
-    -0.3
-)  # largest cosine between the normals of the two sides of a wall
+# largest change of the distance between the two sides of a wall, as a fraction of it
+MAX_WALL_STRAIN = 0.5
+# sides that are further apart than this, in extents, count as no wall
+MAX_WALL_DISTANCE = 0.3
+# largest cosine between the normals of the two sides of a wall
+MAX_OPPOSITE_COSINE = -0.3
 MIN_FACE_HEIGHT = 2e-3
-"""Faces whose height is less than this share of their longest edge are slivers: their
-strain is not looked at.
+"""Faces whose height is less than this fraction of their longest edge are slivers,
+whose strain is not limited.
 """
 NORM_EXPONENT = 32  # exponent p of the norm that stands in for a maximum
 # distance over which a push on one vertex spreads, in extents (form large-steps)
@@ -77,34 +74,39 @@ WALL_WEIGHT = 4.0  # weight of a link through a wall, in edges of the mesh
 
 
 class WeldedMesh:
-    """A mesh whose seams are welded: what a displacement acts on."""
+    """A mesh whose seams are welded: what a displacement acts on.
+
+    Attributes:
+        position_of_vertex: (V,) index of the position of each vertex.
+        positions: (P, 3) distinct positions of vertices.
+        extent: largest side of the bounding box.
+        faces: (F, 3) indices of positions, without faces that have no area.
+        normals: (P, 3) unit normals, the mean of the faces' weighted by area.
+        walls: (W, 2) indices of positions on opposite sides of a wall or of a gap.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         """Weld the seams of a mesh, and find its walls."""
-        self.position_of_vertex, count = weld_vertices(
-            mesh
-        )  # (V,) the position of each vertex
-        self.positions = np.zeros((count, 3))  # distinct vertex positions
+        self.position_of_vertex, count = weld_vertices(mesh)
+        self.positions = np.zeros((count, 3))
         self.positions[self.position_of_vertex] = mesh.vertices
         self.extent = float(np.ptp(self.positions, axis=0).max())
         faces = self.position_of_vertex[mesh.faces]
         area_vectors = compute_area_vectors(self.positions[faces])
-        # over positions, without those that have no area
         self.faces = faces[np.linalg.norm(area_vectors, axis=1) > 0.0]
         summed = np.zeros((count, 3))
         np.add.at(summed, faces.reshape(-1), np.repeat(area_vectors, 3, axis=0))
-        # weighted by area
-        self.normals = summed / np.maximum(
-            np.linalg.norm(summed, axis=1, keepdims=True), 1e-20
-        )
-        # (W, 2) positions on opposite sides of a wall or of a gap
+        lengths = np.linalg.norm(summed, axis=1, keepdims=True)
+        self.normals = summed / np.maximum(lengths, 1e-20)
         self.walls = self._find_walls()
 
     def _find_walls(self) -> IntArray:
         """Return pairs (W, 2) of positions on opposite sides of a wall or of a gap.
 
-        The partner of a position is the nearest one with an opposite normal, by
-        |x - y|^2 + b^2 |n + m|^2: a search in six dimensions.
+        The partner of a position x with the normal n is the nearest y with an opposite
+        normal m, by |x - y|^2 + b^2 |n + m|^2, b a tenth of the extent: a search in six
+        dimensions. A pair is a wall if the normals are opposite enough and the distance
+        is not too large, nor 0.
         """
         scaled_normals = 0.1 * self.extent * self.normals
         tree = cKDTree(np.hstack([self.positions, scaled_normals]))
@@ -123,7 +125,7 @@ class WeldedMesh:
 # ---- modes over space
 
 
-get_welded_mesh = lru_cache(maxsize=8)(WeldedMesh)  # of a mesh; kept in memory
+get_welded_mesh = lru_cache(maxsize=8)(WeldedMesh)  # of a mesh; cached
 
 
 def _compute_landmark_weights(
@@ -146,7 +148,8 @@ def _compute_landmark_weights(
 def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     """Return the smoothest displacement fields of a mesh that are no rigid motion.
 
-    Kept in memory.
+    They are combinations of the slowest functions of a diffusion map of landmarks,
+    extended to all positions (Nystrom). The result is cached.
 
     Args:
         mesh: in object sizes.
@@ -164,7 +167,8 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     energy = (1.0 - values) / width**2
     combination = _without_rotation(points, functions, mass, energy, count)
 
-    # Nystrom extension from the landmarks to all positions
+    # Nystrom extension from the landmarks to all positions; small eigenvalues are
+    # limited, since a division by them amplifies noise
     weights = _compute_landmark_weights(welded_mesh.positions, points, width, density)
     extended = weights @ (functions / np.maximum(values, 0.05))
     fields = np.einsum("ps,sck->pck", extended, combination)
@@ -191,8 +195,8 @@ def _diffusion_map(
     kernel /= density[:, None] * density[None, :]
     mass = kernel.sum(axis=1)
     symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
-    # by Lanczos, without entries too small to matter: dense solvers wait for all
-    # threads, which takes ten times as long on a machine with other work
+    # A sparse matrix without negligible entries, for the Lanczos method: dense solvers
+    # wait for all threads, which takes ten times as long on a busy machine.
     matrix = sparse.csr_matrix(
         np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0)
     )
@@ -201,13 +205,15 @@ def _diffusion_map(
     values, vectors = sparse_linalg.eigsh(
         matrix, n_scalars + 1, which="LA", v0=first_vector, ncv=n_lanczos
     )
-    falling = np.argsort(-values)[1:]  # the first is constant
-    functions = _signed(vectors[:, falling]) / np.sqrt(mass)[:, None]
-    return density, functions, mass, values[falling]
+    descending = np.argsort(-values)[1:]  # the function of the first is constant
+    functions = _fix_signs(vectors[:, descending]) / np.sqrt(mass)[:, None]
+    return density, functions, mass, values[descending]
 
 
-def _signed(vectors: Float64Array) -> Float64Array:
-    """Return columns with the sign that makes their largest entry positive."""
+def _fix_signs(vectors: Float64Array) -> Float64Array:
+    """Return columns with the sign that makes their largest entry positive, since
+    solvers return either sign.
+    """
     largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])]
     return np.asarray(vectors * np.where(largest < 0.0, -1.0, 1.0))
 
@@ -215,7 +221,8 @@ def _signed(vectors: Float64Array) -> Float64Array:
 def _landmarks(solid: WeldedMesh) -> tuple[Float64Array, float]:
     """Return points (N, 3) spread evenly over the surface, and the side of their cells.
 
-    At most `MAX_LANDMARKS`: each is the mean of the samples in one cube.
+    Each is the mean of the samples and vertices in a cubic cell. Cells are enlarged
+    until there are at most `MAX_LANDMARKS`.
     """
     corners = solid.positions[solid.faces]
     areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
@@ -260,13 +267,16 @@ def _without_rotation(
     n_scalars = functions.shape[1]
     center = (points * mass[:, None]).sum(axis=0) / mass.sum()
     turns = [np.cross(axis, points - center) for axis in np.eye(3)]
+    # (3, 3 S) coefficients of the rotations in the functions
     rotations = np.stack(
         [(functions.T @ (mass[:, None] * turn)).reshape(-1) for turn in turns]
     )
-    free = linalg.null_space(rotations)
-    reduced = free.T @ (np.repeat(energy, 3)[:, None] * free)
-    vectors = linalg.eigh(reduced)[1][:, : min(count, free.shape[1])]
-    combined = _signed(free @ vectors)
+    # (3 S, M) basis of the fields without rotation, and their energy in it
+    basis = linalg.null_space(rotations)
+    basis_energy = basis.T @ (np.repeat(energy, 3)[:, None] * basis)
+    _, vectors = linalg.eigh(basis_energy)  # ascending energy
+    n_fields = min(count, basis.shape[1])
+    combined = _fix_signs(basis @ vectors[:, :n_fields])
     return np.asarray(combined.reshape(n_scalars, 3, -1))
 
 
@@ -276,7 +286,12 @@ def _without_rotation(
 class Preconditioner:
     """Spreads pushes over the neighborhood of a welded mesh: `R (I + lambda L)^-2 p`.
 
-    Rigid motions are taken out.
+    L is the Laplacian of the mesh, and R takes rigid motions out (Nicolet, Jacobson and
+    Jakob 2021, "Large steps in inverse rendering of geometry").
+
+    Attributes:
+        _factor: of the sparse matrix I + lambda L.
+        _rigid: (3 P, 6) orthonormal basis of the rigid motions.
     """
 
     def __init__(self, welded_mesh: WeldedMesh) -> None:
@@ -297,18 +312,19 @@ class Preconditioner:
 
     def __call__(self, pushes: Tensor) -> Tensor:
         """Return displacements (P, 3) for pushes (P, 3), float64; differentiable."""
-        once: Tensor = _Solve.apply(pushes, self._factor)  # type: ignore[no-untyped-call]
-        smooth: Tensor = _Solve.apply(once, self._factor)  # type: ignore[no-untyped-call]
-        flat = smooth.reshape(-1)
-        rigid = self._rigid.to(flat.device)
-        return (flat - rigid @ (rigid.T @ flat)).reshape(smooth.shape)
+        solved: Tensor = _Solve.apply(pushes, self._factor)  # type: ignore[no-untyped-call]
+        smooth: Tensor = _Solve.apply(solved, self._factor)  # type: ignore[no-untyped-call]
+        vector = smooth.reshape(-1)
+        rigid = self._rigid.to(vector.device)
+        return (vector - rigid @ (rigid.T @ vector)).reshape(smooth.shape)
 
 
 def _wall_laplacian(solid: WeldedMesh) -> tuple[Any, float]:
-    """Return the Laplacian (P, P) of a mesh with links through its walls, sparse.
+    """Return the Laplacian (P, P) of a mesh with links through its walls, sparse, and
+    the mean length of an edge.
 
-    Edges are weighted by the inverse square of their length. The second value is the
-    mean length of an edge.
+    Edges are weighted by the inverse square of their length, links through walls by
+    `WALL_WEIGHT`.
     """
     count = len(solid.positions)
     edges = np.concatenate(
@@ -351,37 +367,48 @@ class _Solve(torch.autograd.Function):
 
 
 class DisplacementLimits:
-    """Holds displacements where the mesh stays whole, by one factor for all of it.
+    """Scales displacements by a common factor, so that the mesh stays intact.
 
         offsets = epsilon s d,    s = (1 + sum_i r_i^p)^(-1/p)
 
-    with `r_i` what each bound would be used up to, 1 being all of it: the length of d
-    at each place (1), the gradient of the displacement along each face
-    (`MAX_FACE_STRAIN`), and between the two sides of each wall (`MAX_WALL_STRAIN`). As
-    `s max r < 1`, no place moves further than epsilon, no face turns over (its tangent
-    map is I + B with ||B|| < 1, and so has a positive determinant), and walls and gaps
-    between places keep more than half their width. Epsilon is in the mesh's units.
+    with r_i the fraction of each bound that epsilon d would use up: of the length of d
+    at each position (1), the gradient of the displacement along each face
+    (`MAX_FACE_STRAIN`), and the change between the two sides of each wall
+    (`MAX_WALL_STRAIN`). As `s max r < 1`, no position moves further than epsilon, no
+    face turns over (its tangent map is I + B with ||B|| < 1, and so has a positive
+    determinant), and walls and gaps keep more than half their width.
+
+    Attributes:
+        epsilon: largest displacement, in the mesh's units.
+        _faces: (F, 3) indices of positions, without slivers.
+        _inverse_axes: (F, 3) elements of the matrix that turns differences along the
+            edges of a face into a gradient, see `_compute_squared_gradients`.
+        _walls: (W, 2) indices of positions.
+        _wall_widths: (W,) distances of the sides.
+        _positions: (P, 3) of the mesh.
     """
 
     def __init__(self, welded_mesh: WeldedMesh, epsilon: float) -> None:
         """Compute what each bound needs of the mesh."""
         self.epsilon = epsilon
         corners = welded_mesh.positions[welded_mesh.faces]
-        first = corners[:, 1] - corners[:, 0]
-        second = corners[:, 2] - corners[:, 0]
-        edges = np.stack([first, second, first - second])
+        edge_1 = corners[:, 1] - corners[:, 0]
+        edge_2 = corners[:, 2] - corners[:, 0]
+        edges = np.stack([edge_1, edge_2, edge_1 - edge_2])
         longest = np.linalg.norm(edges, axis=-1).max(axis=0)
-        double_area = np.linalg.norm(np.cross(first, second), axis=1)
+        double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
         is_sound = double_area > MIN_FACE_HEIGHT * longest**2
-        first = first[is_sound]
-        second = second[is_sound]
+        edge_1 = edge_1[is_sound]
+        edge_2 = edge_2[is_sound]
         double_area = double_area[is_sound]
-        length = np.linalg.norm(first, axis=1)
-        along_first = (first * second).sum(axis=1) / length
-        # gradient along the face's two axes: [d1 d2] [[length, along], [0, height]]^-1
+        # In axes along edge 1 and across it, the edges are (length, 0) and (along,
+        # height). With d1 and d2 the differences of the displacement along them, its
+        # gradient is [d1 d2] [[length, along], [0, height]]^-1.
+        length = np.linalg.norm(edge_1, axis=1)
+        along_1 = (edge_1 * edge_2).sum(axis=1) / length
         self._faces = torch.from_numpy(welded_mesh.faces[is_sound])
         self._inverse_axes = torch.from_numpy(
-            np.stack([1.0 / length, along_first / length, length / double_area], axis=1)
+            np.stack([1.0 / length, along_1 / length, length / double_area], axis=1)
         )
         self._walls = torch.from_numpy(welded_mesh.walls)
         wall_vectors = (
@@ -400,35 +427,38 @@ class DisplacementLimits:
         Returns:
             (N,): of the length at each position, of each face, of each wall.
         """
-        device = field.device
-        face_corners = self._faces.to(device)
-        inverse_axes = self._inverse_axes.to(device)
-        walls = self._walls.to(device)
-        wall_widths = self._wall_widths.to(device)
+        walls = self._walls.to(field.device)
+        wall_widths = self._wall_widths.to(field.device)
+        squared_gradient = self._compute_squared_gradients(field)
+        face_usage = squared_gradient * (self.epsilon / MAX_FACE_STRAIN) ** 2
         # index_select, for its derivative is ten times faster than that of an index
-        corners = [field.index_select(0, corner) for corner in face_corners.T]
-        first = corners[1] - corners[0]
-        second = corners[2] - corners[0]
-        gradient_1 = first * inverse_axes[:, :1]
-        gradient_2 = (second - first * inverse_axes[:, 1:2]) * inverse_axes[:, 2:]
-        of_faces = (gradient_1.square() + gradient_2.square()).sum(dim=1) * (
-            self.epsilon / MAX_FACE_STRAIN
-        ) ** 2
         difference = field.index_select(0, walls[:, 0]) - field.index_select(
             0, walls[:, 1]
         )
-        of_walls = (
+        wall_usage = (
             difference.square().sum(dim=1)
             * (self.epsilon / MAX_WALL_STRAIN / wall_widths).square()
         )
-        return torch.cat([field.square().sum(dim=1), of_faces, of_walls])
+        return torch.cat([field.square().sum(dim=1), face_usage, wall_usage])
+
+    def _compute_squared_gradients(self, field: Tensor) -> Tensor:
+        """Return the squared norm (F,) of the gradient of a field (P, 3) on each face."""
+        inverse_axes = self._inverse_axes.to(field.device)
+        face_corners = self._faces.to(field.device)
+        corners = [field.index_select(0, corner) for corner in face_corners.T]
+        d1 = corners[1] - corners[0]
+        d2 = corners[2] - corners[0]
+        gradient_1 = d1 * inverse_axes[:, :1]
+        gradient_2 = (d2 - d1 * inverse_axes[:, 1:2]) * inverse_axes[:, 2:]
+        return (gradient_1.square() + gradient_2.square()).sum(dim=1)
 
     def limit(self, field: Tensor) -> Tensor:
         """Return the offsets (P, 3) for a field d (P, 3), float64; differentiable."""
-        squares = self.compute_squared_usage(field)
-        # keeps the power within the range of floats
-        largest = squares.detach().max().clamp_min(1.0)
-        powers = (squares / largest).pow(NORM_EXPONENT // 2).sum()
+        squared_usage = self.compute_squared_usage(field)
+        # All is divided by the largest, so that powers stay within the range of floats:
+        # (1 + sum r^p) = largest^(p/2) * total, with `largest` squared as usages are.
+        largest = squared_usage.detach().max().clamp_min(1.0)
+        powers = (squared_usage / largest).pow(NORM_EXPONENT // 2).sum()
         total = powers + largest ** (-NORM_EXPONENT // 2)
         return self.epsilon * field * (total ** (-1.0 / NORM_EXPONENT) / largest.sqrt())
 
@@ -458,7 +488,16 @@ ESTIMATORS = ("material", "differences")
 
 
 class GeometryControl(Control):
-    """A smooth change of the object's shape, at most so far."""
+    """A smooth change of the object's shape, at most so far.
+
+    Attributes:
+        form: one of `FORMS`, what the coordinates are.
+        _mesh: that is changed.
+        _offsets_input: name of the scene input with the offsets of its vertices.
+        _index: (V,) position of each vertex, see `WeldedMesh`.
+        _limits: of the displacement.
+        _field: map from coordinates in [-1, 1] to a displacement (P, 3), not limited.
+    """
 
     kind = "geometry"
     of_a_mesh = True
@@ -517,9 +556,9 @@ class GeometryControl(Control):
         """Compute the modes, or the preconditioner, of the mesh in the scene."""
         self._offsets_input = f"{self.mesh}.offsets"
         self._mesh = self.get_mesh(self.scene).mesh
-        solid = get_welded_mesh(self._mesh)
-        self._index = torch.from_numpy(solid.position_of_vertex)
-        self._limits = DisplacementLimits(solid, float(self.chosen["epsilon"]))
+        welded_mesh = get_welded_mesh(self._mesh)
+        self._index = torch.from_numpy(welded_mesh.position_of_vertex)
+        self._limits = DisplacementLimits(welded_mesh, float(self.chosen["epsilon"]))
         if self.form == "modes":
             modes = torch.from_numpy(
                 compute_shape_modes(self._mesh, int(self.chosen["modes"]))
@@ -527,8 +566,8 @@ class GeometryControl(Control):
             group = Group("amplitudes", modes.shape[2], ESTIMATORS)
             self._field: Callable[[Tensor], Tensor] = lambda a: modes.to(a.device) @ a
         else:
-            precondition = Preconditioner(solid)
-            group = Group("pushes", 3 * len(solid.positions), ESTIMATORS)
+            precondition = Preconditioner(welded_mesh)
+            group = Group("pushes", 3 * len(welded_mesh.positions), ESTIMATORS)
             self._field = lambda a: PUSH_FACTOR * precondition(a.reshape(-1, 3))
         self.groups = (group,)
         self.start = torch.full((group.size,), 0.5)

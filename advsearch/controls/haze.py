@@ -39,6 +39,7 @@ class HazeControl(Control):
     """A uniform haze around camera and object: how dense it is, and its colour."""
 
     kind = "haze"
+    photograph_refusal = "haze would lie before the object and not before the rest"
     amount = "density"
     parameters = (
         Parameter.number(
@@ -58,7 +59,12 @@ class HazeControl(Control):
     )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter with the value of the scene's own haze, if it has one."""
+        """Return a parameter with the value of the scene's own haze, if it has one.
+
+        Without one the density is 0 in the clean scene; but if only the color is
+        searched, it is `DEFAULT_DENSITY`, since the color would not show otherwise. The
+        adjoint of a density needs a range that does not begin at 0.
+        """
         scene_haze = _find_haze(self.scene)
         default = parameter.default
         if parameter.name != "density":

@@ -41,9 +41,8 @@ about as bright as the environment.
 
 
 def compute_metered_irradiance(scene: SceneDescription) -> float:
-    """Return the irradiance that gives a white surface `LIT_WHITE`, in scene units.
-
-    At the scene's metered gain.
+    """Return the irradiance, in scene units, at which a white surface has the display
+    value `LIT_WHITE` with the scene's metered gain.
     """
     return LIT_WHITE * math.pi / (CARD_REFLECTANCE * compute_metered_gain(scene))
 
@@ -119,11 +118,13 @@ class LightControl(Control):
             )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        if (
-            parameter.name == "power"
-            and self.has_requested_search
-            and not self.is_searched("power")
-        ):
+        """Return a parameter as this lamp has it.
+
+        A lamp of which other parameters are searched has a power by default, or they
+        would not show. A point has no size to search.
+        """
+        needs_power = self.has_requested_search and not self.is_searched("power")
+        if parameter.name == "power" and needs_power:
             return replace(parameter, default=DEFAULT_POWER)
         if parameter.name == "size" and self.chosen["type"] == "point":
             return replace(parameter, search=None)

@@ -99,6 +99,7 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
     row = top.astype(np.int64)
 
     def corner(right: int, below: int) -> Float64Array:
+        """Return the dot product of a corner's gradient and the offset from it."""
         turn = angle[(row + below) % rows, (column + right) % columns]
         return np.asarray(np.cos(turn) * (x - right) + np.sin(turn) * (y - below))
 
@@ -128,7 +129,7 @@ def _clouds(
 
 
 def _warped(grid: Grid, cells: int, amount: float, seed: int) -> Grid:
-    """Move the coordinates about by noise."""
+    """Return coordinates displaced by up to about `amount` by noise."""
     right = _clouds(grid, (cells, cells), 2, seed)
     down = _clouds(grid, (cells, cells), 2, seed + 7)
     return grid[0] + amount * right, grid[1] + amount * down
@@ -144,11 +145,11 @@ def _scattered(count: int, seed: int) -> Float64Array:
     points = generator.random((1, 2))
     while len(points) < count:
         candidates = generator.random((16, 2))
-        gap = np.abs(candidates[:, None] - points[None])
-        gap = np.minimum(gap, 1.0 - gap)
-        points = np.concatenate(
-            [points, candidates[[np.argmax((gap**2).sum(-1).min(1))]]]
-        )
+        offset = np.abs(candidates[:, None] - points[None])  # (16, N, 2)
+        offset = np.minimum(offset, 1.0 - offset)  # the shorter way on the torus
+        nearest_distance = (offset**2).sum(-1).min(1)
+        farthest = np.argmax(nearest_distance)
+        points = np.concatenate([points, candidates[[farthest]]])
     return np.asarray(points)
 
 
@@ -161,9 +162,9 @@ def _cells(
         Distances (SIDE, SIDE, count), and indices of the points.
     """
     positions = np.stack([grid[0] % 1.0, grid[1] % 1.0], axis=-1)
-    distance, index = cKDTree(points, boxsize=1.0).query(
-        np.minimum(positions, np.nextafter(1.0, 0.0)), k=count
-    )
+    # the tree wants positions below 1, to which a remainder may be rounded
+    positions = np.minimum(positions, np.nextafter(1.0, 0.0))
+    distance, index = cKDTree(points, boxsize=1.0).query(positions, k=count)
     return np.asarray(distance), np.asarray(index, dtype=np.int64)
 
 
@@ -268,22 +269,13 @@ def marble(grid: Grid) -> Float64Array:
         (2, 1, 0.02, 0.45, 24),
         (1, 3, 0.012, 0.3, 26),
     ):
-        wave = np.abs(
-            np.sin(
-                np.pi
-                * (
-                    n_right * x
-                    + n_down * y
-                    + 0.5 * _clouds(finely_warped, (2, 2), 4, seed)
-                )
-            )
-        )
+        turbulence = 0.5 * _clouds(finely_warped, (2, 2), 4, seed)
+        # 0 in the middle of a vein
+        wave = np.abs(np.sin(np.pi * (n_right * x + n_down * y + turbulence)))
         strength = 0.25 + 0.75 * _step(_clouds(warped, (3, 3), 2, seed + 50), 0.0, 0.8)
-        veins += (
-            depth
-            * strength
-            * (np.exp(-((wave / width) ** 2)) + 0.3 * np.exp(-(wave / (4.0 * width))))
-        )
+        core = np.exp(-((wave / width) ** 2))
+        halo = 0.3 * np.exp(-(wave / (4.0 * width)))
+        veins += depth * strength * (core + halo)
     base = _mix(_color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, 0.58, 0.8))
     return _mix(base, _color("4c5159"), np.clip(veins, 0.0, 0.9))
 
@@ -424,19 +416,12 @@ def rust(grid: Grid) -> Float64Array:
     tone = np.clip(1.5 * (broad - 0.5) + 0.5 + 0.22 * grain, 0.0, 1.0)
     oxide = _ramp(tone, "2e1710", "5a2712", "8b3f16", "b5591d", "cf7b33")
     paint = _color("5d6668") + 0.05 * _clouds(grid, (20, 20), 2, 74)[..., None]
-    # paint that has not come off yet
-    paint_left = _step(
-        _clouds(_warped(warped, 16, 0.015, 75), (4, 4), 4, 76), 0.26, 0.05
-    )
-    rim = (
-        _step(_clouds(_warped(warped, 16, 0.015, 75), (4, 4), 4, 76), 0.20, 0.10)
-        - paint_left
-    )
-    surface = _mix(
-        _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0)),
-        paint,
-        0.85 * paint_left,
-    )
+    flakes = _clouds(_warped(warped, 16, 0.015, 75), (4, 4), 4, 76)
+    # paint that has not come off yet, and the dark rim around it
+    paint_left = _step(flakes, 0.26, 0.05)
+    rim = _step(flakes, 0.20, 0.10) - paint_left
+    rimmed_oxide = _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0))
+    surface = _mix(rimmed_oxide, paint, 0.85 * paint_left)
     pits = _step(_noise(grid, (70, 70), 77), 0.5, 0.15)
     return _mix(surface, _color("1b0d09"), 0.6 * pits)
 

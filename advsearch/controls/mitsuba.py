@@ -48,6 +48,13 @@ class MitsubaControl(Control):
         return tuple(_make_parameter(key) for key in settings)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        others = [key for key in self._settings if not key.startswith("object.")]
+        if scene.backdrop_photograph is not None and others:
+            raise InputError(
+                f"`controls` {self.name}:{others[0]} and "
+                f"`backdrop={scene.backdrop_photograph.spec}` contradict each other: "
+                "the photograph shows what is not the object; leave one of the two out"
+            )
         return scene.with_part(
             parts.PluginNumbers(
                 self.name,

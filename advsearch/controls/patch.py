@@ -9,11 +9,11 @@ base colour, so that no outline moves and the adjoint is right.
     base color = (1 - m) base color + m linear(pixels at (a, b))
     m = soft square in (a, b), on the front of the surface
 
-A place is where a ray from outside towards the middle of the object meets the surface;
-(a, b) are those in the tangent plane, unrolled along the direction in which the surface
-bends (exact for cylinders and spheres; Schmidt et al. 2006, "Interactive Decal
-Compositing with Discrete Exponential Maps"). Only what is connected and faces that way
-is painted.
+The patch's center is where a ray from outside towards the middle of the object meets
+the surface; (a, b) are coordinates in the tangent plane there, unrolled along the
+direction in which the surface bends (exact for cylinders and spheres; Schmidt et al.
+2006, "Interactive Decal Compositing with Discrete Exponential Maps"). Only texels that
+are connected with the center and face the same way are painted.
 """
 
 from __future__ import annotations
@@ -50,10 +50,11 @@ NORMS = ("box", "linf", "l2")
 # smallest and largest side of the base-colour map that is painted into, in texels
 MAP_SIDES = (512, 1024)
 PAINT_RADIUS = 0.75
-"""Radius around the middle, in sides of the square, within which the surface is
-painted: its corners are at 0.7071.
+"""Radius around the center, in sides of the square, within which the surface is
+painted: the square's corners are at 0.7071.
 """
-# cosines between the surface and the square's normal between which it fades in
+# cosines of the angle between a texel's normal and the patch's: none of the patch is
+# painted at the first, all of it at the second
 FACING_COSINES = (0.1, 0.3)
 EDGE_TEXELS = 2.0  # width of the soft edge in texels
 
@@ -61,8 +62,11 @@ EDGE_TEXELS = 2.0  # width of the soft edge in texels
 class PatchControl(PictureControl):
     """A printed square stuck onto the object: its pixels, place, size and turn.
 
-    Numbers that are not given are fixed, and pixels are searched unless they are a grey
-    or a picture.
+    Numbers that are not set are fixed, and pixels are searched unless they are a grey
+    or an image file.
+
+    Attributes:
+        _painter: paints the patch into the object's base color; set by `fit`.
     """
 
     kind = "patch"
@@ -154,7 +158,14 @@ class PatchControl(PictureControl):
     on_top = True
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
-        """Check that the settings of the pixels go together. Raises InputError."""
+        """Check that the settings of the pixels go together.
+
+        Pixels are a range or one number, not both pixels and a picture are set, and a
+        ball is set only for searched pixels.
+
+        Raises:
+            InputError: they do not.
+        """
         super().__init__(name, **settings)
         pixels = self.specs.get("pixels")
         picture = self.chosen["picture"]
@@ -163,35 +174,28 @@ class PatchControl(PictureControl):
                 f"{self.name}.pixels: expected none beside "
                 f"{self.name}.picture; leave one of them out"
             )
-        if (
-            pixels is not None
-            and not isinstance(pixels, Fixed)
-            and type(pixels) is not Range
-        ):
-            got = (
-                f"a list of {len(pixels.values)}"
-                if isinstance(pixels, OneOf)
-                else "a distribution"
-            )
+        # distributions are subclasses of Range
+        is_plain_range = type(pixels) is Range
+        if pixels is not None and not isinstance(pixels, Fixed) and not is_plain_range:
+            got = "a distribution"
+            if isinstance(pixels, OneOf):
+                got = f"a list of {len(pixels.values)}"
             raise InputError(
                 f"{self.name}.pixels: expected [low, high] or one number, got {got}"
             )
-        ball = next(
-            (
-                choice
-                for choice in ("epsilon", "norm")
-                if self.chosen[choice] not in (None, "box")
-            ),
-            None,
-        )
-        if ball and not self.is_searched_image:
-            raise InputError(
-                f"{self.name}.{ball}: is of the ball that searched pixels stay in, and "
-                "these are fixed; leave it out, "
-                f"or leave out {self.name}.{'picture' if picture is not None else 'pixels'}"
-            )
+        if self.is_searched_image:
+            return
+        fixing_setting = "pixels" if picture is None else "picture"
+        for ball_setting in ("epsilon", "norm"):
+            if self.chosen[ball_setting] not in (None, "box"):
+                raise InputError(
+                    f"{self.name}.{ball_setting}: is of the ball that searched pixels "
+                    "stay in, and these are fixed; leave it out, "
+                    f"or leave out {self.name}.{fixing_setting}"
+                )
 
     def check_choices(self) -> None:
+        """Let an epsilon without a norm mean the norm linf, and reject one with box."""
         epsilon = self.chosen["epsilon"]
         if "norm" not in self._settings and epsilon is not None:
             self.chosen["norm"] = "linf"
@@ -206,15 +210,18 @@ class PatchControl(PictureControl):
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         if parameter.name not in ("azimuth", "height"):
             return super().resolve_parameter(parameter)
-        return replace(
-            parameter,
-            default=find_side_towards_camera(self.scene)[parameter.name == "height"],
-        )
+        azimuth, height = find_side_towards_camera(self.scene)
+        default = azimuth if parameter.name == "azimuth" else height
+        return replace(parameter, default=default)
 
     def fit(self) -> None:
-        """Prepare the painter, and start from the texture underneath.
+        """Prepare the painter, and let searched pixels start as the texture underneath.
 
-        Raises InputError: nothing is searched.
+        Colors of the texture outside the range of the pixels are clipped to it, and the
+        start is recorded as an adjusted default.
+
+        Raises:
+            InputError: nothing is searched.
         """
         super().fit()
         if not self.groups:
@@ -223,24 +230,26 @@ class PatchControl(PictureControl):
                 "search; give another parameter "
                 f"a range, such as {self.name}={{azimuth: [0, 360]}}"
             )
-        n_pixels = self.sides[0]
-        pixels = self.slots[0]
+        side = self.sides[0]
+        pixels = self.slots[0]  # the slots have the order of `parameters`
         picture = self.read_picture()
         self._picture = (
-            None if picture is None else images.resize_to_square(picture, n_pixels)
+            None if picture is None else images.resize_to_square(picture, side)
         )
         start_values = {
             name: float(value)
             for name, value in self.values(self.start).items()
             if name != "pixels"
         }
-        self._sticker = PatchPainter(self.scene, start_values, n_pixels)
+        self._painter = PatchPainter(self.scene, start_values, side)
         if isinstance(pixels.spec, Range):
             low = pixels.spec.low
             high = pixels.spec.high
-            underneath = (self._sticker.sample_underneath() - low) / (high - low)
-            self.start[: pixels.n_coordinates] = underneath.clamp(0.0, 1.0).reshape(-1)
-            if not torch.allclose(underneath.clamp(0.0, 1.0), underneath, atol=1e-5):
+            # (side, side, 3), as fractions of the range
+            underneath = (self._painter.sample_underneath() - low) / (high - low)
+            start = underneath.clamp(0.0, 1.0)
+            self.start[: pixels.n_coordinates] = start.reshape(-1)
+            if not torch.allclose(start, underneath, atol=1e-5):
                 self.record_adjusted_default(
                     pixels.parameter,
                     "the texture underneath",
@@ -257,7 +266,7 @@ class PatchControl(PictureControl):
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         return {
-            BASE_COLOR: self._sticker.paint(
+            BASE_COLOR: self._painter.paint(
                 so_far.get(BASE_COLOR), values["pixels"], values
             )
         }
@@ -268,9 +277,11 @@ class PatchControl(PictureControl):
     def kept_pictures(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the patch enlarged for printing, and its pixels."""
         pixels = values["pixels"]
+        print_scale = math.ceil(images.MIN_PRINT_SIDE / len(pixels))
         return {
-            self.name: images.enlarge(pixels, -(-images.MIN_PRINT_SIDE // len(pixels))),
+            self.name: images.enlarge(pixels, print_scale),
             f"{self.name}-pixels": pixels,
         }
 
@@ -281,22 +292,45 @@ class PatchControl(PictureControl):
 def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
     """Return the side of the object that faces the camera.
 
+    It inverts `_outward_direction`.
+
     Returns:
         Azimuth in degrees, and height from 0 to 1, as the parameters of the
             control.
     """
-    middle, radius, half = _half_sizes(scene.object.mesh)
-    camera = geometry.camera_to_world(scene)[:3, 3]
-    x, y, z = (
-        np.linalg.solve(geometry.object_to_world(scene), np.append(camera, 1.0))[:3]
-        - middle
-    )
-    lift = math.atan2(z * radius, max(math.hypot(x, y), 1e-12) * half)
-    return math.degrees(math.atan2(y, x)) % 360.0, 0.5 + lift / math.pi
+    center, radius, half_height = _measure_mesh(scene.object.mesh)
+    camera = np.append(geometry.camera_to_world(scene)[:3, 3], 1.0)
+    # from the center to the camera, in the coordinates of the object
+    x, y, z = np.linalg.solve(geometry.object_to_world(scene), camera)[:3] - center
+    # at least a tiny distance: a camera straight above is at height 1
+    level_distance = max(math.hypot(x, y), 1e-12)
+    elevation = math.atan2(z * radius, level_distance * half_height)
+    azimuth = math.degrees(math.atan2(y, x)) % 360.0
+    return azimuth, 0.5 + elevation / math.pi
+
+
+def _compute_edge_opacity(on_patch: Tensor, size: Tensor, spacing: float) -> Tensor:
+    """Return the opacity (N,) of a patch by the distance from its edge.
+
+    It rises from 0 to 1 over `EDGE_TEXELS` texels and is 0.5 on the edge.
+
+    Args:
+        on_patch: (N, 2) positions, in sides of the patch from its center.
+        size: () side of the patch, object sizes.
+        spacing: distance of neighbouring texels, object sizes.
+    """
+    edge_width = EDGE_TEXELS * spacing
+    edge_position = (0.5 - on_patch.abs().amax(dim=1)) * size / edge_width + 0.5
+    return _smooth_step(edge_position)
 
 
 def _sample_pixels(pixels: Tensor, positions: Tensor) -> Tensor:
-    """Interpolate pixels (n, n, 3) sRGB at positions (N, 2) in [-0.5, 0.5]; linear."""
+    """Interpolate pixels (n, n, 3) sRGB at positions (N, 2); return linear (N, 3).
+
+    Positions are to the right and upwards of the center, in sides of the patch; those
+    beyond its edge have the color of the edge.
+    """
+    # grid_sample wants (1, 1, N, 2) in [-1, 1], to the right and downwards
     grid = (positions * positions.new_tensor([2.0, -2.0]))[None, None]
     linear = images.to_planes(color.srgb_to_linear(pixels))
     sampled = F.grid_sample(
@@ -305,31 +339,54 @@ def _sample_pixels(pixels: Tensor, positions: Tensor) -> Tensor:
     return sampled[0, :, 0].T
 
 
-def _half_sizes(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float]:
-    """Return the middle (3,) of a mesh, its largest half-width and its half-height."""
+def _measure_mesh(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float]:
+    """Return the center (3,) of a mesh, its largest half-width and its half-height.
+
+    The sizes are above 0, also of a flat mesh.
+    """
     low = mesh.vertices.min(axis=0).astype(np.float64)
     high = mesh.vertices.max(axis=0).astype(np.float64)
-    half = np.maximum((high - low) / 2.0, 1e-6)
-    return (low + high) / 2.0, float(half[:2].max()), float(half[2])
+    half_size = np.maximum((high - low) / 2.0, 1e-6)
+    return (low + high) / 2.0, float(half_size[:2].max()), float(half_size[2])
 
 
 @dataclass(frozen=True, eq=False)
-class Spot:
-    """The texels that a patch may cover, and their coordinates around its middle."""
+class NearbyTexels:
+    """The N texels near the center of a patch, which it may cover.
 
-    texel_indices: Tensor  # (N,) their numbers, row by row
-    flat: Tensor  # (N, 2) their coordinates to the right and upwards, object sizes
-    cover: Tensor  # (N,) in [0, 1]: how much they face the patch
-    spacing: float  # distance between neighbouring texels on the surface, object sizes
+    Attributes:
+        indices: (N,) of the texels in the map, row by row.
+        coordinates: (N, 2) on the unrolled surface, to the right and upwards of the
+            patch's center before it is rotated, in object sizes.
+        opacity: (N,) of the patch there, 1 where the surface faces as the patch does
+            and 0 where it turns away.
+        spacing: distance between neighbouring texels on the surface, object sizes.
+    """
+
+    indices: Tensor
+    coordinates: Tensor
+    opacity: Tensor
+    spacing: float
 
 
 class PatchPainter:
     """Paints a patch into the object's base-color map.
 
-    Args:
-        scene: with the object.
-        resting: azimuth, height, size and rotation at the start.
-        side: of the patch, pixels.
+    Arrays of texels have one row for each of the T texels that a face of the mesh
+    shows, in object coordinates.
+
+    Attributes:
+        _center_and_sizes: center (3,), largest half-width and half-height of the mesh.
+        _start_values: azimuth, height, size and rotation of the patch at the start.
+        _side: of the patch, pixels.
+        _surface: the mesh, for rays and for what is connected.
+        _object_color: (n, n, 3) the object's own base color, linear.
+        _texels: (T,) indices of the texels in the map, row by row.
+        _faces: (T,) face of each texel.
+        _positions: (T, 3) of texels on the surface.
+        _normals: (T, 3) of the surface there.
+        _areas: (T,) of texels on the surface.
+        _find_texels: `_find_nearby_texels`, cached by azimuth, height and size.
     """
 
     def __init__(
@@ -337,7 +394,13 @@ class PatchPainter:
     ) -> None:
         """Prepare the object's map and its surface.
 
-        Raises InputError: its texture repeats.
+        Args:
+            scene: with the object.
+            start_values: azimuth, height, size and rotation at the start.
+            side: of the patch, pixels.
+
+        Raises:
+            InputError: the object's texture repeats.
         """
         mesh = scene.object.mesh
         if mesh.repeats:
@@ -346,8 +409,8 @@ class PatchPainter:
                 "patch that is painted into it; "
                 "leave patch out, or search the whole texture"
             )
-        self._half_sizes = _half_sizes(mesh)
-        self._resting = start_values
+        self._center_and_sizes = _measure_mesh(mesh)
+        self._start_values = start_values
         self._side = side
         self._surface = images.MeshSurface(mesh)
         object_color = color.srgb_to_linear(
@@ -356,20 +419,20 @@ class PatchPainter:
         pixel_size = start_values["size"] / side
         charts = _rasterise_finely(mesh, max(object_color.shape[:2]), pixel_size)
         self._object_color = _resize_to_square(object_color, len(charts.face))
-        mask = charts.is_readable
-        self._texels = np.flatnonzero(mask)
-        self._faces = charts.face[mask]
-        self._positions = charts.compute_positions()[mask].astype(np.float64)
-        self._normals = charts.compute_normals()[mask].astype(np.float64)
-        self._areas = charts.compute_areas()[mask].astype(np.float64)
-        self._spot = lru_cache(maxsize=4)(self._find_spot)
+        is_used = charts.is_readable
+        self._texels = np.flatnonzero(is_used)
+        self._faces = charts.face[is_used]
+        self._positions = charts.compute_positions()[is_used].astype(np.float64)
+        self._normals = charts.compute_normals()[is_used].astype(np.float64)
+        self._areas = charts.compute_areas()[is_used].astype(np.float64)
+        self._find_texels = lru_cache(maxsize=4)(self._find_nearby_texels)
 
     def paint(
         self, base: Tensor | None, pixels: Tensor, numbers: Mapping[str, Tensor]
     ) -> Tensor:
-        """Return the base color (h, w, 3), linear, with the patch on it.
+        """Return the base color (n, n, 3), linear, with the patch on it.
 
-        Differentiable except in the place (azimuth, height, size and rotation).
+        Differentiable in the colors, not in the patch's position, size and rotation.
 
         Args:
             base: what other controls made of it; None takes the object's own.
@@ -382,110 +445,126 @@ class PatchPainter:
         else:
             base = _resize_to_square(base, len(self._object_color))
         size = numbers["size"]
-        spot = self._spot(
+        texels = self._find_texels(
             *(float(numbers[name].detach()) for name in ("azimuth", "height", "size"))
         )
-        texels = spot.texel_indices.to(device)
-        on_patch = _rotate(spot.flat.to(device), numbers["rotation"]) / size
-        edge_width = EDGE_TEXELS * spot.spacing
-        edge = (0.5 - on_patch.abs().amax(dim=1)) * size / edge_width + 0.5
-        cover = (spot.cover.to(device) * _smooth_step(edge))[:, None]
-        ink = _sample_pixels(pixels, on_patch)
-        flat = base.reshape(-1, 3)
-        under = flat.index_select(0, texels)
-        painted = flat.index_copy(0, texels, under + cover * (ink - under))
-        return painted.reshape(base.shape)
+        indices = texels.indices.to(device)
+        coordinates = texels.coordinates.to(device)
+        # (N, 2) in sides of the patch: it reaches from -0.5 to 0.5
+        on_patch = _rotate(coordinates, numbers["rotation"]) / size
+        edge_opacity = _compute_edge_opacity(on_patch, size, texels.spacing)
+        opacity = (texels.opacity.to(device) * edge_opacity)[:, None]
+        patch_colors = _sample_pixels(pixels, on_patch)
+        base_colors = base.reshape(-1, 3)
+        colors_below = base_colors.index_select(0, indices)
+        blended = colors_below + opacity * (patch_colors - colors_below)
+        return base_colors.index_copy(0, indices, blended).reshape(base.shape)
 
     def sample_underneath(self) -> Tensor:
-        """Return the object's own texture where the patch starts, as its pixels.
+        """Return the pixels of a patch that shows the object's own texture beneath it.
+
+        They are the mean colors of the texels in each pixel, at the patch's starting
+        position, size and rotation.
 
         Returns:
-            (n, n, 3) sRGB; a pixel that no texel lies in has the nearest texel's color.
+            (n, n, 3) sRGB; a pixel that no texel lies in has the nearest texel's color,
+                and all are grey if no texel lies under the patch.
         """
-        resting = self._resting
+        start = self._start_values
         side = self._side
-        spot = self._spot(resting["azimuth"], resting["height"], resting["size"])
-        rotation = torch.tensor(resting["rotation"])
-        on_patch = _rotate(spot.flat, rotation) / resting["size"]
-        inside = (on_patch.abs().amax(dim=1) < 0.5) & (spot.cover > 0.0)
-        if not bool(inside.any()):
+        texels = self._find_texels(start["azimuth"], start["height"], start["size"])
+        rotation = torch.tensor(start["rotation"])
+        # (N, 2) in sides of the patch: it reaches from -0.5 to 0.5
+        on_patch = _rotate(texels.coordinates, rotation) / start["size"]
+        is_covered = (on_patch.abs().amax(dim=1) < 0.5) & (texels.opacity > 0.0)
+        if not bool(is_covered.any()):
             return torch.full((side, side, 3), 0.5)
-        texel_colors = self._object_color.reshape(-1, 3)[spot.texel_indices[inside]]
-        positions = on_patch[inside] * torch.tensor([1.0, -1.0]) + 0.5
-        colors = _average_in_pixels(texel_colors, positions, side)
+        covered_colors = self._object_color.reshape(-1, 3)[texels.indices[is_covered]]
+        # columns go to the right like the first coordinate, rows down unlike the second
+        positions = on_patch[is_covered] * torch.tensor([1.0, -1.0]) + 0.5
+        colors = _average_in_pixels(covered_colors, positions, side)
         return color.linear_to_srgb(colors).reshape(side, side, 3)
 
-    def _find_spot(self, azimuth: float, height: float, size: float) -> Spot:
-        """Find the texels that a patch of a size covers at an azimuth and a height.
+    def _find_nearby_texels(
+        self, azimuth: float, height: float, size: float
+    ) -> NearbyTexels:
+        """Find the texels that a patch of a size may cover at an azimuth and a height.
+
+        The patch's center is the first hit of a ray from outside towards the center of
+        the object. Its normal is the mean of the surface's around there.
 
         Args:
             azimuth: degrees around the object.
             height: from 0 (middle of the underside) to 1 (middle of the top).
             size: side of the patch, object sizes.
         """
-        middle, radius, half_height = self._half_sizes
+        center, radius, half_height = self._center_and_sizes
         outwards = _outward_direction(azimuth, height, radius, half_height)
-        face, point = self._surface.find_hit(
-            middle + 4.0 * (radius + half_height) * outwards, -outwards
-        )
-        faces_outwards = float(self._surface.normals[face] @ outwards) >= 0.0
-        side = 1.0 if faces_outwards else -1.0
-        normal = self._mean_normal(face, point)
-        frame = _frame(side * normal, _upward_direction(azimuth, outwards))
-        texel_indices = self._texels_near(
-            face, point, side * frame[2], PAINT_RADIUS * size
-        )
+        ray_origin = center + 4.0 * (radius + half_height) * outwards
+        face, point = self._surface.find_hit(ray_origin, -outwards)
+        # A face may be seen from its back: then all normals are flipped.
+        is_front = float(self._surface.normals[face] @ outwards) >= 0.0
+        sign = 1.0 if is_front else -1.0
+        normal = self._compute_mean_normal(face, point)
+        frame = _make_frame(sign * normal, _upward_direction(azimuth, outwards))
+        rows = self._select_texels(face, point, sign * frame[2], PAINT_RADIUS * size)
 
-        offsets = self._positions[texel_indices] - point
-        flat, cosine = unroll_surface(
-            offsets, side * self._normals[texel_indices], frame
+        coordinates, cosine = unroll_surface(
+            self._positions[rows] - point, sign * self._normals[rows], frame
         )
-        return Spot(
-            torch.from_numpy(self._texels[texel_indices]),
-            torch.from_numpy(flat.astype(np.float32)),
+        return NearbyTexels(
+            torch.from_numpy(self._texels[rows]),
+            torch.from_numpy(coordinates.astype(np.float32)),
             _fade_in(cosine),
-            self._texel_spacing(texel_indices),
+            self._measure_texel_spacing(rows),
         )
 
-    def _mean_normal(
+    def _compute_mean_normal(
         self, face: int, point: assets.Float64Array
     ) -> assets.Float64Array:
-        """Return the mean normal (3,) over half of the patch's side at the start."""
+        """Return the mean normal (3,) of the surface around a point of a face.
+
+        The radius is half of the patch's side at the start, so that it does not change
+        in a search. Weights fall smoothly to 0 there. The face's own normal stands in
+        if no texel is near.
+        """
         face_normal = self._surface.normals[face]
-        reach = 0.5 * self._resting["size"]
-        is_near = self._surface.find_region(face, point, face_normal, reach)[
-            self._faces
-        ]
-        squared = ((self._positions[is_near] - point) ** 2).sum(axis=1)
-        weight = np.maximum(1.0 - squared / reach**2, 0.0) ** 2
-        total = (self._normals[is_near] * (weight * self._areas[is_near])[:, None]).sum(
-            axis=0
-        )
+        radius = 0.5 * self._start_values["size"]
+        is_face_near = self._surface.find_region(face, point, face_normal, radius)
+        is_near = is_face_near[self._faces]  # (T,)
+        squared_distance = ((self._positions[is_near] - point) ** 2).sum(axis=1)
+        weight = np.maximum(1.0 - squared_distance / radius**2, 0.0) ** 2
+        area_weight = weight * self._areas[is_near]
+        total = (self._normals[is_near] * area_weight[:, None]).sum(axis=0)
         length = float(np.linalg.norm(total))
         if length <= 1e-12:
             return np.asarray(face_normal)
         return np.asarray(total / length)
 
-    def _texels_near(
+    def _select_texels(
         self,
         face: int,
         point: assets.Float64Array,
         normal: assets.Float64Array,
-        reach: float,
+        radius: float,
     ) -> assets.IntArray:
-        """Return which texels (N,) are connected to a point, face its way and are
-        close.
+        """Return the rows (N,) of texels within a radius of a point of a face.
+
+        They are connected to it, and their faces look to the side of the normal.
         """
-        connected = np.flatnonzero(
-            self._surface.find_region(face, point, normal, reach)[self._faces]
-        )
+        is_face_near = self._surface.find_region(face, point, normal, radius)
+        connected = np.flatnonzero(is_face_near[self._faces])
         offsets = self._positions[connected] - point
-        is_close = (offsets**2).sum(axis=1) <= reach**2
+        is_close = (offsets**2).sum(axis=1) <= radius**2
         return np.asarray(connected[is_close])
 
-    def _texel_spacing(self, texels: assets.IntArray) -> float:
-        """Return the distance of neighbouring texels on the surface, object sizes."""
-        areas = self._areas[texels]
+    def _measure_texel_spacing(self, rows: assets.IntArray) -> float:
+        """Return the median distance of neighbouring texels on the surface.
+
+        It is in object sizes. Texels without an area do not count; if none has one, it
+        is that of a map that spans one object size.
+        """
+        areas = self._areas[rows]
         has_area = areas > 0.0
         if not has_area.any():
             return 1.0 / len(self._object_color)
@@ -495,14 +574,18 @@ class PatchPainter:
 def _outward_direction(
     azimuth: float, height: float, radius: float, half_height: float
 ) -> assets.Float64Array:
-    """Return the unit vector (3,) from the middle of an object to a patch on it."""
+    """Return the unit vector (3,) from the center of an object to a patch on it.
+
+    The patch is on an ellipsoid with the object's radius and half-height; `height` is
+    its latitude, 0 at the lower pole and 1 at the upper.
+    """
     angle = math.radians(azimuth)
-    lift = (height - 0.5) * math.pi
+    latitude = (height - 0.5) * math.pi
     outwards = np.array(
         [
-            math.cos(lift) * radius * math.cos(angle),
-            math.cos(lift) * radius * math.sin(angle),
-            math.sin(lift) * half_height,
+            math.cos(latitude) * radius * math.cos(angle),
+            math.cos(latitude) * radius * math.sin(angle),
+            math.sin(latitude) * half_height,
         ]
     )
     outwards /= np.linalg.norm(outwards)
@@ -512,7 +595,9 @@ def _outward_direction(
 def _upward_direction(
     azimuth: float, outwards: assets.Float64Array
 ) -> assets.Float64Array:
-    """Return the unit vector (3,) that is upright and across the outward direction."""
+    """Return the unit vector (3,) across the outward direction that points most
+    upwards.
+    """
     angle = math.radians(azimuth)
     level = math.hypot(outwards[0], outwards[1])
     return np.array(
@@ -521,19 +606,22 @@ def _upward_direction(
 
 
 def _fade_in(cosine: assets.Float64Array) -> Tensor:
-    """Return how much texels are covered by the cosines (N,) of their normals."""
+    """Return the opacity (N,) of a patch by the cosines (N,) of texels' normals with
+    its own.
+    """
     low, high = FACING_COSINES
     return _smooth_step(
         torch.from_numpy(((cosine - low) / (high - low)).astype(np.float32))
     )
 
 
-def _frame(
+def _make_frame(
     normal: assets.Float64Array, upwards: assets.Float64Array
 ) -> assets.Float64Array:
     """Return a right-handed frame (3, 3): rows right, up and normal.
 
-    `up` is as near to a direction as the normal lets it.
+    Up is the part of `upwards` that is across the normal; if there is none, that of
+    the axis that is least along the normal.
     """
     up = upwards - float(upwards @ normal) * normal
     if float(np.linalg.norm(up)) < 1e-6:
@@ -555,27 +643,32 @@ def unroll_surface(
     along the direction of turning is stretched by `phi / sin(phi)`.
 
     Args:
-        offsets: (N, 3) from the middle.
+        offsets: (N, 3) of the points from the center.
         normals: (N, 3) at the points.
-        frame: rows right, up and normal in the middle.
+        frame: rows right, up and normal at the center.
 
     Returns:
         Coordinates (N, 2) to the right and upwards, and cosines (N,) with the
             normal of the frame.
     """
-    plane = offsets @ frame[:2].T
-    tilt = normals @ frame[:2].T
+    in_plane = offsets @ frame[:2].T  # (N, 2)
+    tilt = normals @ frame[:2].T  # (N, 2)
     cosine = normals @ frame[2]
     sine = np.linalg.norm(tilt, axis=1)
-    towards = tilt / np.maximum(sine, 1e-9)[:, None]
-    turned = np.arctan2(sine, np.maximum(cosine, 0.1))
-    stretch = np.where(sine > 1e-4, turned / np.maximum(np.sin(turned), 1e-9), 1.0)
-    along_turn = (plane * towards).sum(axis=1)
-    return plane + ((stretch - 1.0) * along_turn)[:, None] * towards, cosine
+    turn_direction = tilt / np.maximum(sine, 1e-9)[:, None]
+    # The cosine is limited, so that phi stays below 90 degrees: what is beyond is not
+    # painted (`FACING_COSINES`). The stretch is 1 where the surface is flat.
+    phi = np.arctan2(sine, np.maximum(cosine, 0.1))
+    stretch = np.where(sine > 1e-4, phi / np.maximum(np.sin(phi), 1e-9), 1.0)
+    along_turn = (in_plane * turn_direction).sum(axis=1)
+    added = ((stretch - 1.0) * along_turn)[:, None] * turn_direction
+    return in_plane + added, cosine
 
 
 def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
     """Average colors (N, 3) at positions (N, 2) in [0, 1] over side x side pixels.
+
+    Positions are (column, row).
 
     Returns:
         (side * side, 3), row by row; a pixel without any has the nearest color.
@@ -585,25 +678,23 @@ def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
     sums = torch.zeros(side * side, 3).index_add(0, index, colors)
     counts = torch.zeros(side * side).index_add(0, index, torch.ones(len(index)))
     means = sums / counts.clamp_min(1.0)[:, None]
-    grid = torch.meshgrid(*[torch.arange(side) + 0.5] * 2, indexing="ij")
-    centers = torch.stack(grid, dim=-1).reshape(-1, 2)
+    line = torch.arange(side) + 0.5
+    grid = torch.meshgrid(line, line, indexing="ij")
+    centers = torch.stack(grid, dim=-1).reshape(-1, 2)  # (row, column) of each pixel
     tree = spatial.cKDTree(positions.flip(1).numpy())
     nearest = tree.query(centers.numpy() / side)[1]
     return torch.where(counts[:, None] > 0.0, means, colors[torch.from_numpy(nearest)])
 
 
-def _rotate(flat: Tensor, degrees: Tensor) -> Tensor:
-    """Return coordinates (N, 2) on a patch that is turned counter-clockwise."""
+def _rotate(coordinates: Tensor, degrees: Tensor) -> Tensor:
+    """Return coordinates (N, 2) in the axes of a patch that is turned
+    counter-clockwise.
+    """
     angle = torch.deg2rad(degrees)
     cosine = torch.cos(angle)
     sine = torch.sin(angle)
-    return torch.stack(
-        [
-            flat[:, 0] * cosine + flat[:, 1] * sine,
-            flat[:, 1] * cosine - flat[:, 0] * sine,
-        ],
-        dim=1,
-    )
+    x, y = coordinates.T
+    return torch.stack([x * cosine + y * sine, y * cosine - x * sine], dim=1)
 
 
 def _rasterise_finely(
@@ -611,18 +702,21 @@ def _rasterise_finely(
 ) -> images.Charts:
     """Rasterise a mesh into a map whose texels are smaller than pixels of the patch.
 
+    The map starts with the texture's own size, at least the smallest of `MAP_SIDES`,
+    and is doubled as often as needed, as long as it stays within the largest.
+
     Args:
         mesh: the object's.
         texture_side: longer side of its own texture, texels.
         pixel_size: side of a pixel, object sizes.
     """
-    smallest, largest = MAP_SIDES
-    first_side = max(smallest, texture_side)
+    min_side, max_side = MAP_SIDES
+    first_side = max(min_side, texture_side)
     charts = images.rasterize_charts(mesh, first_side)
     areas = charts.compute_areas()
     spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
     map_side = first_side
-    while 2 * map_side <= largest and spacing * first_side / map_side > pixel_size:
+    while 2 * map_side <= max_side and spacing * first_side / map_side > pixel_size:
         map_side *= 2
     return charts if map_side == first_side else images.rasterize_charts(mesh, map_side)
 

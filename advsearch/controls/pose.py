@@ -68,48 +68,54 @@ class PoseControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the pose of the mesh, scaled and turned about its middle."""
+        """Return the pose of the mesh, scaled and turned about its center.
+
+        On the ground its lowest point is at its former height plus z, however it
+        turns; else its center is.
+        """
         mesh = self.get_mesh(self.scene)
+        device = values["scale"].device
         base, vertices, floor = _get_base_pose(
             mesh, self.scene.surrounding_meshes.get(mesh.name)
         )
-        base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
-        middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
-        turned = make_vector_rotation(values["rotation"]) @ make_euler_rotation(
+        base = base.to(device)
+        vertices = vertices.to(device)
+        center = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
+        rotation = make_vector_rotation(values["rotation"]) @ make_euler_rotation(
             values["yaw"], values["pitch"], values["roll"]
         )
-        linear = values["scale"] * turned
+        linear = values["scale"] * rotation
+        # height of the lowest point over the center
         if self.chosen["on_ground"] in ("yes", True):
-            lowest = ((vertices - middle) @ linear[2]).amin()
+            lowest = ((vertices - center) @ linear[2]).amin()
         else:
-            lowest = floor - middle[2]
+            lowest = floor - center[2]
         shift = torch.stack([values["x"], values["y"], floor + values["z"] - lowest])
-        translation = (
-            shift - linear @ middle + torch.cat([middle[:2], middle.new_zeros(1)])
-        )
+        level_center = torch.cat([center[:2], center.new_zeros(1)])
+        translation = shift - linear @ center + level_center
         return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base}
 
 
 @lru_cache(maxsize=16)
 def _get_base_pose(
-    mesh: MeshPart, placed: MeshPart | None
+    mesh: MeshPart, surrounding: MeshPart | None
 ) -> tuple[Tensor, Tensor, float]:
     """Return where a mesh stands before it is posed.
 
     Args:
         mesh: that is posed.
-        placed: a mesh around the object as it came; None for the object, whose own
+        surrounding: the mesh as the scene came with it; None for the object, whose own
             coordinates are those of the scene.
 
     Returns:
-        The pose (4, 4) from its own coordinates, its vertices (V, 3) there, and
+        The pose (4, 4) from its own coordinates, its vertices (V, 3) in the scene, and
             their lowest height.
     """
-    if placed is None:
+    if surrounding is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
-    positions = compute_base_vertices(placed)
+    positions = compute_base_vertices(surrounding)
     return (
-        torch.from_numpy(placed.to_world).float(),
+        torch.from_numpy(surrounding.to_world).float(),
         torch.from_numpy(positions).float(),
         float(positions[:, 2].min()),
     )

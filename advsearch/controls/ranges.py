@@ -90,7 +90,7 @@ class OneOf:
 class Range:
     """Every value from `low` to `high`.
 
-    As its methods are told, the unit interval runs over their logarithms.
+    A coordinate in [0, 1] runs over the values, or with `log` over their logarithms.
     """
 
     low: float
@@ -120,10 +120,13 @@ class Range:
 
 @dataclass(frozen=True)
 class DistributionRange(Range):
-    """Values from `low` to `high`, the shares `lower_probability` to
-    `upper_probability` of a distribution.
+    """Values from `low` to `high` of a distribution, by their quantiles.
 
-    Its quantiles, and what it is.
+    Attributes:
+        quantiles: inverse distribution function.
+        lower_probability: at the coordinate 0; above 0 if the distribution is cut off.
+        upper_probability: at the coordinate 1.
+        label: the distribution, for messages.
     """
 
     quantiles: Quantiles
@@ -136,23 +139,22 @@ class DistributionRange(Range):
 
         Differentiable, by the slope of the quantiles.
         """
-        values = self._values(u.detach())
+        values = self._compute_values(u.detach())
         if u.requires_grad:
             upper = (u.detach() + SLOPE_STEP).clamp(max=1.0)
             lower = (u.detach() - SLOPE_STEP).clamp(min=0.0)
-            slope = (self._values(upper) - self._values(lower)) / (upper - lower)
+            difference = self._compute_values(upper) - self._compute_values(lower)
+            slope = difference / (upper - lower)
+            # 0, but with the derivative
             values = values + slope * (u - u.detach())
         return values
 
-    def _values(self, u: Tensor) -> Tensor:
-        probabilities = (
-            self.lower_probability
-            + (self.upper_probability - self.lower_probability)
-            * u.double().cpu().numpy()
-        )
-        return torch.from_numpy(
-            np.clip(self.quantiles(np.asarray(probabilities)), self.low, self.high)
-        ).to(u)
+    def _compute_values(self, u: Tensor) -> Tensor:
+        """Return the values at coordinates in [0, 1], without derivatives."""
+        width = self.upper_probability - self.lower_probability
+        probabilities = self.lower_probability + width * u.double().cpu().numpy()
+        values = self.quantiles(np.asarray(probabilities))
+        return torch.from_numpy(np.clip(values, self.low, self.high)).to(u)
 
     def find_coordinate(self, value: float, *, log: bool = False) -> float:
         """Return the coordinate of a value, by bisection."""
@@ -168,6 +170,7 @@ class DistributionRange(Range):
                 lower = middle
             else:
                 upper = middle
+        # Beyond the last quantile nothing is found: the largest coordinate below 1.
         return upper if upper < 1.0 else lower
 
 
@@ -182,11 +185,9 @@ def to_plain_value(value: object) -> object:
     value = distribution_to_setting(value)
     if isinstance(value, (list, tuple)):
         return type(value)(map(to_plain_value, value))
-    return (
-        value.tolist()
-        if hasattr(value, "tolist") and hasattr(value, "dtype")
-        else value
-    )
+    if hasattr(value, "tolist") and hasattr(value, "dtype"):
+        return value.tolist()
+    return value
 
 
 def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
@@ -265,7 +266,11 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
 
 
 def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
-    """Return both ranges of angles that a reversed one may mean, for a message."""
+    """Return both ranges of angles that a reversed one may mean, for a message.
+
+    From 350 to 10 may mean the 20 degrees through 0 or the 340 in between. The first
+    range is moved by a turn, so that it ascends and stays within the parameter's bounds.
+    """
     begin = low
     end = high + FULL_TURN
     if low - FULL_TURN >= parameter.low:
@@ -292,15 +297,15 @@ def _make_choice(where: str, values: Sequence[ParameterValue]) -> OneOf:
     return OneOf(tuple(values))
 
 
-MAX_REPEATS = 1000  # equal shares of probability that weights are rounded to, at most
+MAX_REPEATS = 1000  # largest number of values that a weighted choice is repeated to
 
 
 def _make_weighted_choice(
     where: str, values: Sequence[ParameterValue], weights: object
 ) -> OneOf:
-    """Return a choice that has each value as often as its weight says.
+    """Return a choice that repeats each value in proportion to its weight.
 
-    So equal fractions of u draw it that often.
+    So equal fractions of u draw it with that probability.
     """
     weight_list = list(weights) if isinstance(weights, (list, tuple)) else []
     valid_weights = [
@@ -332,7 +337,8 @@ def _make_weighted_choice(
 def _count_repeats(probabilities: Sequence[float]) -> list[int]:
     """Return how often each value is repeated so that it has its probability.
 
-    By the smallest exact number of repeats under `MAX_REPEATS`, or rounded to that.
+    The total is the smallest with which all counts are whole numbers, or `MAX_REPEATS`
+    if there is none; then cumulated counts are rounded, so that their sum is right.
     """
     total = MAX_REPEATS
     for candidate in range(1, MAX_REPEATS):
@@ -343,14 +349,14 @@ def _count_repeats(probabilities: Sequence[float]) -> list[int]:
         if max(errors) < 1e-9:
             total = candidate
             break
-    ends = [
+    cumulated_counts = [
         round(total * sum(probabilities[:k])) for k in range(len(probabilities) + 1)
     ]
-    return [end - begin for begin, end in pairwise(ends)]
+    return [end - begin for begin, end in pairwise(cumulated_counts)]
 
 
 def has_distribution(spec: Spec) -> bool:
-    """Return whether a spec says how likely each value is."""
+    """Return whether a spec states probabilities: a distribution, or weights."""
     return isinstance(spec, DistributionRange) or (
         isinstance(spec, OneOf) and len({*spec.values}) < len(spec.values)
     )
@@ -399,29 +405,26 @@ def is_same_value(
     """
     if isinstance(first, str) or isinstance(second, str):
         return first == second
-    return compute_difference(
-        first, second, is_angle=is_angle
-    ) <= RELATIVE_TOLERANCE * max(1.0, abs(first), abs(second))
+    tolerance = RELATIVE_TOLERANCE * max(1.0, abs(first), abs(second))
+    return compute_difference(first, second, is_angle=is_angle) <= tolerance
 
 
 def compute_difference(first: float, second: float, *, is_angle: bool = False) -> float:
-    """Return how far two numbers are from each other.
-
-    Angles that turn, the nearer way around.
-    """
-    return abs(
-        math.remainder(first - second, FULL_TURN) if is_angle else first - second
-    )
+    """Return how far two numbers are from each other; angles the shorter way round."""
+    difference = first - second
+    if is_angle:
+        difference = math.remainder(difference, FULL_TURN)
+    return abs(difference)
 
 
 def clip_to_range(
     value: float, low: float, high: float, *, is_angle: bool = False
 ) -> float:
-    """Return the value in a range that is nearest to a value.
-
-    Of an angle that turns it is the nearest way around.
+    """Return the value in a range that is nearest to a value; of an angle, nearest the
+    shorter way round.
     """
     if is_angle:
+        # in [low, low + 360): above `high` the way on to `low` may be shorter
         value = low + (value - low) % FULL_TURN
         if value > high and value - high > low + FULL_TURN - value:
             value = low
@@ -439,7 +442,10 @@ def format_value(value: ParameterValue) -> str:
 class Slot:
     """One parameter in a bound control.
 
-    As the scene has it, what it is set to, and where its coordinates begin.
+    Attributes:
+        parameter: as the scene has it.
+        spec: what it is set to.
+        offset: index of its first coordinate in the control's slice of u.
     """
 
     parameter: Parameter
@@ -476,9 +482,8 @@ class Slot:
         )
 
     def start_value(self) -> ParameterValue:
-        """Return the default, or the nearest value that is allowed.
-
-        Of names, the first one that is allowed.
+        """Return the default, or the nearest value that is allowed; of names, the first
+        that is allowed.
         """
         spec = self.spec
         default = self.parameter.default

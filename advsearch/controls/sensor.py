@@ -149,19 +149,18 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     ).to(image.device)
     light = apply_aberration(light, values["aberration"])
     variance = values["shot"] ** 2 * light + values["read"] ** 2
-    spread = torch.sqrt(variance + _DARK**2) - _DARK
-    light = light + spread * images.draw_noise(height, width, seed, "sensor").to(light)
+    # the square root, but with a finite derivative at 0
+    std = torch.sqrt(variance + _DARK**2) - _DARK
+    light = light + std * images.draw_noise(height, width, seed, "sensor").to(light)
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
     gains = torch.stack(
         [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
     )
     display = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
-    return (
-        images.compress_jpeg(display, 100 - compression).clamp(0.0, 1.0)
-        if compression
-        else display
-    )
+    if not compression:
+        return display
+    return images.compress_jpeg(display, 100 - compression).clamp(0.0, 1.0)
 
 
 def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
@@ -169,10 +168,13 @@ def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
 
     `amount` () is missing in the corners.
     """
+    # Natural vignetting, (1 + k r^2)^-2 with r = 1 in the corners, where it is
+    # 1 - amount.
     down, right = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
-    corner = (height**2 + width**2) / 4.0
-    square = (down[:, None] ** 2 + right[None, :] ** 2) / corner
-    return ((1.0 + ((1.0 - amount) ** -0.5 - 1.0) * square.to(amount)) ** -2)[..., None]
+    squared_corner = (height**2 + width**2) / 4.0
+    squared_radius = (down[:, None] ** 2 + right[None, :] ** 2) / squared_corner
+    k = (1.0 - amount) ** -0.5 - 1.0
+    return ((1.0 + k * squared_radius.to(amount)) ** -2)[..., None]
 
 
 def apply_aberration(image: Tensor, amount: Tensor) -> Tensor:
@@ -186,13 +188,12 @@ def apply_aberration(image: Tensor, amount: Tensor) -> Tensor:
         torch.arange(width) + 0.5 - width / 2,
         indexing="ij",
     )
-    outwards = torch.stack([right, down], dim=-1).to(image)
-    red, blue = (
-        images.warp(
-            image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0)
-        )
-        for k, sign in ((0, 1), (2, -1))
-    )
+    outwards = torch.stack([right, down], dim=-1).to(image)  # (H, W, 2) from the center
+    # A channel that is larger by a factor is looked up nearer to the center.
+    red_offsets = outwards * (1.0 / (1.0 + amount) - 1.0)
+    blue_offsets = outwards * (1.0 / (1.0 - amount) - 1.0)
+    red = images.warp(image[..., 0:1], red_offsets)
+    blue = images.warp(image[..., 2:3], blue_offsets)
     return torch.cat([red, image[..., 1:2], blue], dim=-1)
 
 
@@ -207,6 +208,7 @@ def apply_mosaic(light: Tensor) -> Tensor:
     red = (1 - rows) * (1 - columns)
     blue = rows * columns
     is_measured = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
+    # Bilinear weights; divided by the weight of the pixels that have the channel.
     kernel = light.new_tensor(
         [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
     ).expand(3, 1, 3, 3)

@@ -171,7 +171,11 @@ class ShadowControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the card's pose and the offsets of its corners."""
+        """Return the card's pose and the offsets of its corners.
+
+        A corner is moved towards the center by its radius. The card is hidden if it has
+        no size, or the camera would see it from everywhere.
+        """
         radii = values["radii"]
         rim = torch.from_numpy(parts.make_polygon(len(radii)).vertices[1:].copy()).to(
             radii
@@ -221,12 +225,15 @@ class ShadowControl(Control):
     def _find_distance(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> float | None:
-        """Find the distance from which the camera does not see the card.
+        """Find the smallest distance, at least the requested, at which the camera does
+        not see the card.
 
-        A ball around the card is outside of the cone around the corners of the image.
+        That is so if a ball around the card is outside of the cone through the corners
+        of the image. The card stays nearer than the lamp.
 
         Returns:
-            The distance in object sizes; None where the card is put away.
+            The distance in object sizes; None if the card has no size, or is visible at
+                all distances.
         """
         size = float(values["size"].detach())
         requested = float(values["distance"].detach())

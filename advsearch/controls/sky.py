@@ -77,23 +77,25 @@ def compute_direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
 
 
 def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
-    """Interpolate a table (10, ...) between whole turbidities.
+    """Interpolate a table (10, ...) between the integer turbidities 1 to 10.
 
-    By cubics with a continuous derivative: the slope at a whole turbidity is that
+    By cubics with a continuous derivative: the slope at an integer turbidity is that
     between its neighbors (Catmull and Rom 1974), one-sided at the ends. The authors
-    interpolate linearly, so that the derivative jumps at whole turbidities, the default
-    of 3 among them.
+    interpolate linearly, so that the derivative jumps at integer turbidities, the
+    default of 3 among them.
     """
     below = min(8, max(0, int(turbidity.detach()) - 1))
-    t = turbidity - 1.0 - below
-    first = table[below]
-    second = table[below + 1]
-    around = ((max(0, k - 1), min(9, k + 1)) for k in (below, below + 1))
-    slopes = [
-        (table[after] - table[before]) / (after - before) for before, after in around
-    ]
-    rise = second - first
-    return torch.lerp(first, second, t) + t * (1.0 - t) * (
+    t = turbidity - 1.0 - below  # from 0 at the entry below to 1 at the next
+    lower = table[below]
+    upper = table[below + 1]
+    slopes = []
+    for index in (below, below + 1):
+        before = max(0, index - 1)
+        after = min(9, index + 1)
+        slopes.append((table[after] - table[before]) / (after - before))
+    # a cubic Hermite spline, as a correction of the line
+    rise = upper - lower
+    return torch.lerp(lower, upper, t) + t * (1.0 - t) * (
         (1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise)
     )
 
@@ -122,9 +124,13 @@ def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
 
 
 class Sky:
-    """Sky maps over one ground, of a linear reflectance (3,) in [0, 1].
+    """Sky maps over one ground, after Hosek and Wilkie. Its device is the maps'.
 
-    Its device is the maps'.
+    Attributes:
+        ground: linear reflectance (3,) in [0, 1].
+        directions: (H, W, 3) unit vectors towards the texels above the horizon.
+        cosines: (H, W, 1) of their angles from the zenith.
+        solid_angles: (H, 1 or W, 1) of the texels.
     """
 
     def __init__(self, ground: Tensor) -> None:
@@ -157,7 +163,8 @@ class Sky:
             turbidity: () in `TURBIDITIES`.
 
         Returns:
-            (ROWS / 2, COLUMNS, 3).
+            (H, W, 3). The letters are the coefficients of Hosek and Wilkie's formula,
+                in the order of its tables.
         """
         a, b, c, d, e, f, g, i, h = self._interpolated(
             load_tables(sun.device)[0], elevation, turbidity
@@ -181,10 +188,13 @@ class Sky:
     def _interpolated(
         self, table: Tensor, elevation: Tensor, turbidity: Tensor
     ) -> Tensor:
-        """Interpolate a table (10, 2, 6, 3, ...).
+        """Interpolate a table (10, 2, 6, 3, ...) in turbidity, ground albedo (0 or 1)
+        and elevation; the last axis before others is the channel.
 
-        Quintic Bezier in the elevation's cube root, linear in the others.
+        It is a quintic Bezier curve in the cube root of the elevation, and linear in
+        the albedo.
         """
+        # not 0, where the cube root has no derivative
         x = (elevation / 90.0).clamp(1e-6, 1.0).pow(1.0 / 3.0)
         weights = torch.stack(
             [math.comb(5, k) * x**k * (1.0 - x) ** (5 - k) for k in range(6)]
@@ -257,6 +267,7 @@ class SkyControl(Control):
     """
 
     kind = "sky"
+    photograph_refusal = "the photograph was taken in one light, and shows its own sky"
     parameters = (
         _by_differences(
             "azimuth",

@@ -64,11 +64,9 @@ class Space:
     @property
     def start(self) -> Tensor:
         """(d,) float32 in [0, 1]: the configuration that leaves the scene as it is."""
-        return (
-            torch.cat([control.start for control in self.controls])
-            if self.controls
-            else torch.zeros(0)
-        )
+        if not self.controls:
+            return torch.zeros(0)
+        return torch.cat([control.start for control in self.controls])
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
@@ -121,10 +119,11 @@ class Space:
     def _evaluation_order(self) -> tuple[int, ...]:
         """Indices of the controls in the order in which they are evaluated.
 
-        Those later that refine what others set, and last those that lie on top.
+        First those that refine nothing, then those that refine what others set, last
+        those of them that lie on top; within each kind in their order.
         """
-        kinds = [(bool(control.refines), control.on_top) for control in self.controls]
-        return tuple(sorted(range(len(kinds)), key=kinds.__getitem__))
+        ranks = [(bool(control.refines), control.on_top) for control in self.controls]
+        return tuple(sorted(range(len(ranks)), key=lambda index: ranks[index]))
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Map u to scene inputs, by differentiable torch operations.
@@ -157,9 +156,11 @@ class Space:
     def _with_previous_inputs(
         self, u: Tensor
     ) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
-        """Return each control with its slice of u and the inputs of those before it.
+        """Return each control with its slice of u and the inputs of those evaluated
+        before it, in the order of the controls.
 
-        Without these inputs where it takes none.
+        A control that refines nothing gets no inputs; after the last that refines, none
+        are computed.
         """
         slices = u.detach().split(self.sizes)
         order = self._evaluation_order
@@ -206,20 +207,19 @@ class Space:
     def get_printable_colors(self, u: Tensor) -> dict[str, Tensor]:
         """Return the searched colours that a printer would print, by control.
 
-        See `Control.printed`.
+        See `Control.get_printable_colors`; controls without any are left out.
         """
-        colors_by_control = (
-            (control.name, control.get_printable_colors(part))
-            for control, part in self.split_by_control(u)
-        )
-        return {
-            name: colors for name, colors in colors_by_control if colors is not None
-        }
+        colors_by_control = {}
+        for control, part in self.split_by_control(u):
+            colors = control.get_printable_colors(part)
+            if colors is not None:
+                colors_by_control[control.name] = colors
+        return colors_by_control
 
     def get_numeric_values(self, u: Tensor) -> dict[str, Tensor]:
         """Return the numbers of a configuration by parameter ("pose.yaw").
 
-        See `Control.numbers`.
+        See `Control.get_numeric_values`.
         """
         return {
             f"{control.name}.{parameter}": value
@@ -250,16 +250,20 @@ class Space:
     def fix_first_controls(self, u: Tensor) -> Space:
         """Return the space whose first controls stay at a configuration.
 
-        The others vary.
+        The others vary. If the fixed controls choose the environment, the space
+        remembers which one.
 
         Args:
-            u: (k,) coordinates of the first controls.
+            u: (k,) coordinates of the first controls, whose number follows from k.
 
         Raises:
             InputError: no number of controls has k coordinates.
         """
         sizes = self.sizes
-        counts = [k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)]
+        # of controls without coordinates at the end, none is fixed
+        counts = [
+            count for count in range(len(sizes) + 1) if sum(sizes[:count]) == len(u)
+        ]
         if not counts:
             raise InputError(
                 "controls: expected the coordinates of whole controls, "
@@ -271,10 +275,12 @@ class Space:
             _FixedControl(control, part)
             for control, part in zip(self.controls, slices, strict=False)
         ]
-        first = Space(self.controls[:count], self.scene)
-        lit_by = first.find_environment(first.describe(u)) or self.environment
+        fixed_space = Space(self.controls[:count], self.scene)
+        chosen_environment = fixed_space.find_environment(fixed_space.describe(u))
         return replace(
-            self, controls=(*fixed, *self.controls[count:]), environment=lit_by
+            self,
+            controls=(*fixed, *self.controls[count:]),
+            environment=chosen_environment or self.environment,
         )
 
     def find_environment(self, values: Mapping[str, Value]) -> str | None:
@@ -343,10 +349,11 @@ class Space:
 
 
 def _spread_over_box(size: int) -> Tensor:
-    """Return points (n, size) spread over the unit box, and both ends of each axis."""
+    """Return points (n, size) spread over the unit box, and the centers of its faces."""
     spread = SobolEngine(size).draw(N_CAMERA_VIEWS) if size else torch.zeros(1, 0)
-    ends = [torch.where(torch.eye(size) > 0.0, end, 0.5) for end in (0.0, 1.0)]
-    return torch.cat([spread, *ends])
+    is_own_axis = torch.eye(size) > 0.0
+    face_centers = [torch.where(is_own_axis, end, 0.5) for end in (0.0, 1.0)]
+    return torch.cat([spread, *face_centers])
 
 
 def _view_of_inputs(

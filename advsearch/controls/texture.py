@@ -63,6 +63,15 @@ WAVE_REACH = 3.0
 class TextureControl(Control):
     """The base-colour map of the object or another mesh, inside a ball around the
     original.
+
+    Attributes:
+        form: one of `FORMS`, what the coordinates are.
+        _mesh_name: of the mesh that is painted.
+        _materials: names of the materials that are painted; "" for all of the mesh.
+        _original: (h, w, 3) sRGB, the original texture at the search's resolution.
+        _painted_mask: (h, w) texels that are painted; None for all.
+        _painter: map from u to these texels.
+        _unchanged_texels: (n, 3) of the painter at the start.
     """
 
     kind = "texture"
@@ -186,12 +195,13 @@ class TextureControl(Control):
             raise UnknownNameError(kind, self.mesh, known, hint) from None
 
     def _named_material(self, scene: SceneDescription) -> list[str]:
-        """Return the materials of the object that its name means, as in
+        """Return the materials of the object that the control's name means, as in
         `texture:paint`.
 
-        None where a mesh has that name.
+        A name is a material's own, or as it is written for the command line. Empty if a
+        mesh has that name, which wins, or no material has.
         """
-        # takes time, and most do without
+        # imported here, as it takes time and most runs do without
         from advsearch.scene.importing.files import sanitize_name
 
         if self.mesh in scene.meshes:
@@ -232,16 +242,20 @@ class TextureControl(Control):
     def _resample_original(
         self, part: MeshPart, materials: Sequence[str] | None
     ) -> Tensor:
-        """Return the original texture (h, w, 3) sRGB at the resolution of the
-        search.
+        """Return the original texture (h, w, 3) sRGB at the resolution of the search.
+
+        By default a full texture is resized to a square of its longer side within
+        `RESOLUTIONS`. If only some materials are painted, a large enough texture stays
+        as it is, so that the rest does not change.
         """
         original = torch.from_numpy(part.base_color.copy())
         longer_side = max(original.shape[:2])
         resolution = self.chosen["resolution"]
-        smallest, largest = RESOLUTIONS
-        if not (resolution or materials is None or longer_side < smallest):
+        min_side, max_side = RESOLUTIONS
+        paints_some = materials is not None
+        if not resolution and paints_some and longer_side >= min_side:
             return original
-        default = min(max(longer_side, smallest), largest)
+        default = min(max(longer_side, min_side), max_side)
         return resize_to_square(original, int(resolution or default))
 
     def _make_painter(self, part: MeshPart, mask: Tensor) -> Painter:
@@ -257,11 +271,12 @@ class TextureControl(Control):
             budget = Budget(norm, compute_radius(norm, epsilon, centers.numel()))
             return make_palette_painter(texels, centers, budget)
         if self.form == "waves":
-            reach = compute_radius(norm, epsilon, texels.numel())
+            max_change = compute_radius(norm, epsilon, texels.numel())
             if norm == "l2":
-                reach = reach / math.sqrt(texels.numel())
-            return make_wave_painter(texels, mask, int(self.chosen["waves"]), reach)
-        # each texel value on its own
+                # so that all values at the maximum are on the edge of the ball
+                max_change = max_change / math.sqrt(texels.numel())
+            n_waves = int(self.chosen["waves"])
+            return make_wave_painter(texels, mask, n_waves, max_change)
         budget = Budget(norm, compute_radius(norm, epsilon, texels.numel()))
         group = Group("texels", texels.numel(), ("adjoint",), budget)
         return Painter(texels.reshape(-1), group, to_texels)
@@ -380,15 +395,16 @@ def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> P
         centers: (k, 3) sRGB, the original's palette.
         budget: the ball around the palette.
     """
-    squared = (original[..., None, :] - centers).square().sum(dim=-1)
-    # over which a color's influence falls off: half the mean distance to the nearest
-    # other color
-    spread = 1.0
+    squared_distance = (original[..., None, :] - centers).square().sum(dim=-1)  # (n, k)
+    # A color's influence falls off over half the mean distance to the nearest other
+    # color.
+    falloff = 1.0
     if len(centers) > 1:
-        no_self = torch.diag(torch.full((len(centers),), 10.0))
-        distances = torch.cdist(centers, centers) + no_self
-        spread = max(0.5 * float(distances.min(dim=1).values.mean()), 1e-3)
-    weights = torch.softmax(-squared / (2.0 * spread**2), dim=-1)
+        # more than any distance, so that no color is its own nearest
+        self_distance = torch.diag(torch.full((len(centers),), 10.0))
+        distances = torch.cdist(centers, centers) + self_distance
+        falloff = max(0.5 * float(distances.min(dim=1).values.mean()), 1e-3)
+    weights = torch.softmax(-squared_distance / (2.0 * falloff**2), dim=-1)
     group = Group("palette", centers.numel(), ("adjoint", "differences"), budget)
     texels = partial(_paint_palette, original, weights, centers)
     return Painter(centers.reshape(-1), group, texels)
@@ -397,6 +413,10 @@ def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> P
 def _paint_palette(
     original: Tensor, weights: Tensor, centres: Tensor, u: Tensor
 ) -> Tensor:
+    """Return the texels (n, 3) with the palette of a slice u.
+
+    Each changes by the weighted (n, k) changes of the colors (k, 3).
+    """
     change = weights.to(u.device) @ (u.reshape(-1, 3) - centres.to(u.device))
     return (original.to(u.device) + change).clamp(0.0, 1.0)
 
@@ -416,30 +436,36 @@ def make_wave_painter(
             the wave's frequency).
         radius: largest change of a texel value.
     """
-    index = torch.arange(count)
+    wave_index = torch.arange(count)
+    # (h, count) and (w, count): each wave along a side
     down, right = (
-        torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * index / side)
+        torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * wave_index / side)
         for side in mask.shape
     )
-    frequency = torch.hypot(index[:, None].float(), index[None, :].float())
-    reach = (WAVE_REACH / (1.0 + frequency))[..., None]
+    frequency = torch.hypot(wave_index[:, None].float(), wave_index[None, :].float())
+    max_amplitude = (WAVE_REACH / (1.0 + frequency))[..., None]  # (count, count, 1)
     start = torch.full((count * count * 3,), 0.5)
-    texels = partial(_paint_waves, original, mask, radius, (down, right, reach))
+    waves = (down, right, max_amplitude)
+    texels = partial(_paint_waves, original, mask, radius, waves)
     return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
 
 
 def _paint_waves(
     original: Tensor,
-    where: Tensor,
+    mask: Tensor,
     radius: float,
     waves: tuple[Tensor, Tensor, Tensor],
     u: Tensor,
 ) -> Tensor:
-    """Return the texels (n, 3) with the waves of a slice u; see `make_wave_painter`."""
-    down, right, reach = (wave.to(u.device) for wave in waves)
-    amplitudes = (2.0 * u - 1.0).reshape(*reach.shape[:2], 3) * reach
-    summed = torch.einsum("hm,wn,mnc->hwc", down, right, amplitudes)
-    change = radius * torch.tanh(summed[where.to(u.device)])
+    """Return the texels (n, 3) with the waves of a slice u; see `make_wave_painter`.
+
+    `waves` are those down (h, k) and to the right (w, k), and their largest amplitudes
+    (k, k, 1).
+    """
+    down, right, max_amplitude = (wave.to(u.device) for wave in waves)
+    amplitudes = (2.0 * u - 1.0).reshape(*max_amplitude.shape[:2], 3) * max_amplitude
+    wave_sum = torch.einsum("hm,wn,mnc->hwc", down, right, amplitudes)
+    change = radius * torch.tanh(wave_sum[mask.to(u.device)])
     return (original.to(u.device) + change).clamp(0.0, 1.0)
 
 
@@ -480,8 +506,8 @@ def _quantise_colors(
     """Return the mean colors (N, 3) of the 5-bit cells of an image, and their mass
     (N,).
 
-    The mass is the root of the summed weight, or else the shades of the largest surface
-    take all centers.
+    The mass is the root of the summed weight; with the weight itself, shades of the
+    largest surface would take all centers. Cells without weight are left out.
     """
     colors = image.reshape(-1, 3).double().numpy()
     weights = weight.reshape(-1).astype(np.float64)
@@ -501,7 +527,11 @@ def _quantise_colors(
 def _choose_first_centers(
     points: Float64Array, mass: Float64Array, count: int
 ) -> list[int]:
-    """Choose the indices of up to `count` points (N, 3) that k-means starts from."""
+    """Choose the indices of up to `count` points (N, 3) that k-means starts from.
+
+    The heaviest first, then each time the point with the largest mass times squared
+    distance from the nearest chosen one; fewer if no other point is left.
+    """
     chosen = [int(mass.argmax())]
     while len(chosen) < min(count, len(points)):
         squared = ((points[:, None] - points[chosen]) ** 2).sum(axis=-1).min(axis=1)

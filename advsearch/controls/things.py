@@ -1,7 +1,7 @@
 """The `things` control: where the things beside the object stand, how they are turned,
 and whether they are there.
 
-    place = where it was put + (x, y) + away * t,    t >= 0 the least at which it stands free
+    position = initial position + (x, y) + away * t,    t >= 0 the least at which it is free
 
 `away` points from the object to the thing. Free is what overlaps with no other outline
 on the ground: the object's, the camera's, those of things that stay, and those of
@@ -38,18 +38,16 @@ from advsearch.extend import (
     parts,
 )
 
-MIN_GAP = (
-    0.01  # metres between a thing that was moved away and what it would have stood in
-)
+# metres between a thing that was moved away and what it would have stood in
+MIN_GAP = 0.01
 CAMERA_CLEARANCE = 0.3
 CAMERA_CLEARANCE_FRACTION = 0.05
-"""Metres around the camera that stay free of what is as high; at most that share of its
-distance to the object.
+"""Metres around the camera that stay free of what is as high as it; at most this
+fraction of its distance to the object.
 """
 EIGHTHS = np.arange(8) * np.pi / 4.0
-ABSENT_SCALE = (
-    1e-5  # size of a thing that is away, and how many metres it lies in the ground
-)
+# An absent thing is scaled to this size, and lies this many metres under the ground.
+ABSENT_SCALE = 1e-5
 ABSENT_DEPTH = 0.01
 _moving = partial(Parameter.moving, Parameter.ORBIT)
 
@@ -58,13 +56,16 @@ class Stand(NamedTuple):
     """Where a thing stands, in the coordinates of the scene."""
 
     position: assets.Float64Array  # (2,) of its center
-    height: float  # of the ground there
+    height: float  # of its lowest point
     push_distance: float  # how far it was moved away from the object
 
 
 class ThingsControl(Control):
     """Where the things beside the object stand, how they are turned, and whether they
     are there.
+
+    `_moved_things` holds the names of the things that it moves, in the scene's order:
+    those with a searched parameter, or one that the user set.
     """
 
     kind = "things"
@@ -144,7 +145,7 @@ class ThingsControl(Control):
             is_set = slot.parameter.name in self.specs or short_name in self.specs
             if slot.n_coordinates or is_set:
                 moved.add(thing)
-        # the others stay, or another control moves them
+        # The rest stay where they are, or another control moves them.
         self._moved_things = tuple(name for name in things if name in moved)
         unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
         for name, stand in self._compute_stands(unmoved, {}).items():
@@ -155,7 +156,10 @@ class ThingsControl(Control):
                 )
 
     def list_parameter_specs(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
-        """Yield the parameters of each thing, which those for all things apply to."""
+        """Yield the parameters of each thing, named `<thing>.<parameter>`.
+
+        The setting of a parameter of one thing wins over that for all things.
+        """
         for thing in self.scene.things:
             for parameter in map(self.resolve_parameter, self.parameters):
                 name = f"{thing}.{parameter.name}"
@@ -163,20 +167,21 @@ class ThingsControl(Control):
                 yield replace(parameter, name=name), spec
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter, with a range of positions that is not larger than a
-        table.
+        """Return a parameter; x and y go as far as the object is large, at most 2
+        metres.
         """
         if parameter.name not in ("x", "y"):
             return parameter
-        # beside a small thing, two metres are off its table
-        reach = min(2.0, self.scene.metres)
+        # The object is one unit large. Two metres beside a small one are off its table.
+        object_size = self.scene.metres
+        reach = min(2.0, object_size)
         return replace(parameter, search=(-reach, reach))
 
     @property
     def refines(self) -> frozenset[str]:
-        """Inputs that this control reads and does not change.
+        """Inputs of the scene that this control reads and does not change.
 
-        So it comes after whatever moves what things may not stand in.
+        They make it come after the controls that move an obstacle, or bend a mesh.
         """
         fixed = [name for name in self.scene.things if name not in self._moved_things]
         poses = [f"{name}.to_world" for name in ("object", "camera", *fixed)]
@@ -186,12 +191,17 @@ class ThingsControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the pose of each thing that this control moves."""
+        """Return the pose `<thing>.to_world` (4, 4) of each thing that it moves.
+
+        A thing is turned about its foot and put where it stands. An absent one is
+        scaled to almost nothing under the ground, so that the meshes stay the same.
+        Derivatives reach the heading, not the position.
+        """
         inputs = {}
         for name, stand in self._compute_stands(values, so_far).items():
             part = self.scene.meshes[name]
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
-            foot = torch.from_numpy(_foot(part)).to(base)
+            foot = torch.from_numpy(_find_foot(part)).to(base)
             turn = geometry.make_euler_rotation(
                 values[f"{name}.heading"], *base.new_zeros(2)
             )
@@ -199,11 +209,11 @@ class ThingsControl(Control):
             if is_absent:
                 turn = ABSENT_SCALE * turn
             position = base.new_tensor([*stand.position, stand.height])
-            sunk = (
+            depth = (
                 base.new_tensor([0.0, 0.0, ABSENT_DEPTH / self.scene.metres])
                 * is_absent
             )
-            translation = position - sunk - turn @ foot
+            translation = position - depth - turn @ foot
             inputs[f"{name}.to_world"] = geometry.make_affine(turn, translation) @ base
         return inputs
 
@@ -222,7 +232,11 @@ class ThingsControl(Control):
     def _compute_stands(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Stand]:
-        """Compute where the things that move stand, by name; without derivatives."""
+        """Compute where the things that move stand, by name; without derivatives.
+
+        They are placed in their order, and each that is present is an obstacle to the
+        next ones.
+        """
         scene = self.scene
         obstacles = self._list_obstacles(so_far)
         object_outline = obstacles[0].outline
@@ -232,24 +246,28 @@ class ThingsControl(Control):
         ]
         stands = {}
         for name in self._moved_things:
-            base = _footprint(scene, name, so_far)
+            footprint = _compute_footprint(scene, name, so_far)
             stand, outline = self._find_stand(
-                name, values, base, object_center, obstacles, solids
+                name, values, footprint, object_center, obstacles, solids
             )
             stands[name] = stand
-            if not values[f"{name}.presence"]:
-                obstacles.append(parts.Footprint(outline, base.lower, base.upper))
+            is_absent = values[f"{name}.presence"]
+            if not is_absent:
+                obstacles.append(
+                    parts.Footprint(outline, footprint.lower, footprint.upper)
+                )
         return stands
 
     def _list_obstacles(self, so_far: Mapping[str, Tensor]) -> list[parts.Footprint]:
-        """List what a thing may not stand in: the object first, the camera, other
-        things.
+        """List what a thing may not stand in: the object first, then the camera, then
+        the things that do not move.
 
-        Things that move are not among them yet.
+        The camera's footprint is a circle of the clearance, from the camera upwards.
         """
         scene = self.scene
-        tested = _footprint(scene, "object", so_far)
-        object_center = (tested.outline.min(axis=0) + tested.outline.max(axis=0)) / 2.0
+        object_footprint = _compute_footprint(scene, "object", so_far)
+        outline = object_footprint.outline
+        object_center = (outline.min(axis=0) + outline.max(axis=0)) / 2.0
         camera = geometry.get_camera_pose(scene, so_far)
         eye = camera[:3, 3].detach().double().cpu().numpy()
         object_distance = float(np.linalg.norm(eye[:2] - object_center))
@@ -262,13 +280,13 @@ class ThingsControl(Control):
         )
         fixed_things = [name for name in scene.things if name not in self._moved_things]
         return [
-            tested,
+            object_footprint,
             around_camera,
-            *(_footprint(scene, name, so_far) for name in fixed_things),
+            *(_compute_footprint(scene, name, so_far) for name in fixed_things),
         ]
 
     def _read_numbers(self, name: str, values: Values) -> list[float]:
-        """Return the values of a thing's parameters, without derivatives."""
+        """Return x, y, heading and presence (1 if absent) of a thing."""
         return [
             float(values[f"{name}.{parameter.name}"].detach())
             for parameter in self.parameters
@@ -278,35 +296,41 @@ class ThingsControl(Control):
         self,
         name: str,
         values: Values,
-        base: parts.Footprint,
+        initial_footprint: parts.Footprint,
         object_center: assets.Float64Array,
         obstacles: Sequence[parts.Footprint],
         solids: Sequence[parts.Solid],
     ) -> tuple[Stand, assets.Float64Array]:
         """Find the free position of one thing, and its outline (K, 2) there.
 
+        An absent thing is not pushed anywhere.
+
         Args:
             name: of the thing.
             values: of the control.
-            base: what the thing takes up before it is moved.
+            initial_footprint: of the thing before it is moved.
             object_center: (2,) that it is pushed away from.
-            obstacles: which it may not stand in; it goes away from the object.
-            solids: of the place, which it goes towards the object for.
+            obstacles: it is pushed away from the object until it is free of these.
+            solids: of the surroundings; it is first pushed towards the object until it
+                is free of these.
         """
         scene = self.scene
         x, y, heading, is_absent = self._read_numbers(name, values)
-        foot = _foot(scene.meshes[name])
+        foot = _find_foot(scene.meshes[name])
         requested = foot[:2] + np.array([x, y]) / scene.metres
-        outline = _rotate_outline(base.outline - foot[:2], heading)
-        direction = _unit_direction(requested - object_center)
-        pushed = 0.0
+        outline = _rotate_outline(initial_footprint.outline - foot[:2], heading)
+        direction = _normalize(requested - object_center)
+        push_distance = 0.0
         if not is_absent:
-            footprint = parts.Footprint(outline + requested, base.lower, base.upper)
-            gap = MIN_GAP / scene.metres
-            pushed = _find_free_shift(footprint, direction, obstacles, solids, gap)
-        position = requested + pushed * direction
+            footprint = parts.Footprint(
+                outline + requested, initial_footprint.lower, initial_footprint.upper
+            )
+            push_distance = _find_free_shift(
+                footprint, direction, obstacles, solids, gap=MIN_GAP / scene.metres
+            )
+        position = requested + push_distance * direction
         height = _compute_height(scene, foot, position)
-        return Stand(position, height, pushed), outline + position
+        return Stand(position, height, push_distance), outline + position
 
 
 def _rotate_outline(
@@ -320,8 +344,8 @@ def _rotate_outline(
     return np.asarray(outline @ rotation.T)
 
 
-def _unit_direction(vector: assets.Float64Array) -> assets.Float64Array:
-    """Return the direction (2,) of a vector; +x for one of length 0."""
+def _normalize(vector: assets.Float64Array) -> assets.Float64Array:
+    """Return a vector (2,) scaled to length 1; (1, 0) if its length is 0."""
     if not vector.any():
         return np.array([1.0, 0.0])
     return np.asarray(vector / np.linalg.norm(vector))
@@ -334,28 +358,33 @@ def _find_free_shift(
     solids: Sequence[parts.Solid],
     gap: float,
 ) -> float:
-    """Find how far something is shifted along a direction so that it stands free.
+    """Find how far a thing is shifted along a direction so that it stands free.
+
+    If it stands in solids, it first goes backwards, out of all of them. From there it
+    goes forwards past each solid or obstacle that it stands in, in their order along
+    the direction. The shift is negative if it ends behind where it began.
 
     Args:
-        footprint: what it takes up where it was put.
+        footprint: of the thing at the requested position.
         direction: (2,) unit vector away from the object.
-        obstacles: which it goes forwards for, along the direction.
-        solids: which it first goes backwards for, where it stands in one.
-        gap: that stays free.
+        obstacles: footprints that it may not overlap with.
+        solids: of the surroundings, likewise.
+        gap: distance that stays free.
     """
-    in_solids = [
+    # (begin, end) of the shifts at which it overlaps
+    solid_intervals = [
         geometry.find_overlap_interval(footprint, solid.footprint, direction)
         for solid in solids
     ]
-    in_obstacles = [
+    obstacle_intervals = [
         geometry.find_overlap_interval(footprint, obstacle, direction)
         for obstacle in obstacles
     ]
     shift = 0.0
-    solid_begins = [begin for begin, end in in_solids if begin < 0.0 < end]
+    solid_begins = [begin for begin, end in solid_intervals if begin < 0.0 < end]
     if solid_begins:
         shift = min(solid_begins) - gap
-    for begin, end in sorted(in_obstacles + in_solids):
+    for begin, end in sorted(obstacle_intervals + solid_intervals):
         if begin < shift < end:
             shift = end + gap
     return shift
@@ -366,20 +395,19 @@ def _compute_height(
     foot: assets.Float64Array,
     position: assets.Float64Array,
 ) -> float:
-    """Return the height at a position (2,) of a thing that is as far above the ground
-    there.
+    """Return the height of a thing's foot at a position (2,) of the ground.
 
-    `foot` is the point (3,) that it stands at so far.
+    It is as far above the ground there as at `foot` (3,), where it stands so far.
     """
     height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
     height: float = height_above_ground + scene.get_ground_height(position)
     return height
 
 
-def _foot(part: parts.MeshPart) -> assets.Float64Array:
-    """Return the point (3,) that a thing is put at and turned about.
+def _find_foot(part: parts.MeshPart) -> assets.Float64Array:
+    """Return the point (3,) that a thing is placed by and turned about.
 
-    It is the center of its box, at the height of its lowest point.
+    It is the center of its bounding box, at the height of its lowest point.
     """
     low = part.mesh.vertices.min(axis=0)
     high = part.mesh.vertices.max(axis=0)
@@ -387,24 +415,29 @@ def _foot(part: parts.MeshPart) -> assets.Float64Array:
     return np.asarray(part.to_world[:3, :3] @ foot + part.to_world[:3, 3])
 
 
-def _footprint(
+def _compute_footprint(
     scene: SceneDescription, name: str, so_far: Mapping[str, Tensor]
 ) -> parts.Footprint:
-    """Return what a mesh takes up where the controls before have put it."""
+    """Return the footprint of a mesh on the ground, as earlier controls left it.
+
+    `so_far` may have its pose (4, 4) and offsets (N, 3) of its vertices.
+    """
     part = scene.meshes[name]
     pose = so_far.get(f"{name}.to_world")
     offsets = so_far.get(f"{name}.offsets")
     if pose is None and offsets is None:
-        return _initial_footprint(part)
-    vertices = part.mesh.vertices + 0.0
+        return _compute_initial_footprint(part)
+    vertices = part.mesh.vertices
     if offsets is not None:
-        vertices = part.mesh.vertices + offsets.detach().cpu().double().numpy()
-    matrix = part.to_world
+        vertices = vertices + offsets.detach().cpu().double().numpy()
+    to_world = part.to_world
     if pose is not None:
-        matrix = pose.detach().cpu().double().numpy()
-    return geometry.compute_footprint(vertices @ matrix[:3, :3].T + matrix[:3, 3])
+        to_world = pose.detach().cpu().double().numpy()
+    rotation = to_world[:3, :3]
+    translation = to_world[:3, 3]
+    return geometry.compute_footprint(vertices @ rotation.T + translation)
 
 
 @lru_cache(maxsize=256)
-def _initial_footprint(part: parts.MeshPart) -> parts.Footprint:
+def _compute_initial_footprint(part: parts.MeshPart) -> parts.Footprint:
     return geometry.compute_footprint(geometry.compute_base_vertices(part))

@@ -32,18 +32,16 @@ from advsearch.scene.transport.matrix import (
 )
 from advsearch.trust.stored_files import scale_limit
 
-INITIAL_CONDITIONS = (
-    8  # conditions in the bank at first, as a multiple of those of an evaluation
-)
-DRAWS_PER_CONDITION = (
-    4  # conditions that are drawn for each that is added, while the bank grows
-)
+# conditions in the bank at first, as a multiple of those of an evaluation
+INITIAL_CONDITIONS = 8
+# conditions that evaluations draw for each that is added, while the bank grows
+DRAWS_PER_CONDITION = 4
 COMPARISON_INTERVAL = 100  # evaluations from one comparison to the next
 # conditions that a comparison traces, and as many of the bank that it predicts
 N_COMPARED = 16
-MIN_STANDARD_ERRORS = (
-    1.0  # standard errors by which unseen conditions must be better for the model
-)
+# standard errors by which unseen conditions must be better for the model, for the bank
+# to grow
+MIN_STANDARD_ERRORS = 1.0
 SPP = 4  # samples per pixel of a condition's light (see `problem.LIGHT_DEPTH`)
 BATCH_SIZE = 16  # images in a batch of the model
 MAX_SOBOL_DIM = 64  # coordinates of a condition up to which conditions are stratified
@@ -183,7 +181,11 @@ class Bank(PredictedSearch):
         return replace(evaluation, predicted=1)
 
     def _choose_conditions(self, kind: str, index: int) -> list[Condition]:
-        """Return the conditions of an evaluation: all new ones, and random others."""
+        """Return the conditions of an evaluation: those that are new since the one
+        before, and random others of the bank.
+
+        The ranking has none that are new since the search ended.
+        """
         count = min(self.problem.n_draws, len(self._conditions))
         previous_index = index - 1 if kind == "search" else self._latest_step
         size_before = self._bank_size(previous_index)
@@ -232,22 +234,26 @@ class Bank(PredictedSearch):
             return self._image_renderer(self.problem.add_conditions(u))
 
     def _bank_size(self, index: int) -> int:
-        """Return how many conditions are collected by the evaluation with an index."""
-        # The second half of a search adds none.
+        """Return how many conditions are collected by the evaluation with an index.
+
+        The bank grows from the start, and from each comparison in `growth_steps`, until
+        the next comparison; but not in the second half of a search. While it grows,
+        each evaluation adds one condition for every `DRAWS_PER_CONDITION` that it
+        draws.
+        """
         index = min(index, self.steps // 2 - 1)
-        n_growing_steps = sum(
-            min(max(index - begin + 1, 0), COMPARISON_INTERVAL)
-            for begin in (0, *self.growth_steps)
-        )
+        n_growing_steps = 0
+        for begin in (0, *self.growth_steps):
+            n_growing_steps += min(max(index - begin + 1, 0), COMPARISON_INTERVAL)
         draws = self.problem.n_draws
-        return (
-            INITIAL_CONDITIONS * draws + n_growing_steps * draws // DRAWS_PER_CONDITION
-        )
+        n_initial = INITIAL_CONDITIONS * draws
+        return n_initial + n_growing_steps * draws // DRAWS_PER_CONDITION
 
     def _make_query(self, number: int) -> Query:
         """Return the query for the light of the condition with an index.
 
-        The light is collected where the search was when the bank last began to grow.
+        The light is collected at the configuration where the search was when the bank
+        began to grow for the last time before that condition; at the start before any.
         """
         assert self.problem.conditions is not None
         starts = [
@@ -262,7 +268,9 @@ class Bank(PredictedSearch):
     def _fill(self, index: int, tick: ProgressCallback = lambda samples: None) -> None:
         """Make the matrices of all conditions up to an evaluation, the newest last.
 
-        The oldest are dropped where memory is short.
+        The light of all conditions up to the next comparison is requested at once, so
+        that workers can collect it in parallel. The oldest matrices are dropped if
+        memory is short.
         """
         size = self._bank_size(index)
         first = self._conditions[-1].index + 1 if self._conditions else 0

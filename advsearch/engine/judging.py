@@ -106,10 +106,10 @@ def _import_name(function: Metric) -> str:
     """
     module_name = str(getattr(function, "__module__", None))
     qualified_name = str(getattr(function, "__qualname__", None))
-    found: Any = sys.modules.get(module_name)
+    imported: Any = sys.modules.get(module_name)
     for attribute in qualified_name.split("."):
-        found = getattr(found, attribute, None)
-    if found is function:
+        imported = getattr(imported, attribute, None)
+    if imported is function:
         return f"{module_name}:{qualified_name}"
     return str(getattr(function, "__name__", type(function).__name__))
 
@@ -222,17 +222,19 @@ def judge_images(
 def add_visible_things(judgement: Judgement, things: JsonObject | None) -> Judgement:
     """Return a judgement whose payload has what the image shows of each thing.
 
-    What the task states of a thing already is not replaced.
+    `things` are those of `find_visible_things`, which has every thing of the scene,
+    visible or not. What the task states of a thing itself wins. A judgement of a NaN
+    prediction stays as it is.
     """
-    if things is None or judgement.is_not_a_number:
+    if things is None or judgement.is_non_finite:
         return judgement
     payload = judgement.payload if isinstance(judgement.payload, dict) else {}
-    judged_things: Any = payload.get("things", {})
-    all_things: Any = {
-        name: {**visible, **judged_things.get(name, {})}  # type: ignore[dict-item]
+    stated_by_task: Any = payload.get("things", {})
+    merged: Any = {
+        name: {**visible, **stated_by_task.get(name, {})}  # type: ignore[dict-item]
         for name, visible in things.items()
     }
-    return replace(judgement, payload={**payload, "things": all_things})
+    return replace(judgement, payload={**payload, "things": merged})
 
 
 def add_metrics(
@@ -518,7 +520,8 @@ class ConfigurationInputs:
     Args:
         space: all controls; those that are searched come first.
         searched: the controls that are searched.
-        wholes: N configurations (d,) of `space`, equal in what is searched.
+        full_configurations: N configurations (d,) of `space`, equal in what is
+            searched.
     """
 
     def __init__(
@@ -606,9 +609,11 @@ def mean_variation(colors: Tensor) -> Tensor:
     if is_masked:
         right = right * mask[:, 1:]
         down = down * mask[1:]
+    # zero for the last column and the last row, which have no neighbor
     squared_right = F.pad(right.square(), (0, 0, 0, 1))
     squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
     squared = squared_right + squared_down
+    # clamped, since the square root has no derivative at 0
     length = squared.clamp(min=MIN_COLOR_STEP**2).sqrt() - MIN_COLOR_STEP
     if is_masked:
         length = length[mask[..., 0] > 0.0]

@@ -29,6 +29,11 @@ from advsearch.options import describe_value, format_things
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
+from advsearch.scene.backdrop import (
+    BackdropPhotograph,
+    find_light_beside,
+    fit_to_photograph,
+)
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
@@ -65,6 +70,9 @@ or its instance, and ``mitsuba:KEY`` a range.
 """
 
 Texture = str | Path | npt.ArrayLike | Tensor
+
+PHOTOGRAPH_SETTINGS = ("ground.level", "backdrop.noise", "backdrop.blur")
+"""Settings that only a scene has which is rendered into a photograph."""
 
 SINGLE_VALUE_KEYS = {"distribution", "choices", "range"}
 """A mapping with one of these keys describes one value, and not the settings of a
@@ -226,6 +234,8 @@ def load_scene(
     | Mapping[str, object]
     | Sequence[str | Mapping[str, object]]
     | None = None,
+    backdrop: str | Path | BackdropPhotograph | None = None,
+    occluder: str | Path | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -261,6 +271,12 @@ def load_scene(
             its left: a text such as "car@12,3.5,heading=180; person@6,-2", or a list of
             such texts or of mappings, {"object": "car", "x": 12, "y": 3.5, "heading":
             180}; `size` (metres), `name` and `label` are optional.
+        backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
+            picture file, taken by `camera`; of a part of it,
+            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels. By default it is lit by the .hdr
+            or .exr file of its name beside it, if there is one.
+        occluder: a mask of the photograph's size, white where it shows what is before
+            the object.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of
@@ -275,6 +291,8 @@ def load_scene(
     if scene is not None and mitsuba_dict is None:
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
+    if environment is None:
+        environment = find_light_beside(backdrop)
     description = load_description(
         object_spec,
         environment,
@@ -288,12 +306,30 @@ def load_scene(
     )
     if camera is not None:
         description = description.with_camera(camera)
+    if backdrop is not None:
+        description = description.with_backdrop(backdrop, occluder)
+    else:
+        _check_no_photograph(fixed_values or {}, occluder)
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
-        for asset in (object, environment)
+        for asset in (object, environment, backdrop)
     )
     loaded = Scene(description, is_session_only=mitsuba_dict is not None or has_asset)
     return loaded if texture is None else loaded.with_texture(texture)
+
+
+def _check_no_photograph(
+    fixed_values: SettingValues, occluder: str | Path | None
+) -> None:
+    """Raise InputError for what says something of a photograph where there is none."""
+    stated = [name for name in fixed_values if name in PHOTOGRAPH_SETTINGS]
+    if occluder is not None:
+        stated.append("occluder")
+    if stated:
+        raise InputError(
+            f"{stated[0]}: is about a photograph that the scene is rendered into, and "
+            "there is none; give a `backdrop`, or leave it out"
+        )
 
 
 def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
@@ -330,6 +366,7 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
     parts that these settings cannot name.
     """
     description = scene.description
+    photograph = description.backdrop_photograph
     return {
         "object": description.object_name,
         "environment": description.environment_name,
@@ -339,6 +376,8 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         "unit": description.unit,
         "camera": _camera_setting(description),
         "things": description.things_spec or None,
+        "backdrop": photograph.spec if photograph is not None else None,
+        "occluder": (photograph.front_spec or None) if photograph is not None else None,
         "set": description.requested_values,
     }
 
@@ -365,10 +404,15 @@ def fit_camera(
         resolution: side, or (height, width), in pixels.
 
     Raises:
-        InputError: several cameras and drops on a lens.
+        InputError: several cameras and drops on a lens; or the scene is rendered into
+            a photograph of another shape.
     """
     height, width = _height_and_width(resolution)
     aspect = width / height
+    if description.backdrop_photograph is not None:
+        return fit_to_photograph(
+            description, description.backdrop_photograph, (height, width)
+        )
     camera_model = description.camera_model
     remarks = description.remarks
     if description.number("camera.drops") > 0.0:
@@ -409,9 +453,19 @@ def make_renderer(
 ) -> Renderer:
     """Load a described scene, with what the space's controls need, into Mitsuba.
 
-    How fast coordinates move outlines is measured only where pictures are
-    differentiated with respect to them: it takes a third of the time in which a scene
-    is loaded and a few small pictures are rendered.
+    Args:
+        description: the scene; that of the space, if it has one, takes its place.
+        space: what varies.
+        resolution: side, or (height, width), in pixels.
+        denoise: "oidn" or "none".
+        seed: root of the noise.
+        estimators: as for `Scene.renderer`.
+        leave_out: what may be left out of the scene where it makes no difference.
+        sampler: "multijitter" or "independent".
+        differentiated: whether images are differentiated with respect to coordinates.
+            If not, it is not measured how fast coordinates move outlines, which takes a
+            third of the time in which a scene is loaded and a few small images are
+            rendered.
 
     Raises:
         InputError: the scene has no light, or its cameras differ in time and nothing
@@ -454,21 +508,24 @@ def make_renderer(
 
 
 def _check_rig_times(description: SceneDescription, space: Space) -> None:
-    """Check that the pictures of a rig can be taken one after the other, if they are.
+    """Check a rig whose cameras take their images one after the other.
+
+    Such a rig needs something that changes with time, and no motion blur.
 
     Raises:
-        InputError: nothing changes with time, or a picture has motion blur.
+        InputError: nothing changes with time, or an image has motion blur.
     """
     if not any(mount.delay for mount in description.rig):
         return
-    in_order = (
+    prefix = (
         f"camera: the pictures of {description.rig_spec} are taken one after the other"
     )
     if any(space.exposure):
         raise InputError(
-            f"{in_order}, and can not have motion blur or a rolling shutter; "
+            f"{prefix}, and can not have motion blur or a rolling shutter; "
             "leave that out"
         )
+    # `advance_time` returns the same object for a control that is static.
     controls_later = space.advance_time(1.0).controls
     changes_with_time = any(
         control is not control_later
@@ -476,23 +533,23 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
     )
     if not changes_with_time:
         raise InputError(
-            f"{in_order}, and show the same: nothing knows a time; add a `path`"
+            f"{prefix}, and show the same: nothing knows a time; add a `path`"
         )
 
 
 MOMENTS_PER_FLASH = 8  # moments of each flash of a light
-N_MOTION_SAMPLES = (
-    64  # random configurations on which motion during an exposure is measured
-)
+# random configurations on which motion during an exposure is measured
+N_MOTION_SAMPLES = 64
 
 
 def choose_moments(
     space: Space, motion: Motion, assembly: Assembly, height: int
 ) -> tuple[Moment, ...]:
-    """Return the moments of an exposure at which a picture is rendered.
+    """Return the moments of an exposure at which an image is rendered.
 
-    There are enough of them that no point moves far in the picture between two moments,
-    and that a flashing light is seen on and off. `height` is in pixels.
+    There are enough of them that no point moves far in the image between two moments
+    (`MOMENTS_PER_PIXEL`), and that a flashing light is on in some and off in others;
+    at least `MIN_MOMENTS` and at most `MAX_MOMENTS`. `height` is in pixels.
     """
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)

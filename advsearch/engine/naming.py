@@ -67,7 +67,7 @@ def load_configured_scene(
 
 def make_scene_kwargs(config: SceneConfig) -> dict[str, Any]:
     """Return the keyword arguments of `load_scene` that a configuration states."""
-    names = ("up", "facing", "size", "unit", "camera", "things")
+    names = ("up", "facing", "size", "unit", "camera", "things", "backdrop", "occluder")
     return {
         **{name: getattr(config, name) for name in names},
         "settings": collect_scene_parameters(config),
@@ -277,6 +277,8 @@ SCENE_SETTINGS = (
     "unit",
     "camera",
     "things",
+    "backdrop",
+    "occluder",
     "exposure",
     "object",
 )
@@ -387,14 +389,11 @@ def select_run_settings(
     for setting in RUN_SETTINGS:
         value = getattr(config, setting, None)
         if isinstance(value, Mapping):
-            value = (
-                {instance_name: value[instance_name]}
-                if instance_name in value
-                else None
-            )
-        run_settings[setting] = (
-            value if takes_setting(qualified_name, control_settings, setting) else None
-        )
+            is_named = instance_name in value
+            value = {instance_name: value[instance_name]} if is_named else None
+        if not takes_setting(qualified_name, control_settings, setting):
+            value = None
+        run_settings[setting] = value
     return run_settings
 
 
@@ -411,7 +410,9 @@ def check_run_settings(config: SceneConfig) -> None:
         value = getattr(config, setting, None)
         if value is None:
             continue
-        random_controls = {} if setting == "epsilon" else getattr(config, "over", {})
+        random_controls: Mapping[str, Any] = {}
+        if setting != "epsilon":
+            random_controls = getattr(config, "over", {})
         controls = merge_control_settings({**config.controls, **random_controls})
         # kind of each control that does not take the setting
         rejecting_kinds = {
@@ -423,9 +424,10 @@ def check_run_settings(config: SceneConfig) -> None:
             _check_named_controls(setting, value, controls, rejecting_kinds)
         elif rejecting_kinds:
             # A curve of epsilons needs all controls, a single value any of them.
-            if isinstance(value, tuple) or len(rejecting_kinds) == len(controls):
+            is_curve = isinstance(value, tuple)
+            if is_curve or len(rejecting_kinds) == len(controls):
                 name, kind = next(iter(rejecting_kinds.items()))
-                raise _make_not_taken_error(setting, name, kind)
+                raise _make_unsupported_error(setting, name, kind)
 
 
 def _check_named_controls(
@@ -444,7 +446,7 @@ def _check_named_controls(
             raise UnknownNameError(f"control in `{setting}`", name, qualified_names)
         kind = rejecting_kinds.get(qualified_names[name])
         if kind is not None:
-            raise _make_not_taken_error(setting, name, kind)
+            raise _make_unsupported_error(setting, name, kind)
 
 
 def takes_setting(
@@ -494,7 +496,7 @@ def _list_active_choices(
     ]
 
 
-def _make_not_taken_error(setting: str, name: str, kind: str) -> InputError:
+def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
     """Return the error of a setting that a control does not take."""
     if setting == "epsilon":
         choices = CONTROLS[kind].choices if kind in CONTROLS else ()

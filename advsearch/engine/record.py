@@ -153,7 +153,7 @@ def add_judgement(row: Row, judgement: Judgement) -> Row:
         score=_none_if_nan(judgement.score),
         correct=judgement.right,
         margin=_none_if_nan(judgement.margin),
-        label=None if judgement.is_not_a_number else prediction.label,
+        label=None if judgement.is_non_finite else prediction.label,
         label_index=prediction.index,
         probability=prediction.probability,
         payload=judgement.payload,
@@ -226,7 +226,7 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
 
 def _rate_fields(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
     """Return the fields that all rates of a result have."""
-    n_not_a_number = sum(trial.is_not_a_number for trial in trials)
+    n_not_a_number = sum(trial.is_non_finite for trial in trials)
     return {
         "trials": rate.trials,
         "rate": rate.rate,

@@ -96,6 +96,10 @@ class SurfaceLight(PredictedSearch):
             cameras and environments.
     """
 
+    # Private attributes that `__post_init__` sets: `_moving` (d,) and `_needs_new_light`
+    # (k,) tell which searched coordinates move a camera or environment, and which
+    # coordinates of conditions need another light; `_has_moving` and
+    # `_searches_colors`, whether a searched coordinate moves something, or colors it.
     method: ClassVar[str] = "surface light"
     title: ClassVar[str] = "finding the light on surfaces"
     light_u: Tensor | None = None
@@ -153,7 +157,8 @@ class SurfaceLight(PredictedSearch):
     def _find_light_conditions(self) -> Tensor:
         """Return which coordinates of the full space need another light, (d,) bool.
 
-        An environment that only becomes brighter needs none.
+        They are those that change the environment, except by a factor of brightness,
+        which is found by comparing two maps of different coordinates.
         """
         problem = self.problem
         needs_new_light = self._find_coordinates(frozenset({ENVIRONMENT_INPUT}))
@@ -244,7 +249,9 @@ class SurfaceLight(PredictedSearch):
     ) -> Iterator[Evaluation]:
         """Evaluate queries of a search, or trials, in their order.
 
-        `trace` evaluates all queries from the first that is not predicted.
+        `trace` evaluates all queries from the first that is not predicted. Images are
+        predicted in batches if neither conditions nor colors vary: then they depend on
+        nothing that an evaluation might change.
         """
         # images of queries that were predicted in one batch, by position
         predicted_images: dict[int, Tensor] = {}
@@ -383,11 +390,13 @@ class SurfaceLight(PredictedSearch):
         )
 
     def replay(self, query: Query) -> None:
-        """Compare predictions where that is due.
+        """Compare predictions with traced images if that is due.
 
-        That is every `COMPARISON_INTERVAL` evaluations where base colors are searched,
-        as their light gets old; else after twice as many each time, until predictions
-        are too far off.
+        It is every `COMPARISON_INTERVAL` evaluations if base colors are searched, as
+        their light gets old; else after twice as many each time, as long as predictions
+        are accurate. If they are not, the light is computed again for the present
+        colors, if these are searched; after two such comparisons in a row, images are
+        traced from there on.
         """
         if query.kind != "search" or query.phase != "search" or self.tracing_reason:
             return

@@ -55,9 +55,8 @@ MIN_STEPS_PER_LIGHT = 8
 COMPARISON_INTERVAL = 20  # evaluations from one comparison to the next
 SURROUNDINGS_SPP = 32  # samples per pixel of what is outside of a matrix's window
 MIN_SCORES = 4  # trials from which a standard deviation is estimated
-LOWER_END_DEVIATIONS = (
-    1.64  # standard deviations below the mean above which 19 of 20 scores lie
-)
+# standard deviations below the mean above which 19 of 20 scores lie
+LOWER_END_DEVIATIONS = 1.64
 ADVICE = {
     RefusalCause.HAZE: "leave the haze out",
     RefusalCause.NOISE: "`denoise=oidn` takes the noise out",
@@ -128,7 +127,8 @@ class PredictedSearch(ABC):
         problem: of the searches.
         steps: evaluations of a search; those after them belong to the ranking, and are
             traced.
-        draws_conditions: whether each evaluation draws conditions; see `Domain.drawn`.
+        draws_conditions: whether each evaluation draws conditions; see
+            `Domain.draws_conditions`.
         deviations: from traced images, of each comparison.
         n_traced: images that were traced, for the predictor and to compare it.
         seconds: spent on both.
@@ -211,7 +211,7 @@ class PredictedSearch(ABC):
     def compare(self, compare_view: Callable[[int], ComparedView]) -> Deviation:
         """Compare predictions with traced images, and store the deviation.
 
-        `compare_view` compares a single view; see `acceptance.compared`.
+        `compare_view` compares a single view; see `acceptance.compare_views`.
         """
         with self.count_time():
             self.deviations.append(compare_views(compare_view))
@@ -341,10 +341,13 @@ class Transport(PredictedSearch):
         return replace(evaluation, predicted=1)
 
     def _update_predictor(self, query: Query) -> Predictor | None:
-        """Return the predictor of a query; None where it is traced.
+        """Return the predictor of a query; None if its image is traced.
 
-        Where that is due, the predictor is compared with traced images and, if it is
-        too far off, computed again.
+        Queries of the ranking and trials are traced. Every `COMPARISON_INTERVAL`
+        queries of a search the predictor is compared with traced images. If it is too
+        far off, it is computed again at the query's configuration; a predictor by basis
+        images of lights, which would be the same again, is given up and the rest of the
+        search is traced.
         """
         kind = query.kind
         number = query.number
@@ -366,7 +369,7 @@ class Transport(PredictedSearch):
                 renderer=renderer,
             )
         )
-        has_same_surroundings = self._has_same_surroundings(kind, query.u)
+        has_same_surroundings, current = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
         # Basis images of lights do not depend on u: nothing can be linearised again.
@@ -374,24 +377,26 @@ class Transport(PredictedSearch):
             self.trace_from(kind, number, f" of the {kind}")
             return None
         self._current[kind] = self._make_predictor(query.u, kind, number)
+        if current is not None:
+            self._full_images[kind] = current
         self.n_renewals = (self.n_renewals or 0) + 1
         return self._current[kind]
 
-    def _has_same_surroundings(self, kind: str, u: Tensor) -> bool:
+    def _compare_surroundings(
+        self, kind: str, u: Tensor
+    ) -> tuple[bool, FullImage | None]:
         """Return whether what is outside of the window is still the same at u (d,).
 
-        If not, the matrix is computed again, and what is outside with it.
+        The second value is the image there; None if images are traced in full.
         """
         if self.window is None:
-            return True
-        before = self._full_images.setdefault(kind, self._full_images["start"])
+            return True, None
+        before = self._full_images.get(kind, self._full_images["start"])
         with self.count_time():
             current = render_full(self.problem, u)
             deviation = measure_outside(self.problem, self.window, before, [current])
         self.n_traced += 1
-        if not deviation.is_accepted:
-            self._full_images[kind] = current
-        return deviation.is_accepted
+        return deviation.is_accepted, current
 
     def is_likely_success(self, u: Tensor) -> bool:
         """Return whether the predicted image of u (d,) would pass its trials.
@@ -406,9 +411,8 @@ class Transport(PredictedSearch):
         The bias is the predicted score minus the lower end of the trials' scores.
         """
         if len(scores) >= MIN_SCORES and all(map(math.isfinite, scores)):
-            lower_end = statistics.fmean(
-                scores
-            ) - LOWER_END_DEVIATIONS * statistics.stdev(scores)
+            mean = statistics.fmean(scores)
+            lower_end = mean - LOWER_END_DEVIATIONS * statistics.stdev(scores)
             self._score_bias = self._predict_score(u) - lower_end
 
     def _predict_score(self, u: Tensor) -> float:

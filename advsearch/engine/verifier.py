@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -287,11 +288,9 @@ class Verifier:
         queries = list[Query]()
         for number, u in configurations.items():
             seed = seeds.stream(problem.seed, kind, number)
-            values = (
-                problem.describe(u, seed)
-                if problem.domain.dim <= MAX_DESCRIBED_COORDINATES
-                else {}
-            )
+            values: dict[str, Any] = {}
+            if problem.domain.dim <= MAX_DESCRIBED_COORDINATES:
+                values = problem.describe(u, seed)
             query = Query(
                 u,
                 seed,
@@ -494,7 +493,9 @@ class Retrials:
     ) -> Iterator[Evaluation]:
         """Judge images as the condition changes them.
 
-        Images before the change are cached for other conditions of the same kind.
+        Images before the change are cached for other conditions, as long as trials are
+        of the same kind. Those that are missing are rendered by workers, if there are
+        any, and otherwise one by one here.
         """
         if kind != self._shared_kind:
             self._images.clear()

@@ -76,10 +76,10 @@ Image8Bit: TypeAlias = npt.NDArray[
 class AnswerStore(Protocol):
     """The store of a run, with its notes."""
 
-    def noted(self, key: str) -> Any:
+    def read_json_note(self, key: str) -> Any:
         """Return a JSON value, or None."""
 
-    def set_note(self, key: str, value: str) -> None:
+    def write_note(self, key: str, value: str) -> None:
         """Store JSON text under a key."""
 
 
@@ -347,7 +347,7 @@ class AddressModel(models.RemoteNetwork):
 
         Its stored answers are not requested again, and counts continue.
         """
-        self.spent += Counter(store.noted(f"asked {self.spec}") or {})
+        self.spent += Counter(store.read_json_note(f"asked {self.spec}") or {})
         self.store = store
 
     def _get_answers(
@@ -369,7 +369,7 @@ class AddressModel(models.RemoteNetwork):
             if self.store is None:
                 answers[key] = self.answer_cache.get(key)
             else:
-                answers[key] = self.store.noted(key)
+                answers[key] = self.store.read_json_note(key)
             if not isinstance(answers[key], dict):
                 new_bodies[key] = body
         new_keys = list(new_bodies)
@@ -383,7 +383,7 @@ class AddressModel(models.RemoteNetwork):
             if self.store is None:
                 self.answer_cache[key] = answer
             else:
-                self.store.set_note(key, json.dumps(answer))
+                self.store.write_note(key, json.dumps(answer))
         return [answers[key] for key in keys]
 
     def _make_body(self, image: Image8Bit) -> dict[str, Any]:
@@ -451,7 +451,7 @@ class AddressModel(models.RemoteNetwork):
 
     def _store_spent(self) -> None:
         if self.store is not None:
-            self.store.set_note(f"asked {self.spec}", json.dumps(self.spent))
+            self.store.write_note(f"asked {self.spec}", json.dumps(self.spent))
 
     @property
     def _spent_by_limit(self) -> dict[str, float]:

@@ -36,7 +36,7 @@ OPERATORS: dict[Any, int] = {**CHANNELS_LAST, **CHANNELS_SECOND}
 activation.
 """
 
-# from a batch as `Model.batches` yields it, N images, to features (N, F)
+# from a batch as `Model.prepare` returns it, N images, to features (N, F)
 Read = Callable[[Tensor], Tensor]
 
 
@@ -99,8 +99,14 @@ def features_of(model: Model) -> Features:
 
 
 class _Call(NamedTuple):
-    """A call of a layer: the layer, its input (None for weights) and output, and the
-    axis of channels.
+    """A call of a layer of a network.
+
+    Attributes:
+        layer: a module, or a node of a graph.
+        name: for messages.
+        input: of the call; None if it is no activation but weights.
+        output: of the call.
+        axis: of the channels in both.
     """
 
     layer: Any
@@ -119,8 +125,9 @@ their order.
 def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
     """Find the features (N, F) of the last layer of a network.
 
-    They are its input if it is the head, else its output, averaged over all axes but
-    the batch and the channels.
+    The head is the last layer whose output has a channel for each class. Features are
+    its input; without a head they are the output of the last layer. They are averaged
+    over all axes but the batch and the channels.
 
     Args:
         calls: traces the layers of a network.
@@ -131,6 +138,7 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
         The function that computes them, and a description of the layer; None if there
         is no such layer.
     """
+    # layers whose output has a row for each image
     usable = [
         call for call in calls(model.module, x, None) if len(call.output) == len(x)
     ]
@@ -154,7 +162,9 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
 
 
 def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
-    """Return the calls of the layers of a module, or of one layer."""
+    """Return the calls of the layers of a module in their order, or those of a single
+    layer; none of a program.
+    """
     calls: list[_Call] = []
     if not isinstance(network, nn.Module) or isinstance(
         network, torch.jit.ScriptModule
@@ -166,7 +176,7 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         if isinstance(layer, LAYERS)
     }
 
-    def keep(
+    def record_call(
         layer: nn.Module,
         args: tuple[Tensor, ...],
         kwargs: dict[str, Tensor],
@@ -187,7 +197,8 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
 
     with ExitStack() as hooks:
         for layer in names if only is None else [only]:
-            hooks.callback(layer.register_forward_hook(keep, with_kwargs=True).remove)
+            handle = layer.register_forward_hook(record_call, with_kwargs=True)
+            hooks.callback(handle.remove)
         network(x)
     return calls
 

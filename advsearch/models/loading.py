@@ -138,7 +138,7 @@ def load_model(
         channels=channels,
         max_batch=max_batch,
     )
-    read = read or (task and task.reader)
+    read = read or (task and task.reader)  # None for logits
     names = None if labels is None else read_labels(labels)
     origin = find_labels_origin(labels)
     if names is not None and task and task.names_source:

@@ -78,12 +78,12 @@ class _Recomputed(torch.autograd.Function):
 
 
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
-    """Return `ask(images)`: tensors, in lists and mappings, without storing
-    activations.
+    """Return `function(images)` without storing activations: tensors, or lists and
+    mappings of them.
 
-    Its gradient computes it a second time, and takes the memory of one batch instead of
-    that of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory Cost*,
-    section 3).
+    The gradient computes the function a second time, and takes the memory of one batch
+    instead of that of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory
+    Cost*, section 3).
     """
     structure: list[Any] = []
     tensors = _Recomputed.apply(function, structure, images)  # type: ignore[no-untyped-call]
@@ -312,7 +312,9 @@ class Model:
         max_batch = self.batch_limits[1]
         recomputes = False
         if self.cameras > 1:
+            # (N, H, cameras * W, 3) to (N * cameras, H, W, 3)
             images = images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
+            # the images of a rig stay in one batch, if they fit into it
             full_rigs = max_batch - max_batch % self.cameras
             max_batch = max(full_rigs, min(max_batch, self.cameras))
             recomputes = (
@@ -630,6 +632,7 @@ def mend_batch_norms(output: Any) -> None:
     def with_strides(
         strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]
     ) -> tuple[Tensor | None, ...]:
+        """Return gradients of which the first has these strides, copied if need be."""
         gradient, *rest = gradients
         if gradient is None or gradient.stride() == strides:
             return gradients

@@ -361,27 +361,24 @@ def _describe_odd_scores(model: Model, rows: Tensor) -> str:
     colors far outside [0, 1] distinguish it from small logits, as those of an untrained
     network.
     """
-    least = float(rows.min())
-    if least >= 0.0 and float(rows.max()) <= 1.0:
+    is_non_negative = float(rows.min()) >= 0.0
+    if is_non_negative and float(rows.max()) <= 1.0:
         with torch.no_grad():
             height, width = model.input_size
             far = torch.linspace(0.0, FAR_COLOR, 3 * height * width).reshape(
                 height, width, 3
             )
             rows = torch.cat([rows, _run(model, torch.zeros_like(far)[None])])
-            with suppress(ModelError):  # it may refuse such colours
+            with suppress(ModelError):  # it may reject such colors
                 rows = torch.cat([rows, _run(model, torch.stack([far, -far]))])
-    if (
-        0.0 <= float(rows.min())
-        and float(rows.max()) <= 1.0
-        and bool(rows.any(dim=1).all())
-    ):
+    is_in_unit_range = float(rows.min()) >= 0.0 and float(rows.max()) <= 1.0
+    has_no_zero_row = bool(rows.any(dim=1).all())
+    if is_in_unit_range and has_no_zero_row:
         return (
             "scores in [0, 1] that do not sum to 1, as after a sigmoid for each class"
         )
-    if least >= 0.0 and bool(
-        ((torch.exp(-rows).sum(dim=1) - 1.0).abs() < PROBABILITY_TOLERANCE).all()
-    ):
+    sum_error = (torch.exp(-rows).sum(dim=1) - 1.0).abs()
+    if is_non_negative and bool((sum_error < PROBABILITY_TOLERANCE).all()):
         return (
             "costs, of which the least is meant: minus the logarithm of probabilities"
         )
@@ -511,7 +508,12 @@ def _find_batch_limits(
 def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     """Return a model with `differentiable` and `attached` set.
 
-    Warns if no gradient reaches the image, or outputs do not follow it.
+    If the network detaches tensors, and its outputs are repeatable, the gradient is
+    tried that ignores it (`_try_attached`). A detector that finds nothing in noise
+    counts as differentiable.
+
+    Warns:
+        ModelWarning: no gradient reaches the image, or outputs do not follow it.
     """
     reason = "it is zero everywhere"
     try:
@@ -561,7 +563,8 @@ def _try_attached(
     A network that rounds behind a `detach` keeps its own: the other one is zero.
     """
     attached = dataclasses.replace(model, attached=True)
-    # It may detach what must have no gradient, such as for numpy.
+    # A network may detach what must have no gradient, such as for numpy, and then
+    # raises if that is ignored: it keeps its own.
     with suppress(RuntimeError, ModelError):
         attached_gradient = _compute_gradient(attached, images)[1]
         for step_size in (STEP, STEP / 8.0):
@@ -570,9 +573,8 @@ def _try_attached(
             change, (attached_change, own_change), *_ = _measure_change(
                 model, images, step, attached_gradient, gradient
             )
-            max_error = min(
-                abs(change - own_change), MAX_ATTACHED_ERROR * abs(attached_change)
-            )
+            own_error = abs(change - own_change)
+            max_error = min(own_error, MAX_ATTACHED_ERROR * abs(attached_change))
             if abs(change - attached_change) < max_error:
                 return attached, attached_gradient
     return model, gradient

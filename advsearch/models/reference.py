@@ -32,7 +32,7 @@ DEPTHS = (1, 1, 2, 1)
 MEAN = 0.45  # of display-referred values; one pair for all channels is enough
 STD = 0.25
 WEIGHTS = "reference.safetensors"
-RECORD = "reference.json"
+METADATA = "reference.json"
 REMEDY = "run `make reference` to train it, or install a release, which contains it"
 
 
@@ -46,10 +46,11 @@ class ReferenceNet(nn.Module):
         super().__init__()
         layers: list[nn.Module] = [_Convolution(3, STEM, 5, stride=2), nn.SiLU()]
         width = STEM
-        for wider, depth in zip(WIDTHS, DEPTHS, strict=True):
-            for position in range(depth):
-                layers.append(_Residual(width, wider, stride=2 if position == 0 else 1))
-                width = wider
+        for stage_width, depth in zip(WIDTHS, DEPTHS, strict=True):
+            for block_index in range(depth):
+                stride = 2 if block_index == 0 else 1
+                layers.append(_Residual(width, stage_width, stride=stride))
+                width = stage_width
         self.features = nn.Sequential(*layers)
         self.dropout = nn.Dropout(dropout)
         self.head = nn.Linear(width, classes)
@@ -140,10 +141,16 @@ def get_data_folder() -> Path:
 
 
 def load(folder: Path | None = None, weights: Path | None = None) -> Model:
-    """Return the model "reference" with its labels, from the folder with its two files
-    (by default the package's own), or with other weights from a safetensors file.
-    Raises ModelError: they are missing, damaged, or do not fit this version's network;
-    FileFormatError: `weights` is missing or is not safetensors.
+    """Return the model "reference" with its labels.
+
+    Args:
+        folder: with its two files; by default the package's own.
+        weights: a safetensors file with other weights for the same labels.
+
+    Raises:
+        ModelError: a file of the folder is missing or corrupt, or weights are not of
+            this version's network.
+        FileFormatError: `weights` is missing or is not safetensors.
     """
     net, labels = load_network(folder, weights)
     name = "reference" if weights is None else f"reference@{weights}"
@@ -158,13 +165,21 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
 def load_network(
     folder: Path | None = None, weights: Path | None = None
 ) -> tuple[ReferenceNet, tuple[str, ...]]:
-    """Return the network with its weights, which can be trained further, and the
-    labels; arguments and errors as for `load`.
+    """Return the network with its weights, which can be trained further, and its labels.
+
+    Args:
+        folder: with its two files; by default the package's own.
+        weights: a safetensors file whose weights replace those of the folder.
+
+    Raises:
+        ModelError: a file of the folder is missing or corrupt, or weights are not of
+            this version's network.
+        FileFormatError: `weights` is missing or is not safetensors.
     """
     folder = folder or get_data_folder()
     try:
-        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-        labels = tuple(str(label) for label in record["labels"])
+        metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+        labels = tuple(str(label) for label in metadata["labels"])
         state = safetensors.load((folder / WEIGHTS).read_bytes())
     except FileNotFoundError as error:
         raise ModelError(

@@ -161,9 +161,13 @@ class Source:
 
 
 def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
-    """Return a source with the module frozen, its type and device read off its
-    parameters; `fields` go to `Source`. Raises ModelError where it has lazy layers that
-    have no weights yet.
+    """Return the source of a module, which is frozen.
+
+    Its dtype and device are those of its first floating-point parameter or buffer,
+    unless `fields`, which go to `Source`, state them.
+
+    Raises:
+        ModelError: it has lazy layers that have no weights yet.
     """
     lazy = [
         key
@@ -178,12 +182,10 @@ def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
             "has seen a picture; call the network once with one, load its weights, and "
             "give it then"
         )
-    placed = next(
-        (p for p in (*module.parameters(), *module.buffers()) if p.is_floating_point()),
-        None,
-    )
-    if placed is not None:
-        fields = {"dtype": placed.dtype, "device": placed.device, **fields}
+    tensors = (*module.parameters(), *module.buffers())
+    first = next((tensor for tensor in tensors if tensor.is_floating_point()), None)
+    if first is not None:
+        fields = {"dtype": first.dtype, "device": first.device, **fields}
     if takes_image_size(module):
         fields = {"size_type": torch.int64, **fields}
     return Source(freeze_network(module, name), name, **fields)
@@ -220,9 +222,18 @@ def freeze_network(module: nn.Module, name: str) -> nn.Module:
 
 
 def load_weights(module: nn.Module, path: Path, name: str) -> None:
-    """Load a safetensors file into the module; its keys and shapes must be the module's
-    own. Raises FileFormatError: the file is missing or is not safetensors; ModelError:
-    keys or shapes do not fit.
+    """Load a safetensors file into a module, whose keys and shapes it must have.
+
+    Counters of batch norms (`num_batches_tracked`) may be missing.
+
+    Args:
+        module: the network.
+        path: of the file.
+        name: of the model, for messages.
+
+    Raises:
+        FileFormatError: the file is missing or is not safetensors.
+        ModelError: keys or shapes do not fit.
     """
     try:
         open_regular(path, "weights", LARGEST).close()
@@ -235,18 +246,18 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
             f"({get_first_line(error)}); "
             "make one with safetensors.torch.save_file(module.state_dict(), path)"
         ) from None
-    own = module.state_dict()
+    expected = module.state_dict()
     missing = [
         key
-        for key in own
+        for key in expected
         if key not in state and not key.endswith("num_batches_tracked")
     ]
-    unexpected = [key for key in state if key not in own]
+    unexpected = [key for key in state if key not in expected]
     shapes = [
-        f"{key} is {tuple(state[key].shape)} in the file and {tuple(own[key].shape)} "
-        "in the network"
-        for key in own
-        if key in state and state[key].shape != own[key].shape
+        f"{key} is {tuple(state[key].shape)} in the file and "
+        f"{tuple(expected[key].shape)} in the network"
+        for key in expected
+        if key in state and state[key].shape != expected[key].shape
     ]
     problems = [
         f"{len(keys)} {what} ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})"
@@ -268,14 +279,22 @@ def split_weights(spec: str) -> tuple[str, Path | None]:
 
 
 def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
-    """Return the model behind ``package.module:callable[@weights.safetensors]``. The
-    module is looked for on `sys.path` and in the current directory. The attribute is an
-    `nn.Module`, a `Model`, or something that returns one when called without arguments
-    (a function, or a class of modules). `libraries` may stand before the colon too: a
-    module that there is not may be one of them, misspelt. Raises ModelError: it cannot
-    be imported, raises, returns something else, or the weights do not fit;
-    UnknownNameError: the module has no such attribute; near matches are named;
-    InputError: it must not be imported (`trust.code.check_import`).
+    """Return the model behind ``package.module:callable[@weights.safetensors]``.
+
+    The module is looked for on `sys.path` and in the current directory. The attribute
+    is an `nn.Module`, a `Model`, or something that returns one when called without
+    arguments (a function, or a class of modules).
+
+    Args:
+        spec: the text.
+        libraries: names that may stand before the colon too, for the message about a
+            module that does not exist: it may be one of them, misspelt.
+
+    Raises:
+        ModelError: it cannot be imported, raises, returns something else, or the
+            weights do not fit.
+        UnknownNameError: the module has no such attribute; near matches are named.
+        InputError: it must not be imported (`trust.code.check_import`).
     """
     target, weights = split_weights(spec)
     check_import(target)

@@ -396,14 +396,12 @@ def _write_label(
             for x0, y0, x1, y1 in text_boxes
         )
 
-    nearest_first = sorted(
-        range(max(size[1] - height, 0) + 1), key=lambda y: (abs(y - preferred_y), y)
-    )
+    candidates = range(max(size[1] - height, 0) + 1)
+    nearest_first = sorted(candidates, key=lambda y: (abs(y - preferred_y), y))
+    # Where no height is free, texts overlap.
     y = next(filter(is_free, nearest_first), preferred_y)
-    draw.rectangle(
-        (x, y, x + width, y + height),
-        fill=TRUE_COLOR if shape.true else PREDICTED_COLOR,
-    )
+    background = TRUE_COLOR if shape.true else PREDICTED_COLOR
+    draw.rectangle((x, y, x + width, y + height), fill=background)
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
     return x, y, x + width, y + height
 

@@ -187,23 +187,25 @@ def arrange_pages(
     parts = [part for piece in pieces for part in _cut_piece(piece, width, height)]
     parts.sort(key=lambda part: -part.extent[1])
     page: list[PlacedPart] = []
-    x = y = row = 0.0
+    x = 0.0
+    y = 0.0
+    row_height = 0.0
     for part in parts:
-        across, down = part.extent
-        if x + across > width and x > 0.0:
+        part_width, part_height = part.extent
+        if x + part_width > width and x > 0.0:  # the row is full
             x = 0.0
-            y = y + row
-            row = 0.0
-        if y + down > height and page:
+            y = y + row_height
+            row_height = 0.0
+        if y + part_height > height and page:  # the page is full
             yield page
             page = []
             x = 0.0
             y = 0.0
-            row = 0.0
+            row_height = 0.0
         frame = part.piece.frame
         page.append(replace(part, x=MARGIN + x + frame[0], y=MARGIN + y + frame[1]))
-        x = x + across
-        row = max(row, down)
+        x = x + part_width
+        row_height = max(row_height, part_height)
     if page:
         yield page
 
@@ -270,6 +272,11 @@ def _make_cover(
     sheets: int,
     profile: Path | None,
 ) -> Figure:
+    """Return the first page: how to print, a square to measure, and the list of pieces.
+
+    `profile` is the ICC profile to which colors were converted. Lengths are
+    millimetres.
+    """
     figure, axes = make_blank_page(paper)
     x = MARGIN
     y = MARGIN + 5.0
@@ -300,13 +307,14 @@ def _make_cover(
 
 
 def _draw_ruler(axes: Axes, paper: tuple[float, float]) -> None:
+    """Draw a ruler at the foot of a page, with a mark at each centimetre."""
     x = MARGIN
     y = paper[1] - MARGIN
     _draw_line(axes, [x, x + RULER], [y, y])
-    for step in range(int(RULER) // 10 + 1):
-        _draw_line(
-            axes, [x + 10.0 * step] * 2, [y, y - (4.0 if step % 5 == 0 else 2.5)]
-        )
+    for centimetre in range(int(RULER) // 10 + 1):
+        mark_x = x + 10.0 * centimetre
+        mark_length = 4.0 if centimetre % 5 == 0 else 2.5
+        _draw_line(axes, [mark_x, mark_x], [y, y - mark_length])
     axes.text(x + RULER + 3.0, y, f"{RULER:g} mm", fontsize=7, va="bottom")
 
 

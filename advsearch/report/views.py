@@ -316,6 +316,11 @@ def _explain_words(described: Iterable[tuple[Fields, set[str]]]) -> ResultPart:
 
 
 def _format_value(value: object) -> str:
+    """Return a value as text for a table; None and NaN are empty.
+
+    Two floats are a range, other lists are separated by semicolons, and mappings and
+    objects with fields become "name value" pairs.
+    """
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -329,18 +334,17 @@ def _format_value(value: object) -> str:
             {name: getattr(value, name) for name in type(value).model_fields}
         )
     if isinstance(value, Mapping):
-        texts = {
-            _format_name(str(name)).lower(): _format_value(inner)
-            for name, inner in value.items()
+        text_by_name = {
+            _format_name(str(name)).lower(): _format_value(item)
+            for name, item in value.items()
         }
-        return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
+        pairs = [f"{name} {text}" for name, text in text_by_name.items() if text]
+        return ", ".join(pairs)
     if isinstance(value, (list, tuple)):
-        between = (
-            " to "
-            if len(value) == 2 and all(isinstance(inner, float) for inner in value)
-            else "; "
-        )
-        return between.join(filter(None, map(_format_value, value)))
+        is_range = len(value) == 2 and all(isinstance(item, float) for item in value)
+        texts = [_format_value(item) for item in value]
+        separator = " to " if is_range else "; "
+        return separator.join(text for text in texts if text)
     return str(value)
 
 
@@ -428,6 +432,7 @@ def make_case_claim(
 
 
 def make_average_claim(case: AverageCase, name: str) -> Claim:
+    """Return the claim about the average case of an attack."""
     what = "configurations in which the model is right"
     extent = make_extent(what, case.correct, case.configurations, case.interval)
     text = (
@@ -630,13 +635,13 @@ def render_result_figure(view: ShownResult) -> Figures:
 
 
 def join_images(pictures: Sequence[ArrayLike]) -> bytes:
+    """Return images (H, W, 3) of one height side by side as a PNG, with white gaps."""
     images = [np.asarray(picture, dtype=np.float32) for picture in pictures]
     gap = np.ones((len(images[0]), GAP, 3), np.float32)
-    return encode_png(
-        np.concatenate(
-            [block for array in images for block in (array, gap)][:-1], axis=1
-        )
-    )
+    blocks = [images[0]]
+    for image in images[1:]:
+        blocks += [gap, image]
+    return encode_png(np.concatenate(blocks, axis=1))
 
 
 def _make_image(png: bytes, width: int, alt: str) -> Html:

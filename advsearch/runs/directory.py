@@ -386,6 +386,10 @@ class RunDirectory:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        """Close the directory; after an error, remove it if it is new and empty.
+
+        Without an error it is checked first that nobody moved it meanwhile.
+        """
         if error is None:
             try:
                 check_not_moved(self.path)
@@ -545,6 +549,11 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
 
 
 def _make_numbered_directory(default: str) -> Path:
+    """Make the directory of the next free number, `default-001` and so on.
+
+    Numbers of removed runs below the largest one are not used again. Another process
+    may take the number in between, hence the loop.
+    """
     pattern = re.compile(re.escape(default) + r"-(\d{3,})")
     with storage_errors(HOME):
         HOME.mkdir(parents=True, exist_ok=True)

@@ -131,34 +131,32 @@ def _flatten_values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
 def _write_csv(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
+    """Write records as CSV; a missing value is empty, and a bool is 0 or 1."""
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
-    for record in map(_encode_payload, records):
-        writer.writerow(
-            {
-                name: int(value) if isinstance(value, bool) else value
-                for name, value in record.items()
-            }
-        )
+    for record in records:
+        cells = {
+            name: int(value) if isinstance(value, bool) else value
+            for name, value in _encode_payload(record).items()
+        }
+        writer.writerow(cells)
     text.detach()
 
 
 def _encode_payload(record: JsonObject) -> JsonObject:
+    """Return a record with its payload as JSON text."""
     payload = record[PAYLOAD]
-    return (
-        record
-        if payload is None
-        else {
-            **record,
-            PAYLOAD: json.dumps(payload, allow_nan=False, ensure_ascii=False),
-        }
-    )
+    if payload is None:
+        return record
+    text = json.dumps(payload, allow_nan=False, ensure_ascii=False)
+    return {**record, PAYLOAD: text}
 
 
 def _write_json(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
+    """Write records as one JSON array, a record on each line."""
     stream.write(b"[")
     for number, record in enumerate(records):
         line = json.dumps(

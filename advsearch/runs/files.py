@@ -253,6 +253,10 @@ def write_layers(
 def _write_exr(
     path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]
 ) -> Path:
+    """Write channels into an OpenEXR file atomically.
+
+    OpenEXR raises RuntimeError for a full disk; it becomes an OSError.
+    """
     # late: OpenEXR takes long to import
     import OpenEXR
 
@@ -301,6 +305,7 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
 
 
 def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:
+    """Encode images as an animation that repeats; the last one stays longer."""
     # one palette for all frames, by Pillow itself: 20 times as fast as through imageio
     pixels = np.concatenate([np.asarray(picture) for picture in pictures])
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
@@ -309,17 +314,17 @@ def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:
         picture.quantize(palette=palette, dither=Image.Dither.NONE)
         for picture in pictures
     ]
-    several = len(frames) > 1
+    is_animated = len(frames) > 1
+    durations: Any = LAST_FRAME_MS
+    if is_animated:
+        durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
     buffer = io.BytesIO()
-    durations = (
-        [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS] if several else LAST_FRAME_MS
-    )
     frames[0].save(
         buffer,
         "GIF",
         loop=0,
         duration=durations,
-        save_all=several,
+        save_all=is_animated,
         append_images=frames[1:],
     )
     return buffer.getvalue()

@@ -113,6 +113,16 @@ def _state(path: Path) -> object:
 def _make_listed_run(
     path: Path, counts: bool, running: bool, faults: list[str]
 ) -> ListedRun:
+    """Read what the list of runs says of one run.
+
+    What cannot be read is added to `faults` and left out; nothing is raised.
+
+    Args:
+        path: of the run.
+        counts: also count its rows, which opens the database.
+        running: a process holds the lock of the run.
+        faults: sentences, to which those of this run are added.
+    """
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
@@ -126,37 +136,47 @@ def _make_listed_run(
             store.Store(path / store.NAME, read_only=True) as results,
         ):
             kinds = results.count_by_kind()
-    object_name = getattr(result, "object", None) or ",".join(
-        getattr(result, "objects", ())
-    )
+    command = config.get("command") or (result.command if result else "?")
+    object_name = config.get("object") or _get_object_names(result)
+    if not object_name and not config:
+        object_name = "?"
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
-    ending = (
-        "stopped"
-        if result is None or result.is_unfinished
-        else str(getattr(result, "ending", "done"))
-    )
+    if not isinstance(controls, (list, tuple, dict)):
+        controls = ("?",)
+
+    if running:
+        state = "running"
+    elif result is None or result.is_unfinished:
+        state = "stopped"
+    else:
+        state = str(getattr(result, "ending", "done"))
+
     return ListedRun(
         path.name,
         str(path),
-        command=str(config.get("command") or (result.command if result else "?")),
-        object=str(config.get("object") or object_name or ("" if config else "?")),
-        controls=tuple(map(str, controls))
-        if isinstance(controls, (list, tuple, dict))
-        else ("?",),
+        command=str(command),
+        object=str(object_name),
+        controls=tuple(map(str, controls)),
         rows=sum(kinds.values()),
-        state="running" if running else ending,
+        state=state,
         answer=result.brief if result else "",
         kinds=kinds,
         begun=bool(config),
-        when=next(
-            (
-                file.stat().st_mtime
-                for file in (path / CONFIG, path / summary.NAME)
-                if file.exists()
-            ),
-            None,
-        ),
+        when=_find_start_time(path),
     )
+
+
+def _get_object_names(result: Result | None) -> str:
+    """Return the object or the objects of a result, separated by commas."""
+    return getattr(result, "object", None) or ",".join(getattr(result, "objects", ()))
+
+
+def _find_start_time(path: Path) -> float | None:
+    """Return when the settings of a run were written, or else its result."""
+    for file in (path / CONFIG, path / summary.NAME):
+        if file.exists():
+            return file.stat().st_mtime
+    return None
 
 
 @contextmanager

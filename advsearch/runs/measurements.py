@@ -80,10 +80,10 @@ class Measurements:
         ]
 
     def put(self, key: str, value: Any) -> None:
-        self._store.set_note(key, json.dumps(value))
+        self._store.write_note(key, json.dumps(value))
 
     def read(self, key: str) -> Any:
-        return self._store.noted(key)
+        return self._store.read_json_note(key)
 
     def collect(
         self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]

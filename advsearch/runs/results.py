@@ -49,6 +49,7 @@ Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
 
 
 def key_validator(*names: str) -> AfterValidator:
+    """Return a validator of a mapping that must have these keys."""
 
     def check(values: Mapping[str, object]) -> Mapping[str, object]:
         missing = [name for name in names if name not in values]

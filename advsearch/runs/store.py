@@ -126,6 +126,7 @@ class Store:
     NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
+        """Open a database, and check its version and its tables."""
         self.path = path
         self._next_sync = -math.inf
         with translate_database_errors(path):
@@ -187,6 +188,10 @@ class Store:
             )
 
     def _select(self, query: str, *parameters: Any) -> Iterator[Any]:
+        """Yield the rows of a query; an error of SQLite becomes one of ours.
+
+        The caller's own errors between two rows pass through unchanged.
+        """
         with translate_database_errors(self.path):
             cursor = self._db.execute(f"SELECT {query}", parameters)
             row = cursor.fetchone()
@@ -270,13 +275,10 @@ class Store:
                 self._db.execute("VACUUM")
 
     def get_last_step(self, kind: str) -> int:
-        return int(
-            next(
-                self._select(
-                    "coalesce(max(step), -1) FROM evaluations WHERE kind = ?", kind
-                )
-            )[0]
-        )
+        """Return the largest step of a kind of rows, -1 if there is none."""
+        query = "coalesce(max(step), -1) FROM evaluations WHERE kind = ?"
+        ((step,),) = self._select(query, kind)
+        return int(step)
 
     def count_rows(self, kind: str | None = None) -> int:
         condition, parameters = (
@@ -305,13 +307,10 @@ class Store:
         return {str(kind): count for kind, count in self._select(what)}
 
     def read_note(self, key: str) -> str | None:
-        return next(
-            (
-                str(text)
-                for (text,) in self._select("value FROM meta WHERE key = ?", key)
-            ),
-            None,
-        )
+        """Return the text that is stored under a key, None if there is none."""
+        for (text,) in self._select("value FROM meta WHERE key = ?", key):
+            return str(text)
+        return None
 
     def read_json_note(self, key: str) -> Any:
         """Return the JSON value that was noted under `key`, or None."""
@@ -360,6 +359,11 @@ _JSON = json.JSONEncoder(allow_nan=False)
 
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
+    """Return a row as the values of its columns; `stamp` is the time.
+
+    Numbers of numpy and torch become Python's, and mappings become JSON. Metrics that
+    are empty become NULL.
+    """
     values = []
     for name in _ENCODED_FIELDS:
         value = getattr(row, name)
@@ -395,6 +399,11 @@ MAX_STEP = (1 << 32) - 1
 
 
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
+    """Return a row from the values of its columns; checks every one of them.
+
+    Raises:
+        FileFormatError: a column has another type, or a number that no row has.
+    """
     by_name = dict(zip(_FIELDS, values, strict=True))
     wrong_columns = [
         name
@@ -429,24 +438,22 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
 
 
 def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:
+    """Return what a search was told, from the values of its columns.
+
+    Raises:
+        FileFormatError: a column has another type, or the image another size.
+    """
     number, u, non_finite, cost, gradient, picture, height = values
     try:
-        if [type(value) for value in (number, u, non_finite, cost)] != [
-            int,
-            bytes,
-            int,
-            int,
-        ]:
+        types = [type(value) for value in (number, u, non_finite, cost)]
+        if types != [int, bytes, int, int]:
             raise TypeError("a number that is none")
+        if gradient is not None:
+            gradient = np.frombuffer(gradient, np.float32)
+        if picture is not None:
+            picture = np.frombuffer(picture, np.uint8).reshape(height, -1, 3)
         return CachedEvaluation(
-            number,
-            u,
-            non_finite,
-            cost,
-            gradient=None if gradient is None else np.frombuffer(gradient, np.float32),
-            picture=None
-            if picture is None
-            else np.frombuffer(picture, np.uint8).reshape(height, -1, 3),
+            number, u, non_finite, cost, gradient=gradient, picture=picture
         )
     except (TypeError, ValueError) as error:
         raise FileFormatError(
@@ -466,6 +473,7 @@ def _parse_named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | Non
 
 
 def _is_value(entry: object) -> bool:
+    """Return whether this is a value of a parameter: text or finite numbers, and a unit."""
     if (
         not isinstance(entry, dict)
         or not isinstance(entry.get("unit"), str)

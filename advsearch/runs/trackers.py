@@ -49,9 +49,18 @@ def _import_package(name: str) -> Any:
 
 
 class Tracker:
-    """Tells rows to a tracker from a thread of its own."""
+    """Sends rows to a tracker, from a thread of its own.
+
+    Nothing that a tracker does stops the run: it is sent less if it is slow, and
+    nothing more after an error.
+
+    Attributes:
+        _accuracy_counts: correct rows and all judged rows so far, by kind of row.
+        _queue: metrics and step of each message; None ends the thread.
+    """
 
     def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
+        """Start the thread. Settings are cut to `MAX_TEXT_LENGTH` characters each."""
         self._name = name
         self._accuracy_counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
         self._queue: Queue[tuple[MetricValues, int] | None] = Queue(MAX_QUEUED)
@@ -66,7 +75,7 @@ class Tracker:
         self._thread.start()
 
     def send_rows(self, rows: Sequence[Row]) -> None:
-        """Tell rows that were kept; returns at once."""
+        """Send rows that were stored; returns at once."""
         kinds: dict[str, list[Row]] = defaultdict(list)
         for row in rows:
             kinds[row.kind].append(row)
@@ -81,13 +90,11 @@ class Tracker:
         self._thread.join(MAX_CLOSE_SECONDS)
 
     def _compute_metrics(self, kind: str, rows: Sequence[Row]) -> MetricValues:
+        """Return the means over some rows of a kind, and its accuracy from the beginning."""
         metrics = {}
         for name in METRICS:
-            values = [
-                float(value)
-                for row in rows
-                if (value := getattr(row, name)) is not None
-            ]
+            stored_values = [getattr(row, name) for row in rows]
+            values = [float(value) for value in stored_values if value is not None]
             if values:
                 metrics[f"{kind}/{name}"] = sum(values) / len(values)
         is_right = [row.correct for row in rows if row.correct is not None]
@@ -105,10 +112,13 @@ class Tracker:
             return  # a tracker that is that slow is told less; the run has all of it
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
+        """Send messages until the last one; the body of the thread."""
         try:
-            tell, close = _open_tracker(self._name, folder, settings)
-            while (message := self._queue.get()) is not None:
-                tell(*message)
+            log_metrics, close = _open_tracker(self._name, folder, settings)
+            message = self._queue.get()
+            while message is not None:
+                log_metrics(*message)
+                message = self._queue.get()
             close()
         except Exception as error:  # whatever a tracker does, the run goes on
             _LOG.warning(

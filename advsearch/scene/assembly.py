@@ -23,19 +23,29 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.assets import Float32Array, IntArray, Mesh, Shape
+from advsearch.scene.backdrop import make_image_inputs
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import (
     camera_to_world,
     compute_car_pose,
-    compute_seated_pose,
+    compute_carried_pose,
     project_points,
 )
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
 
 # inputs that the renderer applies to radiance
-IMAGE_INPUTS = frozenset({"backdrop.color", "camera.exposure"})
+IMAGE_INPUTS = frozenset(
+    {
+        "backdrop.blur",
+        "backdrop.color",
+        "backdrop.front",
+        "backdrop.noise",
+        "backdrop.plane",
+        "camera.exposure",
+    }
+)
 
 
 class MovingMesh:
@@ -148,6 +158,11 @@ HIDDEN_OFFSET = 1000.0
 class Assembly:
     """Turn the inputs of a space into those of `MitsubaScene`, for a scene's parts.
 
+    Args:
+        description: the scene.
+        resolution: height and width in pixels of the image, for a scene that is
+            rendered into a photograph; None leaves the photograph out.
+
     Attributes:
         is_object_hidden: put the object so far away that neither it nor its shadow is
             in the image. The bounds of a scene in which this was set once change the
@@ -156,7 +171,11 @@ class Assembly:
 
     is_object_hidden = False
 
-    def __init__(self, description: SceneDescription) -> None:
+    def __init__(
+        self,
+        description: SceneDescription,
+        resolution: tuple[int, int] | None = None,
+    ) -> None:
         self.meshes = {
             name: MovingMesh(part.mesh, part.to_world)
             for name, part in description.meshes.items()
@@ -167,6 +186,9 @@ class Assembly:
             if isinstance(part, (BeamLamp, LampGlass))
         ]
         self._photograph = description.photograph
+        self._image_inputs: dict[str, Tensor] = {}
+        if resolution is not None:
+            self._image_inputs = make_image_inputs(description, resolution)
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
@@ -178,7 +200,7 @@ class Assembly:
             pose = inputs.get(name, self.meshes[OBJECT].to_world).clone()
             pose[1, 3] += HIDDEN_OFFSET
             inputs = {**inputs, name: pose}
-        parameters = dict(inputs)
+        parameters = {**inputs, **self._image_inputs}
         for part in self._carried:  # what carries it may be moved or deformed
             parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():
@@ -228,7 +250,9 @@ def _move_carried(
         moved_inputs[f"{part.name}.offsets"] = offsets[follows]
     if pose is not None and isinstance(part, BeamLamp):
         car_pose = compute_car_pose(pose) if part.carrier == CAMERA else pose
-        pose = compute_seated_pose(car_pose, torch.from_numpy(part.seat).to(pose))
+        pose = compute_carried_pose(
+            car_pose, torch.from_numpy(part.pose_on_carrier).to(pose)
+        )
     if pose is not None:
         moved_inputs[f"{part.name}.to_world"] = pose
     return moved_inputs

@@ -133,10 +133,9 @@ class Material:
 
         Their names are `prefix` and the attribute's.
         """
+        new_values = {name: values.get(prefix + name) for name in vars(self)}
         replaced = {
-            name: value
-            for name in vars(self)
-            if (value := values.get(prefix + name)) is not None
+            name: value for name, value in new_values.items() if value is not None
         }
         return replace(self, **replaced)
 
@@ -201,6 +200,8 @@ class ObjectAsset(Shape):
     # its largest extent, where distances of the camera are in metres (see below)
     metres: float | None = None
     extent: float | None = None  # its largest extent in the coordinates of its file
+    # (4, 4) from the coordinates of its file to those of `mesh`
+    file_to_mesh: Float64Array | None = None
     # in a lane it faces as the traffic drives; otherwise it faces those who come, as
     # signs do
     drives: bool = True
@@ -246,14 +247,14 @@ class EnvironmentAsset:
         is_bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
         if is_bad.any():
             row, column = np.unravel_index(int(is_bad.argmax()), is_bad.shape)
-            description = (
+            bad_texels = (
                 f"{int(is_bad.sum())} of {is_bad.size} texels that are negative, NaN "
                 "or "
                 "infinite"
             )
             raise InputError(
                 f"environment {self.name!r}: expected finite radiance of at least 0, "
-                f"got {description} (the first in row "
+                f"got {bad_texels} (the first in row "
                 f"{row}, column {column}); clamp them"
             )
 
@@ -267,8 +268,9 @@ def compute_area_vectors(corners: Float64Array) -> Float64Array:
 
 
 def make_pose(linear: npt.ArrayLike, translation: npt.ArrayLike) -> Float64Array:
-    """Return the pose (4, 4) `linear @ v + place` of a matrix (3, 3) and a shift
-    (3,).
+    """Return the pose (4, 4) of `v -> linear @ v + translation`.
+
+    The matrix is (3, 3), the translation (3,).
     """
     pose = np.eye(4)
     pose[:3, :3] = linear
@@ -278,13 +280,18 @@ def make_pose(linear: npt.ArrayLike, translation: npt.ArrayLike) -> Float64Array
 
 def find_footing(points: Float64Array) -> tuple[Float64Array, float]:
     """Return the point (3,) in the middle below points (N, 3), and their extent."""
-    low = points.min(axis=0)
-    high = points.max(axis=0)
-    return np.array([*(low[:2] + high[:2]) / 2.0, low[2]]), float((high - low).max())
+    lower = points.min(axis=0)
+    upper = points.max(axis=0)
+    return np.array([*(lower[:2] + upper[:2]) / 2.0, lower[2]]), float(
+        (upper - lower).max()
+    )
 
 
 def group_indices(group_of: IntArray) -> list[IntArray]:
-    """Return the rising indices (n,) of each group, from 0 to the largest one."""
+    """Return the rising indices (n,) of each group, from 0 to the largest one.
+
+    `group_of` (N,) is the group of each index; a group may be empty.
+    """
     return np.split(
         np.argsort(group_of, kind="stable"), np.cumsum(np.bincount(group_of))[:-1]
     )
@@ -316,8 +323,9 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
 
     After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering
     complex scenes"): vertices are clustered by a grid, and a face of which two corners
-    meet is left out. Both sides of a seam of the texture move together, so that no gap
-    opens.
+    meet is left out. A cluster goes to the mean of its vertices. Both sides of a seam
+    of the texture move together, so that no gap opens: they are vertices of their own,
+    in one cluster. The grid is the finest that leaves few enough faces.
 
     Args:
         mesh: the full mesh.
@@ -328,23 +336,30 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     """
     if len(mesh.faces) <= max_faces:
         return None
-    chart = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(np.int64)
+    texture_cell = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(
+        np.int64
+    )
     for grid in SIMPLIFICATION_GRIDS:
         cluster_of = _cluster_vertices(mesh, grid)
         # vertices of a cluster in different parts of the texture stay apart
-        cluster_and_chart = _encode_rows(np.column_stack([cluster_of, chart]))
+        cluster_and_chart = _encode_rows(np.column_stack([cluster_of, texture_cell]))
         _, representative, new_vertex = np.unique(
             cluster_and_chart, return_index=True, return_inverse=True
         )
         faces = new_vertex.reshape(-1)[mesh.faces]
-        first, second, third = cluster_of[representative][faces].T
-        faces = faces[(first != second) & (second != third) & (third != first)]
+        cluster_a, cluster_b, cluster_c = cluster_of[representative][faces].T
+        faces = faces[
+            (cluster_a != cluster_b)
+            & (cluster_b != cluster_c)
+            & (cluster_c != cluster_a)
+        ]
         if len(faces) <= max_faces:
             break
     distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
     cluster_size = np.bincount(cluster_of)
 
     def simplify(full: Mesh) -> Mesh:
+        """Return a mesh with the same vertices elsewhere, simplified in the same way."""
         sums = [np.bincount(cluster_of, full.vertices[:, axis]) for axis in range(3)]
         mean = np.stack([total / cluster_size for total in sums], axis=1)
         return Mesh(
@@ -372,13 +387,16 @@ def _cluster_vertices(mesh: Mesh, grid: int) -> IntArray:
 
 
 def _encode_rows(rows: IntArray) -> IntArray:
-    """Return one number for each row of whole numbers, the same for equal rows only."""
-    low = rows.min(axis=0)
-    sizes = rows.max(axis=0) - low + 1
-    key = np.zeros(len(rows), np.int64)
-    for column, size in zip((rows - low).T, sizes, strict=True):
-        key = key * size + column
-    return key
+    """Return one number for each row of whole numbers, the same for equal rows only.
+
+    It is the row read as digits, each column with a base of its own.
+    """
+    smallest = rows.min(axis=0)
+    sizes = rows.max(axis=0) - smallest + 1
+    code = np.zeros(len(rows), np.int64)
+    for column, size in zip((rows - smallest).T, sizes, strict=True):
+        code = code * size + column
+    return code
 
 
 # --------------------------------------------------------------------------------------
@@ -490,30 +508,32 @@ def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> Objec
             f"unit: {asset.name} is no mesh file; give its longest side "
             "in metres, such as size=0.1"
         )
-    metres = (
-        float(size)
-        if size is not None
-        else (asset.extent or 0.0) * METRES_PER_UNIT[unit or "m"]
-    )
-    if not MIN_METRES <= metres <= MAX_METRES:
-        statement = (
-            f"size={size:g}"
-            if size is not None
-            else (f"unit={unit} for a mesh of {asset.extent:.4g}")
-        )
+    if size is not None:
+        longest_side = float(size)
+    else:
+        longest_side = (asset.extent or 0.0) * METRES_PER_UNIT[unit or "m"]
+    if not MIN_METRES <= longest_side <= MAX_METRES:
+        statement = f"unit={unit} for a mesh of {asset.extent:.4g}"
+        if size is not None:
+            statement = f"size={size:g}"
         raise InputError(
             f"{statement}: expected a longest side of {MIN_METRES:g} to {MAX_METRES:g} "
             "metres, "
-            f"got {metres:.4g}; give it in "
+            f"got {longest_side:.4g}; give it in "
             "metres, such as size=4.9"
         )
-    return replace(asset, metres=metres)
+    return replace(asset, metres=longest_side)
 
 
 def describe_size_doubts(
     asset: ObjectAsset, *, has_user_size: bool, needs_metres: bool
 ) -> tuple[str, ...]:
     """Return a remark where an object's size is unusual for its name, or unknown.
+
+    The last word of the name that `USUAL_SIZES` has counts; without one a size is
+    unusual only from 5 mm down and from 100 m up. A size that is unknown matters if
+    something is in metres, or if the name and the file's extent tell which unit would
+    fit. The user's own size is never doubted.
 
     Args:
         asset: the object.
@@ -528,36 +548,34 @@ def describe_size_doubts(
         ),
         None,
     )
-    low, high = (0.005, 100.0) if kind is None else USUAL_SIZES[kind]
-    is_unusual = asset.metres is not None and not low <= asset.metres <= high
+    min_size, max_size = (0.005, 100.0) if kind is None else USUAL_SIZES[kind]
+    is_unusual = asset.metres is not None and not min_size <= asset.metres <= max_size
     is_unknown = asset.metres is None and (
         needs_metres or (kind is not None and asset.extent is not None)
     )
     if has_user_size or not (is_unusual or is_unknown):
         return ()
     extent = 0.0 if asset.extent is None or kind is None else asset.extent
-    fits = [
+    fitting_units = [
         unit
         for unit, metres in METRES_PER_UNIT.items()
-        if low <= extent * metres <= high
+        if min_size <= extent * metres <= max_size
     ]
     clauses = [
         f"its longest side is {format_rounded(asset.metres or 0.0)} m"
         if is_unusual
         else "its size in metres is not known",
         f"it is {format_rounded(extent)} in its file" if is_unknown and extent else "",
-        f"a {kind}'s is {low:g} to {high:g} m" if kind else "",
+        f"a {kind}'s is {min_size:g} to {max_size:g} m" if kind else "",
         "it is taken for 1 m, as the road is in metres"
         if is_unknown and needs_metres
         else "",
     ]
-    remedy = (
-        f"give its longest side in metres, such as `size={(low * high) ** 0.5:.2g}`"
-    )
-    if fits:
+    remedy = f"give its longest side in metres, such as `size={(min_size * max_size) ** 0.5:.2g}`"
+    if fitting_units:
         remedy += (
-            f", or `unit={fits[0]}`, which makes it "
-            f"{format_rounded(extent * METRES_PER_UNIT[fits[0]])} m"
+            f", or `unit={fitting_units[0]}`, which makes it "
+            f"{format_rounded(extent * METRES_PER_UNIT[fitting_units[0]])} m"
         )
     return (
         f"{asset.name}: {'; '.join(filter(None, clauses))}. "

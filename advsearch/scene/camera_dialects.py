@@ -128,8 +128,12 @@ METASHAPE_KINDS = {
 
 def describe_projection(name: str) -> str:
     """Describe an unsupported model, to follow its name in an error; "" if unknown."""
-    known = OTHER_PROJECTIONS.get(re.sub(r"[-\s]+", "_", name.strip().lower()))
-    return "" if known is None else f", {known}, another projection; {FIT_FISHEYE}"
+    description = OTHER_PROJECTIONS.get(re.sub(r"[-\s]+", "_", name.strip().lower()))
+    return (
+        ""
+        if description is None
+        else f", {description}, another projection; {FIT_FISHEYE}"
+    )
 
 
 def check_text_format(path: str, text: str) -> None:
@@ -158,6 +162,9 @@ def translate_entries(
 ) -> dict[str, Any] | None:
     """Translate the entries of one camera to those of OpenCV's files.
 
+    The tool is found by its entries: ORB-SLAM, KITTI, OpenSfM, stella_vslam, RealSense
+    or Metashape. The last three have one camera only, which has no name.
+
     Args:
         path: the file.
         camera_name: the name of the camera, "" if none is named.
@@ -170,9 +177,8 @@ def translate_entries(
         FileFormatError: it has another projection, several cameras of which none is
             named, or lacks numbers.
     """
-    orbslam_cameras = [
-        match[1] for name in data if (match := ORBSLAM_CAMERA.fullmatch(name))
-    ]
+    orbslam_matches = map(ORBSLAM_CAMERA.fullmatch, data)
+    orbslam_cameras = [match[1] for match in orbslam_matches if match]
     if orbslam_cameras:
         return _translate_orbslam(path, camera_name, data, orbslam_cameras)
     kitti_cameras = _find_kitti(data)
@@ -185,49 +191,57 @@ def translate_entries(
         return _translate_opensfm(path, select_camera(path, camera_name, data))
     if camera_name:
         return None
-    stella = data.get("Camera")
-    if isinstance(stella, dict) and "model" in stella:
-        entries = {
-            STELLA_NAMES.get(str(name), str(name)): value
-            for name, value in stella.items()
-        }
-        kind = str(stella["model"])
-        entries["distortion_model"] = STELLA_KINDS.get(kind, kind)
-        return {
-            name: value
-            for name, value in entries.items()
-            if not ORBSLAM_NON_LENS_KEYS.fullmatch(f"Camera.{name}")
-        }
+    stella_camera = data.get("Camera")
+    if isinstance(stella_camera, dict) and "model" in stella_camera:
+        return _translate_stella(stella_camera)
     if "ppx" in data:
         return _translate_realsense(data)
-    if data.get("projection") in METASHAPE_KINDS or (
-        "projection" in data and "f" in data
-    ):
+    has_projection = data.get("projection") in METASHAPE_KINDS
+    if has_projection or ("projection" in data and "f" in data):
         return _translate_metashape(path, data)
     return None
+
+
+def _translate_stella(camera: Mapping[str, Any]) -> dict[str, Any]:
+    """Translate a camera of stella_vslam; entries not about the lens are left out."""
+    entries = {
+        STELLA_NAMES.get(str(name), str(name)): value for name, value in camera.items()
+    }
+    kind = str(camera["model"])
+    entries["distortion_model"] = STELLA_KINDS.get(kind, kind)
+    return {
+        name: value
+        for name, value in entries.items()
+        if not ORBSLAM_NON_LENS_KEYS.fullmatch(f"Camera.{name}")
+    }
 
 
 def _translate_orbslam(
     path: str, camera_name: str, data: Mapping[str, Any], cameras: list[str]
 ) -> dict[str, Any]:
-    camera = select_camera(path, camera_name, dict(zip(cameras, cameras, strict=True)))
-    stated = str(data.get("Camera.type", "PinHole"))
+    """Translate a camera of ORB-SLAM, whose entries are `Camera.fx` or `Camera1.fx`.
+
+    Entries of other cameras, and those that are not about the lens, are left out.
+    """
+    camera_group = select_camera(
+        path, camera_name, dict(zip(cameras, cameras, strict=True))
+    )
+    stated_type = str(data.get("Camera.type", "PinHole"))
     entries: dict[str, Any] = {
-        "distortion_model": ORBSLAM_KINDS.get(stated.lower(), stated)
+        "distortion_model": ORBSLAM_KINDS.get(stated_type.lower(), stated_type)
     }
-    others = {name for name in cameras if name != camera}
+    other_cameras = {name for name in cameras if name != camera_group}
     for name, value in data.items():
-        group, _, rest = name.partition(".")
+        group, _, entry_name = name.partition(".")
         if (
             ORBSLAM_NON_LENS_KEYS.fullmatch(name)
-            or group in others
+            or group in other_cameras
             or name == "Camera.type"
         ):
             continue
-        if group in (camera, "Camera"):
-            entries[
-                {"width": "image_width", "height": "image_height"}.get(rest, rest)
-            ] = value
+        if group in (camera_group, "Camera"):
+            size_names = {"width": "image_width", "height": "image_height"}
+            entries[size_names.get(entry_name, entry_name)] = value
         else:
             entries[name] = value
     return entries
@@ -236,16 +250,17 @@ def _translate_orbslam(
 def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
     """Return the names of the matrices of KITTI's cameras, by the cameras' names.
 
-    Its numbers are separated by blanks, and so are text; a list is the P1 of a stereo
-    pair of OpenCV.
+    Numbers separated by blanks are a text in YAML; a list P1 is no camera of KITTI's,
+    but of a stereo pair of OpenCV.
     """
     cameras = dict[str, str]()
     for name, value in data.items():
         if not isinstance(value, str):
             continue
+        match = KITTI_RAW.fullmatch(name) or KITTI_RECTIFIED.fullmatch(name)
         if KITTI_PROJECTION.fullmatch(name):
             cameras[name] = name
-        elif match := KITTI_RAW.fullmatch(name) or KITTI_RECTIFIED.fullmatch(name):
+        elif match:
             cameras[match[1]] = name
     return cameras
 
@@ -253,6 +268,10 @@ def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
 def _read_numbers(
     path: str, data: Mapping[str, Any], name: str, count: int
 ) -> list[float]:
+    """Return the numbers of an entry that are separated by blanks.
+
+    Raises FileFormatError if there are not `count` of them.
+    """
     words = str(data.get(name, "")).split()
     if len(words) != count:
         raise FileFormatError(
@@ -265,16 +284,23 @@ def _read_numbers(
 def _translate_kitti(
     path: str, camera_name: str, data: Mapping[str, Any], cameras: Mapping[str, str]
 ) -> dict[str, Any]:
+    """Translate a camera of KITTI: a raw one with distortion, or a rectified one
+    without.
+
+    Raises FileFormatError if the file has no size of the image.
+    """
     matrix_name = select_camera(path, camera_name, cameras)
     entries = {
         name: value
         for name, value in data.items()
         if not KITTI_NON_LENS_KEYS.fullmatch(name)
     }
-    raw = KITTI_RAW.fullmatch(matrix_name)
-    if raw:
+    raw_match = KITTI_RAW.fullmatch(matrix_name)
+    if raw_match:
         entries["camera_matrix"] = _read_numbers(path, data, matrix_name, 9)
-        entries["distortion_coefficients"] = _read_numbers(path, data, f"D_{raw[1]}", 5)
+        entries["distortion_coefficients"] = _read_numbers(
+            path, data, f"D_{raw_match[1]}", 5
+        )
     else:
         # a rectified camera: K [R | t] with R = 1, so that the first three columns are
         # K
@@ -293,6 +319,10 @@ def _translate_kitti(
 
 
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Translate the intrinsics of RealSense.
+
+    Models without our equivalent are none where all coefficients are 0.
+    """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
     kind = re.sub(
         r"[-\s]+",
@@ -314,7 +344,13 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
-    stated = str(camera["projection_type"])
+    """Translate a camera of OpenSfM, whose lengths are fractions of the larger side.
+
+    The principal point counts from the middle of the image; here from the center of the
+    first pixel. `focal` is that of both axes unless they have their own. A camera of an
+    unknown kind, or a panorama, keeps only its kind and size.
+    """
+    stated_type = str(camera["projection_type"])
     entries = {
         name: value
         for name, value in camera.items()
@@ -334,11 +370,11 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
         parse_number(path, side, camera.get(side)) for side in ("width", "height")
     )
     entries |= {
-        "distortion_model": OPENSFM_KINDS.get(stated, stated),
+        "distortion_model": OPENSFM_KINDS.get(stated_type, stated_type),
         "image_width": width,
         "image_height": height,
     }
-    if OPENSFM_KINDS.get(stated) in (None, "equirectangular"):
+    if OPENSFM_KINDS.get(stated_type) in (None, "equirectangular"):
         return entries
     side = max(width, height)  # lengths are in this
     focal_x = parse_number(path, "focal_x", camera.get("focal_x", camera.get("focal")))
@@ -359,8 +395,8 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     Offsets are from the center of the image, p1 and p2 are swapped against OpenCV, and
     k4 is the fourth coefficient of a polynomial.
     """
-    stated = str(data.get("projection", "frame"))
-    value = {
+    stated_type = str(data.get("projection", "frame"))
+    value_by_name = {
         name: parse_number(path, name, data.get(name, 0.0))
         for name in ("f", "cx", "cy", "b1", "b2", "k4", "p1", "p2")
     }
@@ -370,31 +406,31 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     entries = {
         name: entry
         for name, entry in data.items()
-        if name not in (*value, "projection", "width", "height")
+        if name not in (*value_by_name, "projection", "width", "height")
     }
-    kind = METASHAPE_KINDS.get(stated, stated)
+    kind = METASHAPE_KINDS.get(stated_type, stated_type)
     entries |= {"distortion_model": kind, "image_width": width, "image_height": height}
     if kind == "equirectangular":
         return entries
-    center_x = (width - 1.0) / 2.0 + value["cx"]
-    center_y = (height - 1.0) / 2.0 + value["cy"]
+    center_x = (width - 1.0) / 2.0 + value_by_name["cx"]
+    center_y = (height - 1.0) / 2.0 + value_by_name["cy"]
     entries["camera_matrix"] = [
-        value["f"] + value["b1"],
-        value["b2"],
+        value_by_name["f"] + value_by_name["b1"],
+        value_by_name["b2"],
         center_x,
         0.0,
-        value["f"],
+        value_by_name["f"],
         center_y,
         0.0,
         0.0,
         1.0,
     ]
-    entries |= {"p1": value["p2"], "p2": value["p1"]}
+    entries |= {"p1": value_by_name["p2"], "p2": value_by_name["p1"]}
     if kind == "fisheye":
-        entries["k4"] = value["k4"]
-    elif value["k4"]:
+        entries["k4"] = value_by_name["k4"]
+    elif value_by_name["k4"]:
         raise FileFormatError(
-            f"{path}: k4: expected 0, got {value['k4']:g}: the fourth radial term of "
+            f"{path}: k4: expected 0, got {value_by_name['k4']:g}: the fourth radial term of "
             "Metashape is not OpenCV's; leave "
             "k4 out of the fit and optimize the cameras again"
         )

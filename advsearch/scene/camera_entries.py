@@ -59,7 +59,7 @@ class Entries:
     """The entries of a camera file by plain names, with a record of which are read.
 
         entries.get("cameramatrix", "k")   # the first that has a value, or None
-        entries.told()                     # the entries that were not read
+        entries.find_unread()              # the entries that were not read
 
     Raises:
         FileFormatError: two entries have the same plain name.
@@ -68,10 +68,10 @@ class Entries:
     def __init__(self, path: str, values: Mapping[str, Any]) -> None:
         self.path = path
         self._keys: TrackedKeys[Any] = TrackedKeys(values, fold=normalize_key)
-        for first in self._keys.repeated:
-            other = self._keys.get_spelling(normalize_key(first))
+        for key in self._keys.repeated:
+            later_key = self._keys.get_spelling(normalize_key(key))
             raise FileFormatError(
-                f"{path}: has {format_name(first)} and {format_name(other)}; leave one "
+                f"{path}: has {format_name(key)} and {format_name(later_key)}; leave one "
                 "of them out"
             )
         # Keys of matrices that are not read.
@@ -152,10 +152,10 @@ class Entries:
             FileFormatError: one of them changes the image.
         """
         unread = [prefix + key for key in self._unread_matrix_keys]
-        for spelled in self._keys.find_unread(
+        for spelling in self._keys.find_unread(
             lambda name, _: IGNORED_KEYS.fullmatch(name) is not None
         ):
-            name = normalize_key(spelled)
+            name = normalize_key(spelling)
             value = self._keys.peek(name)
             is_matrix = isinstance(value, (list, Mapping))
             is_coefficient = name in COEFFICIENTS and not is_matrix
@@ -170,10 +170,10 @@ class Entries:
                 and not is_of_second_camera
             )
             if not changes_image:
-                unread.append(prefix + spelled)
+                unread.append(prefix + spelling)
             elif not is_neutral(value):
                 raise FileFormatError(
-                    f"{self.path}: expected no {format_name(prefix + spelled)}, got "
+                    f"{self.path}: expected no {format_name(prefix + spelling)}, got "
                     f"{format_name(str(value))}: it makes another"
                     " picture and is not read; calibrate with one of the models in "
                     "docs/cameras.md"
@@ -192,16 +192,16 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
     listing = ", ".join(names[:8])
     if len(names) > 8:
         listing += ", ..."
-    first = f"{path}#{names[0]}"
+    example = f"{path}#{names[0]}"
     if camera_name and camera_name not in names:
         raise FileFormatError(
             f"{path}: expected one of its cameras {listing}, got "
-            f"{camera_name[:40]!r}; write {first}"
+            f"{camera_name[:40]!r}; write {example}"
         )
     if not camera_name and len(names) > 1:
         raise FileFormatError(
             f"{path}: has {len(names)} cameras, {listing}: say which one takes the "
-            f"picture, as in {first}"
+            f"picture, as in {example}"
         )
     return cameras[camera_name or names[0]]
 
@@ -280,6 +280,9 @@ def make_camera_model(
 ) -> CameraModel:
     """Make a camera model of numbers in pixels.
 
+    A panorama has the numbers of its size, whatever the file has. Lengths along x are
+    stored in image widths, those along y in heights.
+
     Args:
         spec: the file, and perhaps the camera in it.
         kind: the kind of model.
@@ -306,45 +309,56 @@ def make_camera_model(
             "cy": height / 2.0,
         }
         pixel_offset = 0.0
-    value = {name: pixel_values.get(name, 0.0) for name in NUMBER_NAMES}
-    value["cx"] = value["cx"] + pixel_offset
-    value["cy"] = value["cy"] + pixel_offset
-    _check_numbers(path, value, width, height)
-    unit = {"fx": width, "fy": height, "cx": width, "cy": height, "skew": width}
-    numbers = tuple(number / unit.get(name, 1.0) for name, number in value.items())
+    value_by_name = {name: pixel_values.get(name, 0.0) for name in NUMBER_NAMES}
+    value_by_name["cx"] = value_by_name["cx"] + pixel_offset
+    value_by_name["cy"] = value_by_name["cy"] + pixel_offset
+    _check_numbers(path, value_by_name, width, height)
+    unit_by_name = {"fx": width, "fy": height, "cx": width, "cy": height, "skew": width}
+    numbers = tuple(
+        number / unit_by_name.get(name, 1.0) for name, number in value_by_name.items()
+    )
     return CameraModel(kind, numbers, spec, (int(height), int(width)))
 
 
 def _check_numbers(
-    path: str, value: Mapping[str, float], width: float, height: float
+    path: str, value_by_name: Mapping[str, float], width: float, height: float
 ) -> None:
-    """Raise FileFormatError if numbers in pixels are those of no camera."""
+    """Raise FileFormatError if numbers in pixels are those of no camera.
+
+    Focal lengths within a factor of a thousand of the image's sides, a principal point
+    inside of the image, a skew up to fx, and coefficients up to `MAX_COEFFICIENT`.
+    """
 
     def check(name: str, is_valid: bool, expected: str, hint: str = "") -> None:
+        """Raise the error of a number that is not valid."""
         if not is_valid:
             raise FileFormatError(
-                f"{path}: {name}: expected {expected}, got {value[name]:g}{hint}"
+                f"{path}: {name}: expected {expected}, got {value_by_name[name]:g}{hint}"
             )
 
     for name, side in (("fx", width), ("fy", height)):
-        low = side / MAX_FOCAL_RATIO
-        high = side * MAX_FOCAL_RATIO
+        min_focal = side / MAX_FOCAL_RATIO
+        max_focal = side * MAX_FOCAL_RATIO
         check(
             name,
-            low <= value[name] <= high,
-            f"a focal length from {low:g} to {high:g} pixels for a side of {side:g}",
+            min_focal <= value_by_name[name] <= max_focal,
+            f"a focal length from {min_focal:g} to {max_focal:g} pixels for a side of {side:g}",
         )
     for name, side in (("cx", width), ("cy", height)):
         check(
             name,
-            0.0 < value[name] < side,
+            0.0 < value_by_name[name] < side,
             f"a principal point inside the picture, up to {side:g}",
         )
-    check("skew", abs(value["skew"]) <= value["fx"], f"less than fx, {value['fx']:g}")
+    check(
+        "skew",
+        abs(value_by_name["skew"]) <= value_by_name["fx"],
+        f"less than fx, {value_by_name['fx']:g}",
+    )
     for name in COEFFICIENTS:
         check(
             name,
-            abs(value[name]) <= MAX_COEFFICIENT,
+            abs(value_by_name[name]) <= MAX_COEFFICIENT,
             f"a coefficient from -{MAX_COEFFICIENT:g} to {MAX_COEFFICIENT:g}",
             "; is it in the order of OpenCV?",
         )

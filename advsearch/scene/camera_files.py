@@ -164,16 +164,19 @@ def _list_lines(text: str) -> list[str]:
 def read_camera(spec: str) -> CameraModel:
     """Read a camera's model from a file.
 
+    The format is found by the content: COLMAP's text, a dialect of another tool,
+    nerfstudio, Kalibr with several cameras or one, or OpenCV and ROS.
+
     Args:
         spec: the file; of several cameras in it, that which is named, as in
             ``camchain.yaml#cam1`` and ``cameras.txt#3``.
 
     Raises:
         FileFormatError: the file is missing, is of no known kind, has a model that is
-            not one of ours, numbers that no camera has, or an entry that changes the
-            image and is not read.
+            not one of ours, numbers that no camera has, or an entry that changes the image
+            and is not read.
     """
-    path, _, which = spec.partition("#")
+    path, _, camera_name = spec.partition("#")
     suffix = Path(path).suffix.lower()
     if suffix in CAMERA_FORMAT_ADVICE and Path(path).is_file():
         raise FileFormatError(
@@ -188,27 +191,29 @@ def read_camera(spec: str) -> CameraModel:
     text = read_existing_text(path, "a camera file", limit)
     lines = _list_lines(text)
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
-        return _read_colmap(spec, path, which, lines)
+        return _read_colmap(spec, path, camera_name, lines)
     check_text_format(path, text)
     data = _parse_file(path, text)
-    translated = translate_entries(path, which, data)
+    translated = translate_entries(path, camera_name, data)
     if translated is not None:
         return _read_opencv(spec, Entries(path, translated))
     if "frames" in data or "fl_x" in data or "camera_angle_x" in data:
-        return _read_nerfstudio(spec, which, data)
+        return _read_nerfstudio(spec, camera_name, data)
     cameras = {
         name: entry
         for name, entry in data.items()
         if isinstance(entry, dict) and "intrinsics" in entry
     }
     if cameras:
-        rest = {name: entry for name, entry in data.items() if name not in cameras}
-        camera = Entries(path, select_camera(path, which, cameras))
-        return _read_kalibr(spec, camera, Entries(path, rest).find_unread())
-    if which:
+        other_entries = {
+            name: entry for name, entry in data.items() if name not in cameras
+        }
+        camera = Entries(path, select_camera(path, camera_name, cameras))
+        return _read_kalibr(spec, camera, Entries(path, other_entries).find_unread())
+    if camera_name:
         raise FileFormatError(
-            f"{path}: expected several cameras, as {which!r} is asked for, got one; "
-            f"leave #{which} out"
+            f"{path}: expected several cameras, as {camera_name!r} is asked for, got one; "
+            f"leave #{camera_name} out"
         )
     if "intrinsics" in data and "camera_model" in data:
         return _read_kalibr(spec, Entries(path, data))
@@ -216,23 +221,30 @@ def read_camera(spec: str) -> CameraModel:
 
 
 def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return entries with those of camodocal's groups on the top level."""
+    """Return entries with those of camodocal's groups on the top level.
+
+    The numbers of its fisheye lens get the names that other programs give them.
+    """
     groups = {
-        name: group
+        name: data[name]
         for name in CAMODOCAL_GROUPS
-        if isinstance(group := data.get(name), dict)
+        if isinstance(data.get(name), dict)
     }
     entries = {name: value for name, value in data.items() if name not in groups}
     for group in groups.values():
-        names = CAMODOCAL_FISHEYE_KEYS if "mu" in group else {}
+        renamed_keys = CAMODOCAL_FISHEYE_KEYS if "mu" in group else {}
         entries |= {
-            names.get(str(key), str(key)): value for key, value in group.items()
+            renamed_keys.get(str(key), str(key)): value for key, value in group.items()
         }
     return entries
 
 
 def _parse_file(path: str, text: str) -> dict[str, Any]:
-    """Parse a camera file that is XML, JSON or YAML."""
+    """Parse a camera file that is XML, JSON or YAML.
+
+    Of a YAML file with several documents the first counts. Raises FileFormatError if it
+    is no mapping of names.
+    """
     if text.lstrip().startswith("<"):
         return _parse_xml(path, text)
     if path.lower().endswith(".json"):
@@ -254,7 +266,11 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
 
 
 def _parse_xml(path: str, text: str) -> dict[str, Any]:
-    """Parse a camera of OpenCV or Metashape in XML."""
+    """Parse a camera of OpenCV or Metashape in XML.
+
+    A matrix becomes the list of its words, an element with others in it a dictionary,
+    and any other its text. Raises FileFormatError for other XML.
+    """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise FileFormatError(
             f"{path}: declares a document type or entities, "
@@ -285,14 +301,18 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
 def _read_colmap(
     spec: str, path: str, camera_name: str, lines: Sequence[str]
 ) -> CameraModel:
-    """Return the model of a camera of COLMAP's cameras.txt."""
-    rows = {words[0]: words for line in lines if (words := line.split())}
-    if len(rows) < len(lines):
+    """Return the model of a camera of COLMAP's cameras.txt.
+
+    A line has CAMERA_ID, MODEL, WIDTH, HEIGHT and the model's parameters; one focal
+    length stands for both.
+    """
+    words_by_id = {line.split()[0]: line.split() for line in lines if line.split()}
+    if len(words_by_id) < len(lines):
         raise FileFormatError(
             f"{path}: expected each camera once, got one with the same number twice; "
             "correct the file"
         )
-    _, name, *values = select_camera(path, camera_name, rows)
+    _, name, *values = select_camera(path, camera_name, words_by_id)
     if name not in COLMAP_MODELS:
         raise FileFormatError(
             f"{path}: expected one of COLMAP's models {', '.join(COLMAP_MODELS)}, got "
@@ -322,7 +342,11 @@ def _read_colmap(
 def _read_nerfstudio(
     spec: str, camera_name: str, data: Mapping[str, Any]
 ) -> CameraModel:
-    """Return the model of a transforms.json, or of one of its frames."""
+    """Return the model of a transforms.json, or of one of its frames.
+
+    Entries of the frame win over those of all; the principal point is the center by
+    default.
+    """
     path = spec.partition("#")[0]
     frames = _list_frames(data)
     lens = _select_lens(path, camera_name, frames)
@@ -353,7 +377,10 @@ def _list_frames(data: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _select_other_entries(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the entries of frames that are about neither the lens nor the scene."""
+    """Return the entries of frames that are about neither the lens nor the scene.
+
+    Of entries of one name that of the last frame wins.
+    """
     other_entries = {}
     for frame in frames:
         for key, value in frame.items():
@@ -407,11 +434,11 @@ def _select_lens(
     lenses = [
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
     ] or [{}]
-    first: dict[str, Any] = lenses[0]
-    if not camera_name and all(lens == first for lens in lenses):
-        return first
-    by_index = {str(index): lens for index, lens in enumerate(lenses)}
-    selected: dict[str, Any] = select_camera(path, camera_name, by_index)
+    first_lens: dict[str, Any] = lenses[0]
+    if not camera_name and all(lens == first_lens for lens in lenses):
+        return first_lens
+    lens_by_index = {str(index): lens for index, lens in enumerate(lenses)}
+    selected: dict[str, Any] = select_camera(path, camera_name, lens_by_index)
     return selected
 
 
@@ -453,7 +480,12 @@ def _read_kalibr(
 
 
 def _read_opencv(spec: str, entries: Entries) -> CameraModel:
-    """Return the model of a camera of OpenCV or ROS."""
+    """Return the model of a camera of OpenCV or ROS.
+
+    Principal points count from the center of the first pixel. The calibration is of the
+    sensor's pixels, before ROS bins them: the model has the size after that. A tilted
+    sensor is rejected, a region of interest too.
+    """
     path = entries.path
     kind = _find_opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:
@@ -483,6 +515,7 @@ def _read_opencv(spec: str, entries: Entries) -> CameraModel:
         "cy": matrix[5],
     }
     y_binning, x_binning = _read_binning(entries)
+    # Pixels that fill no bin are cut off; the model is in fractions of what is left.
     binned_size = (height - height % y_binning, width - width % x_binning)
     model = make_camera_model(spec, kind, binned_size, numbers, 0.5)
     model = replace(model, size=(int(height // y_binning), int(width // x_binning)))
@@ -493,11 +526,8 @@ def _read_opencv(spec: str, entries: Entries) -> CameraModel:
 def _find_opencv_kind(path: str, entries: Entries) -> str:
     """Return the kind of model that a camera of OpenCV or ROS states."""
     keys = ("distortionmodel", "cameramodel", "modeltype")
-    kinds = {
-        _find_kind(path, model)
-        for key in keys
-        if (model := entries.get(key)) is not None
-    }
+    models = [entries.get(key) for key in keys]
+    kinds = {_find_kind(path, model) for model in models if model is not None}
     is_fisheye = not is_neutral(entries.get("fisheyemodel"))
     if len(kinds) > 1:
         raise FileFormatError(
@@ -508,7 +538,11 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
 
 
 def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
-    """Return the camera matrix, nine numbers row by row."""
+    """Return the camera matrix, nine numbers row by row.
+
+    It is made of fx, fy, cx and cy if only these are there; one that is written column
+    by column is transposed.
+    """
     if entries.get(*CAMERA_MATRIX_KEYS) is None and entries.get("fx") is not None:
         fx, fy, cx, cy = (entries.get_number(name) for name in ("fx", "fy", "cx", "cy"))
         matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
@@ -543,11 +577,11 @@ def _read_distortion(
         names: the coefficients in the order of the list.
         counts: the lengths that the list may have.
     """
-    listing = entries.get(*DISTORTION_KEYS)
-    if is_neutral(listing) and not isinstance(listing, Mapping):
+    distortion = entries.get(*DISTORTION_KEYS)
+    if is_neutral(distortion) and not isinstance(distortion, Mapping):
         coefficients = _read_coefficients(entries, names)
     else:
-        values = entries.parse_numbers("distortion_coefficients", listing, counts)
+        values = entries.parse_numbers("distortion_coefficients", distortion, counts)
         coefficients = dict(zip(names, values, strict=False))
     model = entries.get("distortionmodel")
     is_none = isinstance(model, str) and model.strip().lower() == "none"
@@ -560,15 +594,17 @@ def _read_distortion(
 
 
 def _read_coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
+    """Return entries of single coefficients; 0 for those that are missing."""
     return {name: entries.get_number(name, 0.0) for name in names}
 
 
 def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
-    """Return the names of matrices of rectified images that differ from the
-    camera's.
+    """Return the names of matrices of rectified images that differ from the camera's.
+
+    Unrectified, the rotation is 1 and the projection is the camera matrix.
     """
     fx, skew, cx, _, fy, cy = matrix[:6]
-    differing = []
+    differing_names = []
     for name, short_name, expected in (
         ("rectification_matrix", "r", [1.0, 0, 0, 0, 1, 0, 0, 0, 1]),
         ("projection_matrix", "p", [fx, skew, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
@@ -581,8 +617,8 @@ def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
             abs(a - b) > 1e-6 * max(1.0, abs(b))
             for a, b in zip(numbers, expected, strict=True)
         ):
-            differing.append(name)
-    return differing
+            differing_names.append(name)
+    return differing_names
 
 
 def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
@@ -634,6 +670,7 @@ def _read_binning(entries: Entries) -> tuple[float, float]:
 
     The calibration is that of the pixels before.
     """
+    # ROS writes 0 for no binning, as for 1.
     y_binning = entries.get_number("binning_y", 1.0) or 1.0
     x_binning = entries.get_number("binning_x", 1.0) or 1.0
     for name, pixels in (("binning_y", y_binning), ("binning_x", x_binning)):

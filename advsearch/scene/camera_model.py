@@ -77,9 +77,11 @@ class CameraModel:
 
     @property
     def values(self) -> dict[str, float]:
+        """The numbers by name: `LINEAR_PARAMETERS` and `COEFFICIENTS`."""
         return dict(zip(NUMBER_NAMES, self.numbers, strict=True))
 
     def with_numbers(self, numbers: Tensor) -> CameraModel:
+        """Return the model with other numbers (17,), in the order of `NUMBER_NAMES`."""
         return replace(self, numbers=tuple(numbers.double().tolist()))
 
     def check_no_fov(self, setting_names: Iterable[str]) -> None:
@@ -121,9 +123,10 @@ class CameraModel:
     def _project_fisheye(
         self, x: Tensor, y: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return distorted tangents (N, 2) of points, and which are visible."""
+        """Return distorted points (N, 2) in focal lengths, and which are visible."""
         distance = torch.hypot(x, y)
         angle = torch.atan2(distance, z)
+        # 1e-300: on the axis x and y are 0 whatever the scale
         scale = self._distort_radius(angle) / distance.clamp_min(1e-300)
         distorted = torch.stack([x * scale, y * scale], dim=-1)
         return distorted, angle <= self._max_visible
@@ -131,7 +134,8 @@ class CameraModel:
     def _project_perspective(
         self, x: Tensor, y: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return distorted tangents (N, 2) of points, and which are visible."""
+        """Return distorted points (N, 2) in focal lengths, and which are visible."""
+        # A point behind the lens is not visible; a depth of 1 keeps it finite.
         depth = torch.where(z > 0.0, z, torch.ones_like(z))
         undistorted = torch.stack([x / depth, y / depth], dim=-1)
         radius = undistorted.norm(dim=-1)
@@ -143,7 +147,8 @@ class CameraModel:
 
         They are found by Newton's method, kept within bounds by bisection, and checked:
         coordinates whose inversion has not converged to the branch that the axis is on
-        are outside of the view.
+        are outside of the view. The radial distortion is inverted first; if there is
+        decentering too, that is where an inversion in two dimensions starts.
 
         Returns:
             Directions (N, 3) float64, unit vectors for a fisheye and a panorama, else
@@ -152,13 +157,13 @@ class CameraModel:
         """
         u, v = image_points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
-            return _panorama_directions(u, v), torch.ones_like(u)
+            return _compute_panorama_directions(u, v), torch.ones_like(u)
         distorted = self._to_distorted(u, v)
         radius = distorted.norm(dim=-1)
-        direction_2d = distorted / radius.clamp_min(1e-300)[..., None]
-        bound = min(self._max_visible, MAX_RAY_TANGENT)
+        radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
+        max_visible = min(self._max_visible, MAX_RAY_TANGENT)
         max_radius = float(
-            self._distort_radius(torch.tensor([bound], dtype=torch.float64))
+            self._distort_radius(torch.tensor([max_visible], dtype=torch.float64))
         )
         if self.kind == FISHEYE:
             # Beyond its circle too, for the edge of the view.
@@ -166,15 +171,16 @@ class CameraModel:
                 radius, min(self.fold_angle, math.pi)
             )
             directions = torch.cat(
-                [direction_2d * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
+                [radial_direction * angle.sin()[..., None], angle.cos()[..., None]],
+                dim=-1,
             )
             return directions, _clip_margin(max_radius - radius, converged)
-        start, converged = self._invert_radial(radius, bound)
-        undistorted = direction_2d * start[..., None]
+        undistorted_radius, converged = self._invert_radial(radius, max_visible)
+        undistorted = radial_direction * undistorted_radius[..., None]
         has_decentering = any(self.numbers[NUMBER_NAMES.index("p1") :])
         if has_decentering:
             undistorted, converged = self._invert_distortion(
-                undistorted, distorted, bound
+                undistorted, distorted, max_visible
             )
             radius = (distorted - self._compute_decentering(undistorted)).norm(dim=-1)
         directions = torch.cat(
@@ -194,7 +200,7 @@ class CameraModel:
         """Return rays of image coordinates (N, 2) in the axes of Mitsuba's cameras.
 
         The result is (N, 4) float32: directions to the left, up and ahead, and the
-        margin of `rays`, positive inside the view.
+        margin of `compute_rays`, positive inside the view.
         """
         directions, margin = self.compute_rays(image_points)
         return torch.cat(
@@ -202,7 +208,7 @@ class CameraModel:
         ).float()
 
     def _invert_radial(self, target: Tensor, max_value: float) -> tuple[Tensor, Tensor]:
-        """Solve radial(x) = wanted for x within [0, high], where radial grows.
+        """Solve radial(x) = target for x within [0, max_value], where radial grows.
 
         Newton's method, with bisection if a step leaves the bracket.
 
@@ -213,6 +219,7 @@ class CameraModel:
         Returns:
             The solutions (N,), and which of them have converged.
         """
+        # A bracket as small as it can be, for few bisections.
         bound = min(1.0, max_value)
         while bound < max_value and float(
             self._distort_radius(torch.tensor(bound, dtype=torch.float64))
@@ -225,22 +232,25 @@ class CameraModel:
             values, (slope,) = _evaluate_with_jacobian(
                 lambda radii: self._distort_radius(radii)[..., None], radius
             )
-            error = values[..., 0] - target
-            is_solved = (error.abs() <= TOLERANCE) | (upper - lower <= TOLERANCE)
+            residual = values[..., 0] - target
+            is_solved = (residual.abs() <= TOLERANCE) | (upper - lower <= TOLERANCE)
             if bool(is_solved.all()):
                 break
-            upper = torch.where(error > 0.0, radius, upper)
-            lower = torch.where(error > 0.0, lower, radius)
-            step = radius - error / slope
-            is_within = (step > lower) & (step < upper)
-            radius = torch.where(is_within, step, (lower + upper) / 2.0)
-        error = (self._distort_radius(radius) - target).abs()
-        return radius, error <= 1e3 * TOLERANCE * (1.0 + target)
+            upper = torch.where(residual > 0.0, radius, upper)
+            lower = torch.where(residual > 0.0, lower, radius)
+            newton_radius = radius - residual / slope
+            is_within = (newton_radius > lower) & (newton_radius < upper)
+            radius = torch.where(is_within, newton_radius, (lower + upper) / 2.0)
+        residual = (self._distort_radius(radius) - target).abs()
+        return radius, residual <= 1e3 * TOLERANCE * (1.0 + target)
 
     def _invert_distortion(
         self, undistorted: Tensor, distorted: Tensor, max_radius: float
     ) -> tuple[Tensor, Tensor]:
         """Solve distort(x) = distorted by Newton's method in two dimensions.
+
+        A step that leaves the circle of `max_radius` ends at its border, and one that
+        is not finite is not taken.
 
         Args:
             undistorted: (N, 2) where it starts.
@@ -252,12 +262,12 @@ class CameraModel:
         """
         converged = torch.zeros_like(undistorted[..., 0], dtype=torch.bool)
         for _ in range(MAX_STEPS // 3):
-            values, rows = _evaluate_with_jacobian(self._distort, undistorted)
-            error = values - distorted
-            step, determinant = _solve_two_by_two(rows, error)
+            values, jacobian_rows = _evaluate_with_jacobian(self._distort, undistorted)
+            residual = values - distorted
+            step, determinant = _solve_two_by_two(jacobian_rows, residual)
             is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < max_radius)
             converged = is_inside & (
-                error.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
+                residual.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
             )
             if bool(converged.all()):
                 break
@@ -288,6 +298,7 @@ class CameraModel:
         It is infinite if it never does. Beyond it two directions have one image point,
         so that no image tells them apart.
         """
+        # The numerator of the derivative of radial(r), as a polynomial in r^2.
         numerator, denominator = self._polynomials
         double_square = Polynomial([0.0, 2.0])  # 2 r^2
         slope = (
@@ -307,11 +318,12 @@ class CameraModel:
         if self.kind == FISHEYE:
             return min(self.fold_angle, math.radians(self.max_angle), math.pi)
         if self.fold_angle < math.pi / 2.0:
+            # just before the fold, where the slope is not zero yet
             return math.tan(self.fold_angle) * (1.0 - 1e-9)
         return math.inf
 
-    def _radial_scale(self, square: Tensor) -> Tensor:
-        """Return radial(r) / r at r^2."""
+    def _compute_radial_scale(self, square: Tensor) -> Tensor:
+        """Return radial(r) / r at r^2, of any shape."""
         numerator, denominator = self._polynomials
         value = _evaluate_polynomial(numerator, square)
         if len(denominator) == 1:
@@ -319,12 +331,12 @@ class CameraModel:
         return value / _evaluate_polynomial(denominator, square)
 
     def _distort_radius(self, radius: Tensor) -> Tensor:
-        """Return the radial distortion of radii."""
-        return radius * self._radial_scale(radius * radius)
+        """Return the radial distortion of radii, or of angles of a fisheye."""
+        return radius * self._compute_radial_scale(radius * radius)
 
     def _distort(self, undistorted: Tensor) -> Tensor:
         """Return distorted points of undistorted ones (N, 2)."""
-        scale = self._radial_scale(undistorted.square().sum(dim=-1))
+        scale = self._compute_radial_scale(undistorted.square().sum(dim=-1))
         return undistorted * scale[..., None] + self._compute_decentering(undistorted)
 
     def _compute_decentering(self, undistorted: Tensor) -> Tensor:
@@ -346,21 +358,25 @@ class CameraModel:
     def visible_tangents(self) -> tuple[float, float]:
         """Half the sides, as tangents, of a rectangle around the axis inside the image.
 
-        The rectangle is completely visible.
+        It is the largest fraction, in steps of 2 %, of the rectangle of
+        `_compute_edge_tangents` whose border is completely visible; 2 % of it if none
+        is.
         """
         edges = self._compute_edge_tangents()
         grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
-        edge = torch.ones_like(grid)
-        rim = torch.stack(
+        ones = torch.ones_like(grid)
+        border = torch.stack(
             [
-                torch.cat([grid, grid, edge, -edge]),
-                torch.cat([edge, -edge, grid, grid]),
+                torch.cat([grid, grid, ones, -ones]),
+                torch.cat([ones, -ones, grid, grid]),
             ],
             dim=-1,
         )
-        rim = rim * torch.tensor(edges, dtype=torch.float64)
+        border = border * torch.tensor(edges, dtype=torch.float64)
         for fraction in torch.linspace(1.0, 0.02, 50).tolist():
-            points = torch.cat([fraction * rim, torch.ones_like(rim[:, :1])], dim=-1)
+            points = torch.cat(
+                [fraction * border, torch.ones_like(border[:, :1])], dim=-1
+            )
             coordinates, is_visible = self.project(points)
             is_in_image = (coordinates >= -1e-6).all(dim=-1) & (
                 coordinates <= 1.0 + 1e-6
@@ -372,35 +388,39 @@ class CameraModel:
     def _compute_edge_tangents(self) -> list[float]:
         """Return the tangents at which the image ends along x and along y.
 
-        Along the row and the column through the axis, the nearer of both edges counts.
+        Along the row and the column through the axis, the nearer of both edges counts,
+        at most `MAX_TANGENT`; an edge beyond the view counts as where the view ends.
         """
         center, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
-        edges = []
+        edge_tangents = []
         for axis in (0, 1):
-            line = center.repeat(512, 1)
-            tangents = []
+            line_points = center.repeat(512, 1)
+            border_tangents = []
             for border in (0.0, 1.0):
-                line[:, axis] = torch.linspace(
+                line_points[:, axis] = torch.linspace(
                     float(center[0, axis]), border, 512, dtype=torch.float64
                 )
-                directions, margin = self.compute_rays(line)
+                directions, margin = self.compute_rays(line_points)
+                # 0.1: rays almost aside, at more than about 84 degrees, do not count
                 is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
-                tangent = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
-                tangents.append(
+                line_tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(
+                    0.1
+                )
+                border_tangents.append(
                     float(
                         torch.where(
-                            is_visible, tangent, torch.zeros_like(tangent)
+                            is_visible, line_tangents, torch.zeros_like(line_tangents)
                         ).max()
                     )
                 )
-            edges.append(max(1e-3, min(MAX_TANGENT, *tangents)))
-        return edges
+            edge_tangents.append(max(1e-3, min(MAX_TANGENT, *border_tangents)))
+        return edge_tangents
 
     @cached_property
     def black_fraction(self) -> float:
         """Fraction of the image in which nothing is visible."""
-        step = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
-        grid = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1)
+        centers = (torch.arange(64, dtype=torch.float64) + 0.5) / 64
+        grid = torch.stack(torch.meshgrid(centers, centers, indexing="xy"), dim=-1)
         _, margin = self.compute_rays(grid.reshape(-1, 2))
         return float((margin <= 0.0).double().mean())
 
@@ -422,21 +442,24 @@ class CameraModel:
         return (*self.reading_notes, sentence)
 
     def describe_scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
-        """Return a note if an image has another size (height, width) than the model."""
+        """Return a note if an image has another size (height, width) than the model.
+
+        It says so too if the sizes differ in shape, by more than half a percent.
+        """
         if self.size is None or self.size == resolution:
             return ()
         (model_height, model_width) = self.size
         (height, width) = resolution
         stretch = model_width * height / (model_height * width)
-        stretched = ""
+        stretch_text = ""
         if abs(stretch - 1.0) > 0.005:
-            stretched = (
+            stretch_text = (
                 f", which makes things {stretch:.3g} times as high for their width"
             )
         return (
             f"{self.name} is for {model_width} x {model_height} pixels (width x "
             "height): its focal lengths and its principal point "
-            f"are scaled to {width} x {height}{stretched}.",
+            f"are scaled to {width} x {height}{stretch_text}.",
         )
 
 
@@ -448,13 +471,22 @@ def make_pinhole(fov: float, aspect: float) -> CameraModel:
         aspect: width divided by height.
     """
     focal = 0.5 / math.tan(math.radians(fov) / 2.0)
-    linear = (focal * max(1.0, 1.0 / aspect), focal * max(1.0, aspect), 0.5, 0.5, 0.0)
-    return CameraModel(BROWN_CONRADY, (*linear, *[0.0] * len(COEFFICIENTS)))
+    # Lengths along x are in image widths, those along y in image heights.
+    fx = focal * max(1.0, 1.0 / aspect)
+    fy = focal * max(1.0, aspect)
+    cx = cy = 0.5
+    skew = 0.0
+    no_distortion = [0.0] * len(COEFFICIENTS)
+    return CameraModel(BROWN_CONRADY, (fx, fy, cx, cy, skew, *no_distortion))
 
 
 def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
-    """Return the models that need no file, by name, for an aspect ratio (w / h)."""
-    focal = 1.0 / math.pi
+    """Return the models that need no file, by name, for an aspect ratio (w / h).
+
+    The fisheye has a circle of 180 degrees that fills the smaller side; the panorama
+    has all directions.
+    """
+    focal = 1.0 / math.pi  # an angle of pi / 2 reaches half of the side
     no_distortion = [0.0] * len(COEFFICIENTS)
     fisheye = (
         focal * min(1.0, 1.0 / aspect),
@@ -476,7 +508,7 @@ def _solve_two_by_two(rows: Sequence[Tensor], right: Tensor) -> tuple[Tensor, Te
 
     Args:
         rows: the two rows (N, 2) of the matrices.
-        right: (N, 2), their right sides.
+        right: (N, 2), their right-hand sides.
 
     Returns:
         The solutions (N, 2), large where a matrix is nearly singular; and the
@@ -495,7 +527,10 @@ def _solve_two_by_two(rows: Sequence[Tensor], right: Tensor) -> tuple[Tensor, Te
 
 
 def _project_to_panorama(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """Return image coordinates (N, 2) of points in an equirectangular image."""
+    """Return image coordinates (N, 2) of points in an equirectangular image.
+
+    Coordinates (N,) are to the right, down and ahead; the middle of the image is ahead.
+    """
     longitude = torch.atan2(x, z)
     latitude = torch.atan2(y, torch.hypot(x, z))
     column = 0.5 + longitude / (2.0 * torch.pi)
@@ -503,7 +538,7 @@ def _project_to_panorama(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return torch.stack([column, row], dim=-1)
 
 
-def _panorama_directions(u: Tensor, v: Tensor) -> Tensor:
+def _compute_panorama_directions(u: Tensor, v: Tensor) -> Tensor:
     """Return unit vectors (N, 3) at image coordinates of an equirectangular image."""
     longitude = (u - 0.5) * (2.0 * torch.pi)
     latitude = (v - 0.5) * torch.pi
@@ -526,6 +561,10 @@ def _evaluate_with_jacobian(
 ) -> tuple[Tensor, list[Tensor]]:
     """Evaluate a function that maps each of N points separately, and differentiate it.
 
+    Args:
+        function: from points to values (N, k).
+        at: the points, (N, ...).
+
     Returns:
         The values (N, k), and the derivatives of each of the k by the points.
     """
@@ -540,7 +579,10 @@ def _evaluate_with_jacobian(
 
 
 def _clip_margin(margin: Tensor, converged: Tensor) -> Tensor:
-    """Return margins clipped to 1, below zero if an inversion has not converged."""
+    """Return margins clipped to 1, below zero if an inversion has not converged.
+
+    A margin that is negative already stays, so that it changes its sign continuously.
+    """
     return torch.where(
         converged | (margin <= 0.0), margin, torch.full_like(margin, -1e-6)
     ).clamp(-1.0, 1.0)

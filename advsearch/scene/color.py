@@ -24,12 +24,13 @@ def srgb_to_linear(display: Values) -> Values:
 
     Any shape, float32; differentiable everywhere.
     """
-    low_end = display <= 0.04045
-    low = display / 12.92
+    is_straight = display <= 0.04045
+    straight = display / 12.92
+    # Clipped, so that the side that is not taken has a finite derivative.
     curve = ((display.clip(0.04045, None) + 0.055) / 1.055) ** 2.4
     if isinstance(display, np.ndarray):
-        return np.where(low_end, low, curve).astype(np.float32)
-    return low.where(low_end, curve)
+        return np.where(is_straight, straight, curve).astype(np.float32)
+    return straight.where(is_straight, curve)
 
 
 def linear_to_srgb(linear: Values) -> Values:
@@ -38,12 +39,12 @@ def linear_to_srgb(linear: Values) -> Values:
     Any shape, float32; differentiable.
     """
     clipped = linear.clip(0.0, 1.0)
-    low_end = clipped <= LINEAR_LIMIT
-    low = clipped * 12.92
+    is_straight = clipped <= LINEAR_LIMIT
+    straight = clipped * 12.92
     curve = 1.055 * clipped.clip(LINEAR_LIMIT, None) ** (1.0 / 2.4) - 0.055
     if isinstance(linear, np.ndarray):
-        return np.where(low_end, low, curve).astype(np.float32)
-    return low.where(low_end, curve)
+        return np.where(is_straight, straight, curve).astype(np.float32)
+    return straight.where(is_straight, curve)
 
 
 def to_uint8(display: Tensor) -> Tensor:

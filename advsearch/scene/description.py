@@ -16,6 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy.typing as npt
 import torch
 
 from advsearch.errors import InputError, UnknownNameError
@@ -28,6 +29,16 @@ from advsearch.scene.assets import (
     ObjectAsset,
     describe_size_doubts,
     with_size,
+)
+from advsearch.scene.backdrop import (
+    PLANE_SETTINGS,
+    PLANE_SIZE,
+    BackdropPhotograph,
+    compute_photograph_gain,
+    compute_view_settings,
+    make_matrix_camera,
+    read_backdrop,
+    with_front,
 )
 from advsearch.scene.camera_entries import (
     MAX_TABLETOP_SIZE,
@@ -120,8 +131,11 @@ class SceneDescription:
     # beside object, environment and ground: further meshes, lamps, haze
     parts: tuple[ScenePart, ...] = ()
     thin_lens: bool = False  # the camera has an aperture and a focus distance
-    # the environment may be hidden behind a plain colour (`backdrop.color`)
+    # the environment may be hidden behind a plain colour or a photograph
+    # (`backdrop.color`)
     backdrop: bool = False
+    # that it is rendered into; None for none
+    backdrop_photograph: BackdropPhotograph | None = None
     aspect: float = 1.0  # width over height of the picture
     # those with poses of their own, by name
     cameras: Mapping[str, PosedCamera] = field(default_factory=dict)
@@ -176,6 +190,93 @@ class SceneDescription:
     def without_ground(self) -> SceneDescription:
         """Return the scene without a table, a road or a place."""
         return with_requested_ground(self.with_values(ground__size=0.0))
+
+    def with_backdrop(
+        self,
+        photograph: str | Path | BackdropPhotograph,
+        occluder: str | Path | None = None,
+    ) -> SceneDescription:
+        """Return the scene as it is rendered into a photograph.
+
+        The camera of the scene is the one that took it. It hides the environment, which
+        keeps lighting the object, and the ground is a plane that takes the shadow.
+
+        Args:
+            photograph: a picture file; with the part to use behind its name,
+                ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels from the top left corner.
+            occluder: a mask of the photograph's size, white where it shows what is
+                before the object.
+
+        Raises:
+            FileFormatError: the file can not be used.
+            InputError: the part leaves the photograph; a ground was requested, there
+                are several cameras, or drops on the lens.
+        """
+        if not isinstance(photograph, BackdropPhotograph):
+            photograph = read_backdrop(photograph)
+        if occluder is not None:
+            photograph = with_front(photograph, occluder)
+        others = sorted(
+            name
+            for name in self.requested - PLANE_SETTINGS
+            if name.startswith("ground.")
+        )
+        if others:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `set` {others[0]} contradict each "
+                "other: the ground of a photograph is a plane that takes the shadow, "
+                f"with {', '.join(sorted(PLANE_SETTINGS))}; leave one of the two out"
+            )
+        if self.rig:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `camera={self.rig_spec}` contradict "
+                "each other: a photograph was taken by one camera; name one of them, "
+                f"{self.rig_spec}#NAME"
+            )
+        if self.number("camera.drops") > 0.0:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
+                "other: drops would show the photograph; leave one of the two out"
+            )
+        values = dict(self.values)
+        if "ground.size" not in self.requested:
+            values["ground.size"] = PLANE_SIZE
+        scene = replace(
+            self, backdrop=True, backdrop_photograph=photograph, values=values
+        )
+        return with_requested_ground(scene)
+
+    def with_measured_view(
+        self,
+        camera_matrix: npt.ArrayLike,
+        object_to_camera: npt.ArrayLike,
+        up: npt.ArrayLike | None = None,
+    ) -> SceneDescription:
+        """Return the scene as the camera of its photograph was measured to see it.
+
+        Args:
+            camera_matrix: intrinsics (3, 3) of the full photograph, in pixels, as
+                OpenCV has them.
+            object_to_camera, up: as for `backdrop.compute_view_settings`.
+
+        Raises:
+            InputError: it is rendered into no photograph; or as for
+                `backdrop.compute_view_settings`.
+        """
+        if self.backdrop_photograph is None:
+            raise InputError(
+                "camera_matrix: is that of a photograph, and there is none; give a "
+                "`backdrop`"
+            )
+        model = make_matrix_camera(camera_matrix, self.backdrop_photograph.full_size)
+        measured = compute_view_settings(self.object, object_to_camera, up)
+        return replace(
+            self,
+            camera=ORBIT_CAMERA,
+            camera_model=model,
+            values={**self.values, **measured},
+            requested=self.requested | set(measured),
+        )
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:
@@ -377,8 +478,8 @@ class SceneDescription:
             carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
         return replace(
             part,
-            to_world=geometry.compute_seated_pose(
-                carrier, torch.from_numpy(part.seat)
+            to_world=geometry.compute_carried_pose(
+                carrier, torch.from_numpy(part.pose_on_carrier)
             ).numpy(),
         )
 
@@ -581,7 +682,9 @@ class SceneDescription:
         """
         stops = self.values.get("camera.ev")
         unit = None if self.environment is None else self.environment.candelas
-        if stops is None:
+        if stops is None and self.backdrop_photograph is not None:
+            exposure = compute_photograph_gain(self, self.backdrop_photograph)
+        elif stops is None:
             exposure = compute_metered_gain(self) if self.metered else 1.0
         elif unit is None:
             raise InputError(

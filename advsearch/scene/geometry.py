@@ -37,7 +37,9 @@ from advsearch.scene.rigged import PERSON_PARAMETERS as PERSON_PARAMETERS
 from advsearch.scene.rigged import TIME as TIME
 from advsearch.scene.rigged import find_rig_parameter as find_rig_parameter
 from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
-from advsearch.scene.skeleton import rotation_entries as rotation_entries
+from advsearch.scene.skeleton import (
+    compute_rotation_entries as compute_rotation_entries,
+)
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -56,7 +58,10 @@ DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 @dataclass(frozen=True)
 class Frame:
-    """What the picture shows, as tangents: the ranges to the right and upwards."""
+    """What the picture shows, as tangents: the ranges to the right and upwards.
+
+    A direction is (x, y, 1): x to the right, y up, and 1 ahead.
+    """
 
     left: float
     right: float
@@ -72,15 +77,20 @@ class Frame:
         Args:
             fov: field of view along the larger side, degrees.
             aspect: width over height.
-            shift: of the image to the right in its widths and downwards in its
-                heights: what it shows moves the other way.
+            shift: of the image to the right in its widths and downwards in its heights:
+                what it shows moves the other way.
         """
-        larger = math.tan(math.radians(fov) / 2.0)
-        x = larger * min(1.0, aspect)
-        y = larger * min(1.0, 1.0 / aspect)
-        right = 2.0 * x * shift[0]
-        down = 2.0 * y * shift[1]
-        return Frame(-x + right, x + right, -y - down, y - down)
+        half_tangent = math.tan(math.radians(fov) / 2.0)
+        half_width = half_tangent * min(1.0, aspect)
+        half_height = half_tangent * min(1.0, 1.0 / aspect)
+        right_shift = 2.0 * half_width * shift[0]
+        down_shift = 2.0 * half_height * shift[1]
+        return Frame(
+            -half_width + right_shift,
+            half_width + right_shift,
+            -half_height - down_shift,
+            half_height - down_shift,
+        )
 
     def corners(self) -> Float64Array:
         """Return unit directions (4, 3) to the corners."""
@@ -113,9 +123,11 @@ def _compute_edge_tangents(
 def compute_framing_distance(
     description: SceneDescription, fov: Tensor, aspect: float
 ) -> Tensor:
-    """Return the distance () of the camera to the middle of a scene's object.
+    """Return the distance () of the camera to the middle of a scene's object; see
+    above.
 
-    In object sizes, float64; differentiable in the field of view.
+    In object sizes, float64; differentiable in the field of view. With a lens of the
+    user's, the field of view does not count.
 
     Args:
         description: the scene.
@@ -126,17 +138,19 @@ def compute_framing_distance(
         description.object.mesh.vertices.astype(np.float64)
         - compute_center(description)
     ).to(fov.device)
-    edge = _compute_edge_tangents(description, fov, aspect)
+    edge_tangents = _compute_edge_tangents(description, fov, aspect)
     azimuth, elevation, roll = (
         float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW
     )
     axes = torch.from_numpy(compute_camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
-    (half_width, half_height) = edge * FRAME_FILL
+    (half_width, half_height) = edge_tangents * FRAME_FILL
     from_default_view = (
         outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
     ).max()
-    from_all_around = _framing_distance_all_around(offsets, elevation, edge)
+    from_all_around = _compute_framing_distance_all_around(
+        offsets, elevation, edge_tangents
+    )
     return torch.maximum(from_default_view, from_all_around).clamp_min(
         float(offsets.norm(dim=1).max()) + MIN_SPHERE_DISTANCE
     )
@@ -153,16 +167,18 @@ def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float6
     azimuth = math.radians(azimuth)
     elevation = math.radians(elevation)
     roll = math.radians(roll)
-    level = math.cos(elevation)
-    up = math.sin(elevation)
-    outwards = np.array([level * math.cos(azimuth), level * math.sin(azimuth), up])
+    horizontal = math.cos(elevation)
+    vertical = math.sin(elevation)
+    outwards = np.array(
+        [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), vertical]
+    )
     left = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
     upright = np.cross(-outwards, left)
-    turned = (
+    rolled_axes = (
         math.cos(roll) * left + math.sin(roll) * upright,
         math.cos(roll) * upright - math.sin(roll) * left,
     )
-    return np.stack([*turned, outwards])
+    return np.stack([*rolled_axes, outwards])
 
 
 def compute_center(description: SceneDescription) -> Float64Array:
@@ -174,7 +190,7 @@ def compute_center(description: SceneDescription) -> Float64Array:
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
 
 
-def _framing_distance_all_around(
+def _compute_framing_distance_all_around(
     offsets: Tensor, elevation: float, tangents: Tensor
 ) -> Tensor:
     """Return the distance at which every vertex is in the image from every azimuth.
@@ -182,6 +198,11 @@ def _framing_distance_all_around(
     Seen from all around, a vertex runs through a circle of radius rho at height z: what
     it needs is a sine of the azimuth plus a constant for each edge of the image, whose
     largest value is known in closed form.
+
+    Args:
+        offsets: (V, 3) of the vertices from the middle of the object.
+        elevation: of the camera, degrees.
+        tangents: (2,) of the angles to the edges of the image.
     """
     rho = offsets[:, :2].norm(dim=1)
     z = offsets[:, 2]
@@ -189,14 +210,14 @@ def _framing_distance_all_around(
     sine = math.sin(math.radians(elevation))
     inverse_width = 1.0 / tangents[0]
     inverse_height = 1.0 / tangents[1]
-    aside = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
-    above = rho * (cosine - sine * inverse_height).abs() + z * (
+    for_sides = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
+    for_top = rho * (cosine - sine * inverse_height).abs() + z * (
         sine + cosine * inverse_height
     )
-    below = rho * (cosine + sine * inverse_height).abs() + z * (
+    for_bottom = rho * (cosine + sine * inverse_height).abs() + z * (
         sine - cosine * inverse_height
     )
-    return torch.stack([aside.max(), above.max(), below.max()]).max()
+    return torch.stack([for_sides.max(), for_top.max(), for_bottom.max()]).max()
 
 
 def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
@@ -212,49 +233,50 @@ def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
 
 
 def make_affine(linear: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
-    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,).
+    """Return the pose (4, 4) of `v -> linear @ v + translation`.
 
-    Differentiable.
+    Differentiable in the matrix (3, 3) and the translation (3,).
     """
     top = torch.cat([linear, translation[:, None]], dim=1)
     return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])
 
 
 def object_to_world(description: SceneDescription) -> Float64Array:
-    """Return the object's pose.
+    """Return the object's pose (4, 4).
 
     Scale and rotate about the middle of its bounding box, keep it on the ground, shift.
     "On the ground" means that the lowest vertex is at z = 0 before `pose.z` is added,
     whatever the rotation.
     """
     vertices = description.object.mesh.vertices.astype(np.float64)
-    pose = {
+    parameters = {
         parameter.name: description.number(f"pose.{parameter.name}")
         for parameter in POSE
     }
-    return _compute_pose(vertices, 0.0, pose)
+    return _compute_pose(vertices, 0.0, parameters)
 
 
 def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
     """Return a mesh around the object as the settings have it.
 
     It is posed about its own middle, where it stands, by the settings `pose:NAME.yaw`
-    and so on.
+    and so on, and stays on the height that it stands on; without any it stays as it is.
+    Its material is set by `material:NAME.roughness` and so on.
     """
-    pose = {
-        parameter.name: value
-        for parameter in POSE
-        if (value := values.get(f"pose:{part.name}.{parameter.name}")) is not None
-    }
-    if pose:
+    parameters = {}
+    for parameter in POSE:
+        value = values.get(f"pose:{part.name}.{parameter.name}")
+        if value is not None:
+            parameters[parameter.name] = value
+    if parameters:
         positions = compute_base_vertices(part)
-        pose = {
+        parameters = {
             **{parameter.name: float(parameter.default) for parameter in POSE},
-            **pose,
+            **parameters,
         }
         part = replace(
             part,
-            to_world=_compute_pose(positions, float(positions[:, 2].min()), pose)
+            to_world=_compute_pose(positions, float(positions[:, 2].min()), parameters)
             @ part.to_world,
         )
     return replace(
@@ -271,20 +293,24 @@ def compute_base_vertices(part: MeshPart) -> Float64Array:
 
 
 def _compute_pose(
-    positions: Float64Array, floor: float, pose: Mapping[str, float]
+    positions: Float64Array, floor: float, parameters: Mapping[str, float]
 ) -> Float64Array:
     """Return the pose (4, 4) by parameters of `settings.POSE`.
 
     Scale and rotate positions (V, 3) about the middle of their bounding box, put the
-    lowest at `floor`, and shift.
+    lowest at `floor`, and shift. The middle stays above the same point before the
+    shift.
     """
-    middle = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
-    linear = pose["scale"] * make_rotation(pose["yaw"], pose["pitch"], pose["roll"])
-    lowest = float(((positions - middle) @ linear.T)[:, 2].min())
-    translation = (
-        np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
+    center = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
+    linear = parameters["scale"] * make_rotation(
+        parameters["yaw"], parameters["pitch"], parameters["roll"]
     )
-    translation[:2] += middle[:2]
+    lowest = float(((positions - center) @ linear.T)[:, 2].min())
+    translation = (
+        np.array([parameters["x"], parameters["y"], floor + parameters["z"] - lowest])
+        - linear @ center
+    )
+    translation[:2] += center[:2]
     return make_pose(linear, translation)
 
 
@@ -296,7 +322,8 @@ def camera_to_world(
     By default it is on an orbit around the middle of the object, looking at it. The
     camera looks along its own +z with +y up and +x to the left, as Mitsuba's sensors
     do. It frames the object in its default pose, so that a shifted or scaled object
-    moves in the image.
+    moves in the image. `camera.distance` wins over framing, and `camera.height` over
+    `camera.elevation`: the camera stays at its distance, no steeper than 89 degrees.
 
     Args:
         description: the scene.
@@ -306,7 +333,8 @@ def camera_to_world(
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
     get_number = description.number
-    if (requested_distance := description.values["camera.distance"]) is not None:
+    requested_distance = description.values["camera.distance"]
+    if requested_distance is not None:
         distance = requested_distance / description.metres
     else:
         distance = float(
@@ -319,14 +347,10 @@ def camera_to_world(
     elevation = get_number("camera.elevation")
     height = description.values.get("camera.height")
     if height is not None:
-        height_above_center = (
-            height / description.metres - float(compute_center(description)[2])
-        ) / distance
-        elevation = math.degrees(
-            math.asin(
-                min(max(height_above_center, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
-            )
-        )
+        center_height = float(compute_center(description)[2])
+        sine = (height / description.metres - center_height) / distance
+        sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
+        elevation = math.degrees(math.asin(sine))
     azimuth = description.azimuth_zero + get_number("camera.azimuth")
     axes = compute_camera_axes(azimuth, elevation, get_number("camera.roll"))
     return make_pose(
@@ -343,25 +367,26 @@ def project_points(
 ) -> tuple[Tensor, Tensor]:
     """Return where the camera of scene inputs sees points.
 
+    By its lens if it has one; otherwise it is a pinhole, with the field of view and the
+    shift of the inputs, or the scene's field of view.
+
     Args:
         description: the scene.
         inputs: of the scene.
-        points: (N, 3) float64 in the camera's coordinates.
+        points: (N, 3) float64 in the camera's coordinates: left, up and ahead.
         size: height and width of the image.
 
     Returns:
         (N, 2) pixels to the right and down from the middle of the image; (N,) bool,
-            which are before the camera.
+        which are before the camera.
     """
     image_size = torch.tensor(size[::-1], dtype=torch.float64)
     # to the right, down and ahead
     points = points * torch.tensor([-1.0, -1.0, 1.0]).to(points)
-    if (model := description.camera_model) is not None:
-        model = (
-            model.with_numbers(inputs["camera.lens"].detach())
-            if "camera.lens" in inputs
-            else model
-        )
+    model = description.camera_model
+    if model is not None:
+        if "camera.lens" in inputs:
+            model = model.with_numbers(inputs["camera.lens"].detach())
         positions, is_visible = model.project(points)
         return (positions - 0.5) * image_size, is_visible
     fov = (
@@ -378,15 +403,18 @@ def project_points(
     return positions, depth > MIN_DEPTH
 
 
-def compute_seated_pose(carrier: Tensor, seat: Tensor) -> Tensor:
-    """Return the rigid pose (4, 4) of what sits at a seat (4, 4) on a carrier (4, 4).
+def compute_carried_pose(carrier: Tensor, pose_on_carrier: Tensor) -> Tensor:
+    """Return the rigid pose (4, 4) of what is fixed to a carrier.
 
-    The carrier may be scaled.
+    Args:
+        carrier: (4, 4) pose of the carrier, which may be scaled: what it carries keeps
+            its size.
+        pose_on_carrier: (4, 4) pose in the carrier's coordinates.
     """
     scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
     return make_affine(
-        carrier[:3, :3] / scale @ seat[:3, :3],
-        carrier[:3, :3] @ seat[:3, 3] + carrier[:3, 3],
+        carrier[:3, :3] / scale @ pose_on_carrier[:3, :3],
+        carrier[:3, :3] @ pose_on_carrier[:3, 3] + carrier[:3, 3],
     )
 
 
@@ -395,11 +423,11 @@ def compute_car_pose(camera: Tensor) -> Tensor:
 
     It is level, with its +x ahead, on the ground below the camera; differentiable.
     """
-    ahead = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
-    zero = torch.zeros_like(ahead[0])
-    unit = torch.ones_like(ahead[0])
+    forward = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
+    zero = torch.zeros_like(forward[0])
+    unit = torch.ones_like(forward[0])
     axes = torch.stack(
-        [ahead[0], -ahead[1], zero, ahead[1], ahead[0], zero, zero, zero, unit]
+        [forward[0], -forward[1], zero, forward[1], forward[0], zero, zero, zero, unit]
     ).reshape(3, 3)
     return make_affine(axes, torch.cat([camera[:2, 3], zero[None]]))
 
@@ -419,14 +447,16 @@ def compute_real_harmonics(height: int, width: int) -> Tensor:
     root3 = math.sqrt(3.0)
     root15 = math.sqrt(15.0)
     root5 = math.sqrt(5.0)
-    first = [torch.ones_like(z), root3 * y, root3 * z, root3 * x]
-    second = [
+    lower_degrees = [torch.ones_like(z), root3 * y, root3 * z, root3 * x]
+    degree_two = [
         root15 * x * y,
         root15 * y * z,
         root5 / 2.0 * (3.0 * z * z - 1.0),
         root15 * x * z,
     ]
-    return torch.stack([*first, *second, root15 / 2.0 * (x * x - y * y)], dim=-1)
+    return torch.stack(
+        [*lower_degrees, *degree_two, root15 / 2.0 * (x * x - y * y)], dim=-1
+    )
 
 
 def make_euler_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
@@ -449,20 +479,27 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
     """Return the rotation (3, 3) about a vector (3,) by its length in degrees.
 
     Rodrigues' formula with guarded series, so that value and derivative are right at
-    zero, where the plain formula is NaN.
+    zero, where the plain formula is NaN: `torch.where` would pass on the NaN of the
+    side that it does not take, so that side gets an angle of 1 instead.
     """
     vector = degrees * (math.pi / 180.0)
-    square = vector.square().sum()
-    small = square < 1e-6
-    angle = torch.sqrt(torch.where(small, torch.ones_like(square), square))
-    sine = torch.where(small, 1.0 - square / 6.0, torch.sin(angle) / angle)
-    cosine = torch.where(
-        small, 0.5 - square / 24.0, (1.0 - torch.cos(angle)) / angle.square()
+    squared_angle = vector.square().sum()
+    is_small = squared_angle < 1e-6
+    angle = torch.sqrt(
+        torch.where(is_small, torch.ones_like(squared_angle), squared_angle)
+    )
+    sine_factor = torch.where(
+        is_small, 1.0 - squared_angle / 6.0, torch.sin(angle) / angle
+    )
+    cosine_factor = torch.where(
+        is_small, 0.5 - squared_angle / 24.0, (1.0 - torch.cos(angle)) / angle.square()
     )
     x, y, z = vector
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return torch.eye(3).to(degrees) + sine * cross + cosine * (cross @ cross)
+    return (
+        torch.eye(3).to(degrees) + sine_factor * cross + cosine_factor * (cross @ cross)
+    )
 
 
 HIDDEN_SCALE = 1e-3  # size of an occluder that is put away, behind the camera
@@ -483,17 +520,14 @@ def get_camera_pose(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> Te
 
 
 def make_hidden_pose(camera: Tensor) -> Tensor:
-    """Return the pose (4, 4) of what is out of sight.
-
-    Tiny, behind the camera of a pose (4, 4).
-    """
+    """Return the pose (4, 4) of what is out of sight: tiny, behind a camera (4, 4)."""
     return make_affine(
         HIDDEN_SCALE * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2]
     )
 
 
 def compute_footprint(points: Float64Array) -> Footprint:
-    """Return what a cloud of points (N, 3) takes up."""
+    """Return the convex outline from above and the height range of points (N, 3)."""
     corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
     return Footprint(
         points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max())
@@ -501,9 +535,9 @@ def compute_footprint(points: Float64Array) -> Footprint:
 
 
 def is_overlapping(first: Footprint, second: Footprint) -> bool:
-    """Return whether two outlines overlap, at heights that both have."""
-    begin, end = find_overlap_interval(first, second, np.array([1.0, 0.0]))
-    return begin < 0.0 < end
+    """Return whether two footprints overlap from above, at heights that both have."""
+    start, end = find_overlap_interval(first, second, np.array([1.0, 0.0]))
+    return start < 0.0 < end
 
 
 def find_overlap_interval(
@@ -511,8 +545,9 @@ def find_overlap_interval(
 ) -> tuple[float, float]:
     """Return over which interval of a shift one footprint overlaps another.
 
-    By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1),
-    each of which bounds an interval.
+    By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1): on
+    the normal of each edge both footprints are intervals, which overlap for an interval
+    of the shift; the footprints overlap where all of these do. Touching is no overlap.
 
     Args:
         first: the footprint that is shifted.
@@ -530,20 +565,22 @@ def find_overlap_interval(
             for points in (first.outline, second.outline)
         ]
     )
+    # (k, 2); corners at the same point have no edge
     normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
     moving_range = first.outline @ normals.T
     fixed_range = second.outline @ normals.T
     speed = normals @ direction
-    reach = np.stack(
+    separations = np.stack(
         [
             fixed_range.min(axis=0) - moving_range.max(axis=0),
             fixed_range.max(axis=0) - moving_range.min(axis=0),
         ]
     )
+    # The shift does not move it along such an axis: they are apart always or never.
     is_parallel = speed == 0.0
-    if (is_parallel & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
+    if (is_parallel & ((separations[0] >= 0.0) | (separations[1] <= 0.0))).any():
         return math.inf, -math.inf
-    stretches = np.sort(reach[:, ~is_parallel] / speed[~is_parallel], axis=0)
-    begin = float(stretches[0].max())
-    end = float(stretches[1].min())
-    return (begin, end) if begin < end else (math.inf, -math.inf)
+    intervals = np.sort(separations[:, ~is_parallel] / speed[~is_parallel], axis=0)
+    start = float(intervals[0].max())
+    end = float(intervals[1].min())
+    return (start, end) if start < end else (math.inf, -math.inf)

@@ -44,6 +44,10 @@ class GlbBuffer:
     """The binary buffer of a glTF file, with its views and accessors.
 
     Bytes that are already in it are not added again.
+
+    Attributes:
+        data: the bytes.
+        views, accessors: their entries in the document.
     """
 
     def __init__(self) -> None:
@@ -105,6 +109,7 @@ class GlbBuffer:
         text = json.dumps(header).encode()
         text += b" " * (-len(text) % 4)
         binary = bytes(self.data)
+        # 12 bytes of the file's header, and 8 of each of both chunks
         size = 28 + len(text) + len(binary)
         file_header = struct.pack("<4sIIII", b"glTF", 2, size, len(text), 0x4E4F534A)
         chunk_header = struct.pack("<II", len(binary), 0x004E4942)
@@ -118,6 +123,9 @@ DEFAULT_SPECULAR = 0.5  # specular of a surface whose index of refraction is 1.5
 # Limit of the sides of a texture in a file for the web, and the quality of its JPEG.
 WEB_TEXTURE_SIZE = 1024
 WEB_QUALITY = 90
+# Filter and wrap mode of textures, as OpenGL numbers them.
+LINEAR = 9729
+REPEAT = 10497
 # Entry of a camera, of which only the pose of its node counts.
 CAMERA_ENTRY = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
 
@@ -125,7 +133,7 @@ CAMERA_ENTRY = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.0
 def encode_glb(meshes: Sequence[Shape]) -> bytes:
     """Return meshes as a binary glTF file with PNG textures."""
     buffer = GlbBuffer()
-    return buffer.to_bytes(_make_header(buffer, meshes, encode_levels))
+    return buffer.to_bytes(_make_document(buffer, meshes, encode_levels))
 
 
 def encode_web_glb(
@@ -145,41 +153,45 @@ def encode_web_glb(
         note: text for readers, in `asset.extras`.
     """
     buffer = GlbBuffer()
-    header = _make_header(buffer, [*adversarial, *clean], _encode_jpeg)
-    # Rows: its axes, then its position.
-    our_rows = camera[:3].T.astype(np.float32)
-    columns = np.eye(4)
-    # glTF's cameras look along their -z.
+    document = _make_document(buffer, [*adversarial, *clean], _encode_jpeg)
+    # Rows of 3: its axes to the left, up and ahead, then its position.
+    camera_rows = camera[:3].T.astype(np.float32)
+    camera_matrix = np.eye(4)
+    # glTF's cameras look along their -z, with +x to the right. A row here is a column
+    # of the node's matrix, as the format stores it.
     signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
-    columns[:, :3] = _to_y_up(our_rows * signs)
-    header["cameras"] = [CAMERA_ENTRY]
-    header["nodes"].append(
-        {"name": "camera", "camera": 0, "matrix": columns.ravel().tolist()}
+    camera_matrix[:, :3] = _to_y_up(camera_rows * signs)
+    document["cameras"] = [CAMERA_ENTRY]
+    document["nodes"].append(
+        {"name": "camera", "camera": 0, "matrix": camera_matrix.ravel().tolist()}
     )
     n_adversarial = len(adversarial)
-    camera_node = len(header["nodes"]) - 1
-    header["scenes"] = [
+    camera_node = len(document["nodes"]) - 1
+    document["scenes"] = [
         {"name": "adversarial", "nodes": [*range(n_adversarial), camera_node]},
         {"name": "clean", "nodes": list(range(n_adversarial, camera_node))},
     ]
     if note:
-        header["asset"]["extras"] = {"note": note}
-    return buffer.to_bytes(header)
+        document["asset"]["extras"] = {"note": note}
+    return buffer.to_bytes(document)
 
 
-def _make_header(
+def _make_document(
     buffer: GlbBuffer,
     meshes: Sequence[Shape],
     encode_image: Callable[[ByteImage], bytes],
 ) -> dict[str, Any]:
-    """Return the header of a file of meshes, whose data is added to a buffer.
+    """Return the glTF document (the JSON part) of a file of meshes.
+
+    Their data and their images are appended to the buffer. Nodes, meshes and materials
+    have the order of the shapes; every node is in the one scene.
 
     Args:
-        buffer: the buffer.
+        buffer: gets the data.
         meshes: one node each.
         encode_image: encodes an image (H, W, 3).
     """
-    header: dict[str, Any] = {
+    document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
@@ -190,22 +202,29 @@ def _make_header(
         "materials": [],
         "textures": [],
         "samplers": [
-            {"magFilter": 9729, "minFilter": 9729, "wrapS": 10497, "wrapT": 10497}
+            {
+                "magFilter": LINEAR,
+                "minFilter": LINEAR,
+                "wrapS": REPEAT,
+                "wrapT": REPEAT,
+            }
         ],
         "images": [],
     }
     for index, shape in enumerate(meshes):
         primitive = {**_add_geometry(buffer, shape), "material": index}
-        header["meshes"].append({"name": shape.name, "primitives": [primitive]})
-        header["materials"].append(_add_material(header, buffer, shape, encode_image))
-    used = {
+        document["meshes"].append({"name": shape.name, "primitives": [primitive]})
+        document["materials"].append(
+            _add_material(document, buffer, shape, encode_image)
+        )
+    extensions = {
         name
-        for material in header["materials"]
+        for material in document["materials"]
         for name in material.get("extensions", ())
     }
-    if used:
-        header["extensionsUsed"] = sorted(used)
-    return header
+    if extensions:
+        document["extensionsUsed"] = sorted(extensions)
+    return document
 
 
 def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
@@ -229,49 +248,55 @@ def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
 
 
 def _add_material(
-    header: dict[str, Any],
+    document: dict[str, Any],
     buffer: GlbBuffer,
     shape: Shape,
     encode_image: Callable[[ByteImage], bytes],
 ) -> dict[str, Any]:
-    """Add the images of a shape, and return its material."""
+    """Return the material of a shape, whose images are added to the buffer and the
+    document.
+    """
     color = _to_bytes(shape.base_color)
     if shape.opacity is None:
         encoded = encode_image(color)
     else:
         encoded = _encode_png_with_alpha(color, _to_bytes(shape.opacity))
-    material = _make_material(shape, _add_texture(header, buffer, encoded))
+    material = _make_material(shape, _add_texture(document, buffer, encoded))
     if shape.normal_map is not None:
         normals = encode_image(_to_bytes(shape.normal_map))
-        material["normalTexture"] = _add_texture(header, buffer, normals)
+        material["normalTexture"] = _add_texture(document, buffer, normals)
     if shape.emission is not None:
         # A texture is at most 1, so the strength is an extension.
         strength = float(shape.emission.max())
         material["emissiveFactor"] = [1.0, 1.0, 1.0]
         relative = linear_to_srgb(shape.emission / np.float32(strength))
         emission = encode_image(_to_bytes(relative))
-        material["emissiveTexture"] = _add_texture(header, buffer, emission)
+        material["emissiveTexture"] = _add_texture(document, buffer, emission)
         extensions = material.setdefault("extensions", {})
         extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
     return material
 
 
 def _add_texture(
-    header: dict[str, Any], buffer: GlbBuffer, image_file: bytes
+    document: dict[str, Any], buffer: GlbBuffer, image_file: bytes
 ) -> dict[str, int]:
     """Add an image file as a texture, and return the reference to it."""
-    header["images"].append(
+    document["images"].append(
         {
             "mimeType": find_mime_type(image_file),
             "bufferView": buffer.add_view(image_file),
         }
     )
-    header["textures"].append({"source": len(header["textures"]), "sampler": 0})
-    return {"index": len(header["textures"]) - 1}
+    document["textures"].append({"source": len(document["textures"]), "sampler": 0})
+    return {"index": len(document["textures"]) - 1}
 
 
 def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
-    """Return the material of a shape with a texture of its base color."""
+    """Return the material of a shape with a texture of its base color.
+
+    An opacity of 0 and 1 alone is a mask; another one is blended. Extensions are
+    written only where the surface differs from glTF's default.
+    """
     surface = shape.material
     material: dict[str, Any] = {"name": shape.name, "doubleSided": True}
     if shape.opacity is not None:
@@ -312,17 +337,17 @@ def _to_bytes(color: Float32Array) -> ByteImage:
 
 def _encode_png_with_alpha(color: ByteImage, opacity: ByteImage) -> bytes:
     """Encode colors (H, W, 3) with an opacity, resized to their size, as PNG."""
-    picture = Image.fromarray(color)
-    picture.putalpha(
-        Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR)
+    image = Image.fromarray(color)
+    image.putalpha(
+        Image.fromarray(opacity).resize(image.size, Image.Resampling.BILINEAR)
     )
-    return encode_levels(np.asarray(picture))
+    return encode_levels(np.asarray(image))
 
 
 def _encode_jpeg(color: ByteImage) -> bytes:
     """Encode colors (H, W, 3) as JPEG, reduced to the size for the web."""
     file = io.BytesIO()
-    picture = Image.fromarray(color)
-    picture.thumbnail((WEB_TEXTURE_SIZE, WEB_TEXTURE_SIZE))
-    picture.save(file, "JPEG", quality=WEB_QUALITY, subsampling=0)
+    image = Image.fromarray(color)
+    image.thumbnail((WEB_TEXTURE_SIZE, WEB_TEXTURE_SIZE))
+    image.save(file, "JPEG", quality=WEB_QUALITY, subsampling=0)
     return file.getvalue()

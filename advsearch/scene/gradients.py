@@ -25,7 +25,10 @@ DIFFERENCE_ESTIMATORS = frozenset({"differences", "secant"})
 
 @dataclass(frozen=True)
 class Budget:
-    """How far a group of u may go from its start, inside the unit box."""
+    """How far a group of u may go from its start, inside the unit box.
+
+    A ball of the norm, as a rule; "box" is the whole unit box.
+    """
 
     norm: str  # "linf" or "l2", or "box" for everywhere
     epsilon: float | None  # radius of the norm's ball in units of u; None for "box"
@@ -126,7 +129,8 @@ STEP_RANGE = (1e-6, 0.15)  # smallest and largest step in u
 def compute_steps(speeds: Tensor) -> Tensor:
     """Return half-widths of differences in u over which outlines move by a pixel.
 
-    The speeds of the outlines are in pixels per unit of u.
+    The speeds of the outlines are in pixels per unit of u. Where nothing moves (below a
+    thousandth of a pixel) it is `DEFAULT_STEP`; all steps are within `STEP_RANGE`.
     """
     steps = torch.where(
         speeds > 1e-3,
@@ -170,7 +174,7 @@ class GradientPlan:
     groups: tuple[Group, ...]  # of all controls, in the order of u
     spp: int | None = None  # samples per pixel of differences; None is the primal's
 
-    def groups_with(self, *estimators: str) -> tuple[Group, ...]:
+    def select_groups(self, *estimators: str) -> tuple[Group, ...]:
         """Return the groups that use one of these estimators."""
         return tuple(group for group in self.groups if group.estimator in estimators)
 
@@ -186,7 +190,7 @@ class GradientPlan:
         It is 1 where the derivative runs back through scene inputs or the image.
         """
         mask = torch.zeros(sum(group.size for group in self.groups))
-        for group in self.groups_with(*ADJOINT_ESTIMATORS, "image"):
+        for group in self.select_groups(*ADJOINT_ESTIMATORS, "image"):
             mask[group.coordinates] = 1.0
         return mask
 
@@ -203,9 +207,9 @@ class GradientPlan:
 
     def scale_steps(self, factor: float) -> GradientPlan:
         """Return the plan with steps multiplied by a factor, within `STEP_RANGE`."""
-        smallest, largest = STEP_RANGE
+        min_step, max_step = STEP_RANGE
         return self._change_groups(
-            lambda group: {"step": min(largest, max(smallest, group.step * factor))}
+            lambda group: {"step": min(max_step, max(min_step, group.step * factor))}
         )
 
     def with_pixel_steps(self) -> GradientPlan:
@@ -250,7 +254,8 @@ class GradientPlan:
 def select_compared(valid: Sequence[str], size: int) -> tuple[str, ...]:
     """Return which of the valid estimators of a group are worth a measurement.
 
-    `size` is its number of coordinates.
+    `size` is its number of coordinates: above `MAX_COMPARED_SIZE` only adjoints are, if
+    there are any.
     """
     adjoints = tuple(
         estimator for estimator in valid if estimator in ADJOINT_ESTIMATORS
@@ -300,33 +305,51 @@ def make_first_plan(
 def _plan_group(
     group: Group, steps: Tensor, forced: Mapping[str, str], image_size: float
 ) -> Group:
-    """Return a group with its preferred or forced estimator; see `make_first_plan`."""
-    pixel = float(steps[group.coordinates].min()) if group.size else 0.0
-    step = pixel
+    """Return a group with its preferred or forced estimator; see `make_first_plan`.
+
+    The step is that of a pixel. A single coordinate that moves outlines has a wider
+    one, `SEARCH_STEP`, as long as that moves them by no more than `SEARCH_FRACTION` of
+    the image. An estimator forced for the group wins over one for its control, and that
+    over one for all groups, which holds only where it is valid.
+    """
+    pixel_step = float(steps[group.coordinates].min()) if group.size else 0.0
+    step = pixel_step
     moves_outlines = not {"adjoint", "image"} & {*group.valid}
     if group.size == 1 and moves_outlines:
-        step = max(pixel, min(SEARCH_STEP, SEARCH_FRACTION * image_size * pixel))
-    group = replace(group, pixel=pixel)
+        step = max(
+            pixel_step, min(SEARCH_STEP, SEARCH_FRACTION * image_size * pixel_step)
+        )
+    group = replace(group, pixel=pixel_step)
     if not group.valid:
         return replace(
             group, estimator="none", reason="a discrete choice has no derivative"
         )
-    by_name = forced.get(group.name) or forced.get(group.control)
-    if by_name is not None:
+    forced_by_name = forced.get(group.name) or forced.get(group.control)
+    if forced_by_name is not None:
         allowed = dict.fromkeys((*group.valid, *ALWAYS_VALID_ESTIMATORS))
-        if by_name not in allowed:
+        if forced_by_name not in allowed:
             raise InputError(
-                f"`estimators` {group.name}={by_name}: not valid there; expected one "
+                f"`estimators` {group.name}={forced_by_name}: not valid there; expected one "
                 f"of {', '.join(allowed)}"
             )
         return replace(
-            group, estimator=by_name, step=step, reason="forced by name", is_forced=True
+            group,
+            estimator=forced_by_name,
+            step=step,
+            reason="forced by name",
+            is_forced=True,
         )
-    for_all = forced.get("*", "")
-    has_alternative = for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
-    if for_all in group.valid or has_alternative:
+    forced_for_all = forced.get("*", "")
+    has_alternative = (
+        forced_for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
+    )
+    if forced_for_all in group.valid or has_alternative:
         return replace(
-            group, estimator=for_all, step=step, reason="forced for all", is_forced=True
+            group,
+            estimator=forced_for_all,
+            step=step,
+            reason="forced for all",
+            is_forced=True,
         )
     reason = "the only valid estimator"
     if len(group.valid) > 1:
@@ -349,6 +372,7 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
 
     @wraps(backward)
     def once(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the derivatives, guarded if another backward pass may follow."""
         with torch.no_grad():
             derivatives = backward(ctx, cotangent)
         if not torch.is_grad_enabled():
@@ -356,6 +380,7 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
         arguments = (cotangent, *ctx.saved_tensors)
         guarded = []
         for value in derivatives:
+            # The cotangent itself, of an identity, may be differentiated.
             if value is not None and value is not cotangent:
                 value = _OnceDifferentiable.apply(value, *arguments)  # type: ignore[no-untyped-call]
             guarded.append(value)

@@ -42,8 +42,8 @@ class Photograph:
 
     A photographed environment shows the floor that its camera stood on. That part of
     the map is projected from the height of the camera onto the plane z = 0, and the
-    plane gets the reflectance that shows the photograph where
-    nothing is in the way of the light:
+    plane gets the reflectance that shows the photograph where nothing is in the way of
+    the light:
 
         reflectance(p) = pi map(from (0, 0, height) to p) / E
         E = irradiance of the map's upper half on the plane
@@ -58,14 +58,20 @@ class Photograph:
     lamp, a window low down or its reflection, the reflectance is above 1. Such texels
     still look as photographed.
 
-    It is made of linear radiance (H, W, 3), row 0 straight up, the camera's height
-    above the ground in object sizes, and the map's rotation about the vertical in
-    degrees.
+    Args:
+        radiance: (H, W, 3) linear radiance of the map, row 0 straight up.
+        height: of the camera above the ground, object sizes.
+        rotation: of the map about the vertical, degrees.
+
+    Attributes:
+        mesh: the plane.
+        base_color: its texture, see `compute_reflectance`.
     """
 
     def __init__(self, radiance: Float32Array, height: float, rotation: float) -> None:
-        self._rows = radiance.shape[0]
-        self._first = (self._rows - 1) // 2
+        self._map_rows = radiance.shape[0]
+        # the last row at or above the horizon, where the plane's texture begins
+        self._horizon_row = (self._map_rows - 1) // 2
         self.mesh = self._make_mesh(height, rotation)
         self.base_color = self.compute_reflectance(
             torch.from_numpy(np.asarray(radiance, dtype=np.float32))
@@ -74,21 +80,24 @@ class Photograph:
     def _make_mesh(self, height: float, rotation: float) -> Mesh:
         """Make rings of faces around the point below the camera.
 
-        Their texture coordinates are those of the lower half of the map.
+        Radii are in heights of the camera: a ring at radius r is atan(r) away from
+        straight down, and that angle is its row in the map. Texture coordinates are
+        those of the lower half of the map, from its column (0 to 1) and its row.
         """
         radii = np.concatenate(
             [[0.0], np.geomspace(MIN_RING_RADIUS, MAX_RING_RADIUS, N_RINGS)]
         )
-        turns = np.linspace(0.0, 1.0, N_SECTORS + 1)
-        radius, turn = np.meshgrid(radii, turns, indexing="ij")
-        azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + math.radians(rotation)
+        map_columns = np.linspace(0.0, 1.0, N_SECTORS + 1)
+        radius, map_column = np.meshgrid(radii, map_columns, indexing="ij")
+        azimuth = 0.5 * math.pi - 2.0 * math.pi * map_column + math.radians(rotation)
         vertices = height * np.stack(
-            [radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1
+            [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
+            axis=-1,
         )
         polar = math.pi - np.arctan(radius)
-        n_rows = self._rows - self._first
-        row = polar / math.pi * (self._rows - 1) - self._first
-        uvs = np.stack([turn, 1.0 - (row + 0.5) / n_rows], axis=-1)
+        n_rows = self._map_rows - self._horizon_row
+        lower_row = polar / math.pi * (self._map_rows - 1) - self._horizon_row
+        uvs = np.stack([map_column, 1.0 - (lower_row + 0.5) / n_rows], axis=-1)
         normals = np.tile(
             np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
         )
@@ -102,32 +111,37 @@ class Photograph:
     def compute_reflectance(self, radiance: Tensor) -> Tensor:
         """Return the plane's texture (h, W, 3) for a map of any size.
 
-        0 where no light comes from above. Differentiable; row 0 is the horizon, the
-        last one is straight down, and columns are those of the map.
+        Row 0 is the horizon, the last one is straight down, and columns are those of
+        the map; h is always that of the map the plane was made of, between whose rows
+        it interpolates. 0 where no light comes from above. Differentiable.
         """
         rows = radiance.shape[0]
-        position = torch.arange(self._first, self._rows, device=radiance.device) * (
-            (rows - 1) / (self._rows - 1)
-        )
-        upper = position.floor().long().clamp_max(rows - 2)
-        fraction = (position - upper)[:, None, None].to(radiance.dtype)
+        map_row = torch.arange(
+            self._horizon_row, self._map_rows, device=radiance.device
+        ) * ((rows - 1) / (self._map_rows - 1))
+        upper = map_row.floor().long().clamp_max(rows - 2)
+        fraction = (map_row - upper)[:, None, None].to(radiance.dtype)
         lower_half = radiance[upper] + fraction * (
             radiance[upper + 1] - radiance[upper]
         )
-        arriving = compute_irradiance(radiance)
+        irradiance = compute_irradiance(radiance)
         return torch.where(
-            arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0
+            irradiance > 0.0, lower_half * math.pi / irradiance.clamp_min(1e-30), 0.0
         )
 
 
 def _make_ring_faces() -> npt.NDArray[np.uint32]:
-    """Return the faces (F, 3) of the rings; the innermost are single triangles."""
+    """Return the faces (F, 3) of the rings; the innermost are single triangles.
+
+    Vertices lie ring by ring, each of `N_SECTORS` + 1, the last at the position of the
+    first; the innermost ring is the one point below the camera.
+    """
     ring_starts = np.arange(N_RINGS)[:, None] * (N_SECTORS + 1)
     inner = (ring_starts + np.arange(N_SECTORS)).ravel()
     outer = inner + N_SECTORS + 1
-    first = np.stack([outer, inner, outer + 1], axis=1)
-    second = np.stack([inner, inner + 1, outer + 1], axis=1)[N_SECTORS:]
-    return np.concatenate([first, second]).astype(np.uint32)
+    outer_triangles = np.stack([outer, inner, outer + 1], axis=1)
+    inner_triangles = np.stack([inner, inner + 1, outer + 1], axis=1)[N_SECTORS:]
+    return np.concatenate([outer_triangles, inner_triangles]).astype(np.uint32)
 
 
 @lru_cache(maxsize=4)
@@ -143,12 +157,12 @@ def compute_irradiance(radiance: Tensor) -> Tensor:
     Differentiable.
     """
     rows, columns = radiance.shape[:2]
-    edges = (
+    row_bounds = (
         torch.arange(rows + 1, device=radiance.device, dtype=torch.float64) - 0.5
     ) * (math.pi / (rows - 1))
-    # the integral of cos sin
-    within = edges.clamp(0.0, math.pi / 2.0).sin().square() / 2.0
-    weights = (within.diff() * (2.0 * math.pi / columns)).to(radiance.dtype)
+    # Integral of cos sin over the angle from straight up; none from below the horizon.
+    antiderivative = row_bounds.clamp(0.0, math.pi / 2.0).sin().square() / 2.0
+    weights = (antiderivative.diff() * (2.0 * math.pi / columns)).to(radiance.dtype)
     return (radiance.sum(dim=1) * weights[:, None]).sum(dim=0)
 
 
@@ -171,29 +185,35 @@ MAX_CAR_CAMERA_HEIGHT = 2.5
 
 
 def is_against_traffic(scene: SceneDescription, camera: Float64Array) -> bool:
-    """Return whether a camera (4, 4) drives in the object's lane towards its front."""
+    """Return whether a camera (4, 4) drives in the object's lane towards its front.
+
+    That is before the object, at most half a lane aside and no higher than a car's
+    camera; the object has to be one that drives, and stand in a lane.
+    """
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
-    ahead, aside = (camera[:2, 3] - compute_center(scene)[:2]) * scene.metres
+    distance_ahead, distance_aside = (
+        camera[:2, 3] - compute_center(scene)[:2]
+    ) * scene.metres
     height = float(camera[2, 3]) * scene.metres
     place = find_place(scene)
-    width = (
-        LANE_WIDTH
-        if place is None or place.file.lane_width is None
-        else place.file.lane_width
-    )
+    width = LANE_WIDTH
+    if place is not None and place.file.lane_width is not None:
+        width = place.file.lane_width
     return bool(
-        ahead > 0.0 and abs(aside) <= width / 2.0 and height <= MAX_CAR_CAMERA_HEIGHT
+        distance_ahead > 0.0
+        and abs(distance_aside) <= width / 2.0
+        and height <= MAX_CAR_CAMERA_HEIGHT
     )
 
 
 def make_traffic_remark(scene: SceneDescription) -> str:
-    """Return what users are told of a camera that drives against the traffic."""
-    behind = (180.0 - scene.azimuth_zero) % 360.0
+    """Return the remark on a camera that drives against the traffic."""
+    azimuth_behind = (180.0 - scene.azimuth_zero) % 360.0
     return (
         f"The camera is in the lane of {scene.object.name} and looks at its front, "
         "against the traffic; behind it is "
-        f"`set` camera.azimuth={behind:g}"
+        f"`set` camera.azimuth={azimuth_behind:g}"
     )
 
 
@@ -224,7 +244,9 @@ PLACE_BY_GROUND_KIND: Mapping[str, tuple[str, str | None]] = {
 def find_ground_kind(scene: SceneDescription) -> str | None:
     """Return the kind of ground that a scene's environment and its settings ask for.
 
-    None where they name none.
+    A setting wins over the environment; the environment's does not count where a
+    setting of the table is used, and no ground of size 0 has a kind. None where neither
+    names one.
     """
     requested = scene.values.get("ground.kind")
     if scene.number("ground.size") <= 0.0:
@@ -253,45 +275,49 @@ def find_place(scene: SceneDescription) -> Place | None:
 def load_requested_place(scene: SceneDescription) -> Place | None:
     """Return the place that a scene's environment and its settings ask for.
 
-    None where they ask for none.
+    A kind of ground wins, which may be no place; else it is the environment's own,
+    unless settings describe the ground. None where they ask for none.
     """
     kind = find_ground_kind(scene)
     if kind is not None:
-        return (
-            load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
-            if kind in PLACE_BY_GROUND_KIND
-            else None
-        )
-    light = scene.environment
-    is_described = scene.number("ground.size") <= 0.0 or not scene.requested.isdisjoint(
-        settings.TABLE_SETTINGS
-    )
-    return None if light is None or is_described else light.place
+        if kind not in PLACE_BY_GROUND_KIND:
+            return None
+        return load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
+    has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
+    is_described = scene.number("ground.size") <= 0.0 or has_table_settings
+    environment = scene.environment
+    return None if environment is None or is_described else environment.place
 
 
 def with_requested_ground(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the road or the place that its settings ask for.
 
-    Another one that it had is left out.
+    Another one that it had is left out. The place's lamps are on at dusk: where the
+    environment has a unit, and less illuminance than `DUSK_ILLUMINANCE`.
     """
-    others = tuple(
+    other_parts = tuple(
         part
         for part in scene.parts
         if not (isinstance(part, MeshPart) and part.is_laid_ground)
     )
-    place = load_requested_place(scene)
+    place = None
+    if scene.backdrop_photograph is None:
+        place = load_requested_place(scene)
     if place is None:
-        if len(others) == len(scene.parts):
+        if len(other_parts) == len(scene.parts):
             return scene
-        return replace(scene, parts=others)
-    light = scene.environment
-    unit = None if light is None else light.candelas
+        return replace(scene, parts=other_parts)
+    environment = scene.environment
+    radiance_unit = None if environment is None else environment.candelas
     is_dark = False
-    if light is not None and unit is not None and place.file.lamps:
-        arriving = compute_irradiance(torch.from_numpy(light.radiance.copy()))
-        is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK_ILLUMINANCE
-    place_parts = make_place_parts(place, scene.metres, unit, is_dark=is_dark)
-    return replace(scene, parts=(*others, *place_parts))
+    if environment is not None and radiance_unit is not None and place.file.lamps:
+        irradiance = compute_irradiance(torch.from_numpy(environment.radiance.copy()))
+        is_dark = (
+            radiance_unit * float(irradiance @ torch.tensor(LUMINANCE))
+            < DUSK_ILLUMINANCE
+        )
+    place_parts = make_place_parts(place, scene.metres, radiance_unit, is_dark=is_dark)
+    return replace(scene, parts=(*other_parts, *place_parts))
 
 
 DUSK_ILLUMINANCE = (
@@ -364,30 +390,33 @@ class CameraView(NamedTuple):
 
 
 def find_valid_range(
-    environment: Surroundings, camera: CameraView
+    surroundings: Surroundings, camera: CameraView
 ) -> tuple[float, float]:
-    """Return up to which distance and height a picture fits a camera.
+    """Return up to which distance and height an environment's picture fits a camera.
 
-    In the lengths of `environment`, infinite without a bound, 0 where it fits nowhere;
+    In the lengths of `surroundings`, infinite without a bound, 0 where it fits nowhere;
     see above. The camera's own distance does not count.
     """
-    if abs((environment.rotation + 180.0) % 360.0 - 180.0) > MAX_MAP_ROTATION:
+    if abs((surroundings.rotation + 180.0) % 360.0 - 180.0) > MAX_MAP_ROTATION:
         return 0.0, 0.0
-    behind = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
-        environment.nearest_distance, camera.towards
+    max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
+        surroundings.nearest_distance, camera.towards
     )
-    unseen = (
+    hidden_ground_distance = (
         math.inf
         if camera.lower_angle <= 0.0
         else camera.height / math.tan(math.radians(min(camera.lower_angle, 179.0)))
     )
-    return max(
-        0.0,
-        min(behind, _reach_of_area(environment.ground_extent, camera.azimuth) + unseen),
-    ), MAX_SCALE_ERROR * environment.height
+    ground_distance = _reach_of_area(surroundings.ground_extent, camera.azimuth)
+    max_distance = min(max_scale_distance, ground_distance + hidden_ground_distance)
+    return max(0.0, max_distance), MAX_SCALE_ERROR * surroundings.height
 
 
 def _reach_of_area(area: Box | float, azimuth: float) -> float:
+    """Return how far an area reaches from the object in a direction, by its azimuth.
+
+    `area` is a box, or a number: the same in all directions.
+    """
     if isinstance(area, float):
         return area
     x = math.cos(math.radians(azimuth))
@@ -399,7 +428,10 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
 def find_surroundings(scene: SceneDescription) -> Surroundings | None:
     """Return what is known of the place in a scene's environment.
 
-    None where nothing of it has to fit a ground.
+    In metres. A place whose picture the environment shows has the picture's limits; a
+    photograph over a ground has those of its camera's height and its empty radius;
+    otherwise only the end of a paved ground counts. None where nothing of it has to fit
+    a ground.
     """
     environment = scene.environment
     # what encloses the object is geometry, true from everywhere
@@ -407,22 +439,29 @@ def find_surroundings(scene: SceneDescription) -> Surroundings | None:
         return None
     place = find_place(scene)
     extent: Box | float = math.inf if place is None else bound_ground(place)
+    # the place whose picture is in the environment's map
     bundled = PLACE_BY_GROUND_KIND.get(environment.ground or "")
-    backdrop = environment.place if bundled is None else load_bundled_place(*bundled)
-    if place is not None and backdrop is not None and backdrop.file.picture is not None:
-        picture = backdrop.file.picture
+    captured_site = (
+        environment.place if bundled is None else load_bundled_place(*bundled)
+    )
+    if (
+        place is not None
+        and captured_site is not None
+        and captured_site.file.picture is not None
+    ):
+        picture = captured_site.file.picture
         return Surroundings(
-            picture.height,
-            (*picture.x, *picture.y),
-            extent,
-            scene.number("environment.rotation"),
+            height=picture.height,
+            nearest_distance=(*picture.x, *picture.y),
+            ground_extent=extent,
+            rotation=scene.number("environment.rotation"),
         )
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.metres
         radius = scene.values.get("ground.radius")
-        return Surroundings(
-            height, DEFAULT_EMPTY_RADIUS * height if radius is None else radius, extent
-        )
+        if radius is None:
+            radius = DEFAULT_EMPTY_RADIUS * height
+        return Surroundings(height, radius, extent)
     return Surroundings(math.inf, math.inf, extent) if is_paved(scene) else None
 
 
@@ -441,26 +480,40 @@ def make_camera_view(
     to_world: Float64Array | None = None,
     fov: float | None = None,
 ) -> CameraView:
-    """Return how a scene is looked at.
+    """Return how a scene is looked at, in metres.
 
-    By its own camera, or by one with another pose (4, 4) or field of view.
+    By its own camera, or by one with another pose (4, 4) or field of view (degrees). A
+    camera that looks straight down counts as looking to the object.
     """
     pose = camera_to_world(scene) if to_world is None else to_world
     x, y, z = pose[:3, 3] * scene.metres
-    ahead = pose[:3, 2]
-    half = math.radians(scene.number("camera.fov") if fov is None else fov) / 2.0
-    half_height = math.degrees(math.atan(math.tan(half) * min(1.0, 1.0 / scene.aspect)))
+    forward = pose[:3, 2]
+    if fov is None:
+        fov = scene.number("camera.fov")
+    half_fov = math.radians(fov) / 2.0
+    half_height_angle = math.degrees(
+        math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
+    )
+    # A lens of the user's may show anything down to straight below.
     if scene.camera_model is not None and scene.camera_model.name:
-        half_height = 90.0
+        half_height_angle = 90.0
     azimuth = math.degrees(math.atan2(y, x))
-    level_length = math.hypot(ahead[0], ahead[1])
-    direction = (
-        math.degrees(math.atan2(ahead[1], ahead[0]))
+    level_length = math.hypot(forward[0], forward[1])
+    view_azimuth = (
+        math.degrees(math.atan2(forward[1], forward[0]))
         if level_length > 1e-6
         else azimuth + 180.0
     )
-    lowest = half_height - math.degrees(math.asin(float(np.clip(ahead[2], -1.0, 1.0))))
-    return CameraView(azimuth, direction, math.hypot(x, y), float(z), lowest)
+    lower_angle = half_height_angle - math.degrees(
+        math.asin(float(np.clip(forward[2], -1.0, 1.0)))
+    )
+    return CameraView(
+        azimuth=azimuth,
+        towards=view_azimuth,
+        distance=math.hypot(x, y),
+        height=float(z),
+        lower_angle=lower_angle,
+    )
 
 
 def get_camera_position(view: CameraView) -> Float64Array:
@@ -488,6 +541,10 @@ def list_view_remarks(
 ) -> tuple[str, ...]:
     """Return remarks where views go past what an environment's picture is valid for.
 
+    A remark on views outside of the place wins; the next is that the map is rotated
+    against the road; the last that views are too far or too high. At most one is
+    returned.
+
     Args:
         scene: that is looked at.
         views: at least one.
@@ -509,20 +566,20 @@ def list_view_remarks(
             "across it; leave the rotation out",
         )
     limits = [find_valid_range(surroundings, view) for view in views]
-    beyond = [
+    views_beyond = [
         view
         for view, (distance, height) in zip(views, limits, strict=True)
         if view.distance > distance or view.height > height
     ]
-    if not beyond:
+    if not views_beyond:
         return ()
     unit = "m" if scene.object.metres is not None else "object sizes"
-    who = _describe_views_beyond(len(beyond), len(views))
-    farthest = max(view.distance for view in beyond)
-    highest = max(view.height for view in beyond)
+    subject = _describe_views_beyond(len(views_beyond), len(views))
+    farthest = max(view.distance for view in views_beyond)
+    highest = max(view.height for view in views_beyond)
     return (
         f"{name}: the place around the object is a picture, which fits a camera up to "
-        f"{_describe_limits(limits, unit)}; {who} "
+        f"{_describe_limits(limits, unit)}; {subject} "
         f"{farthest:.3g} {unit} away and {highest:.3g} {unit} high. There what stands "
         "around is more than twice too large or "
         "too high, or the ground ends in sight: predictions from there are about the "
@@ -563,26 +620,28 @@ def list_outside_remarks(
         place: of the scene.
         views: at least one.
     """
-    bounds = [(axis, limits) for axis, limits in place.file.valid if limits is not None]
+    axis_limits = [
+        (axis, limits) for axis, limits in place.file.valid if limits is not None
+    ]
     positions = np.array([get_camera_position(view) for view in views])
     is_outside = np.zeros(len(views), bool)
-    for axis, (lower, upper) in bounds:
+    for axis, (lower, upper) in axis_limits:
         coordinate = positions[:, "xyz".index(axis)]
         is_outside |= (coordinate < lower) | (coordinate > upper)
     if not is_outside.any():
         return ()
     box = " and ".join(
-        f"{axis} {lower:g} to {upper:g} m" for axis, (lower, upper) in bounds
+        f"{axis} {lower:g} to {upper:g} m" for axis, (lower, upper) in axis_limits
     )
-    first = _describe_position(positions[int(is_outside.argmax())])
-    which = f"the camera is outside, at {first}"
+    first_position = _describe_position(positions[int(is_outside.argmax())])
+    outside_views = f"the camera is outside, at {first_position}"
     if len(views) > 1:
-        which = (
+        outside_views = (
             f"{100.0 * is_outside.mean():.0f} % of the views are outside, the "
-            f"first at {first}"
+            f"first at {first_position}"
         )
     return (
         f"{scene.environment_name}: the place holds for a camera at {box} from the "
-        f"object; {which}. Predictions from "
+        f"object; {outside_views}. Predictions from "
         "there are not about a real place",
     )

@@ -79,6 +79,8 @@ EGO_LAMP_POSITION = (1.7, 0.62, 0.65)
 """Where the headlamps of the camera's own car are: metres before the camera, to either
 side, above the ground.
 """
+# A beam shines along its own +z; a car drives along its +x, with +z up.
+BEAM_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 GLASS_MATERIAL = Material(roughness=0.06, specular=0.6)
 GLASS_OFFSET = 0.004  # how far glass stands out from what it lies on, metres
 
@@ -86,82 +88,92 @@ GLASS_OFFSET = 0.004  # how far glass stands out from what it lies on, metres
 def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array:
     """Return the luminous intensity of one headlamp, "low" or "high"; see above.
 
-    `h` and `v` are degrees aside and up.
+    `h` and `v` are degrees aside and up, of any shape; the high beam has the low one in
+    it.
     """
-    below = CUT_OFF - v
-    spot = 14500.0 * np.exp(-((h / 5.0) ** 2) / 2.0 - below.clip(0.0) / 1.5)
-    flood = 4000.0 * np.exp(-((h / 16.0) ** 2) / 2.0 - below.clip(0.0) / 5.0)
-    low = (spot + flood) / (1.0 + np.exp(-(below / 0.08).clip(-60.0, 60.0)))
-    high = (
+    below_cut_off = CUT_OFF - v
+    narrow_beam = 14500.0 * np.exp(
+        -((h / 5.0) ** 2) / 2.0 - below_cut_off.clip(0.0) / 1.5
+    )
+    wide_beam = 4000.0 * np.exp(
+        -((h / 16.0) ** 2) / 2.0 - below_cut_off.clip(0.0) / 5.0
+    )
+    # The clip keeps `exp` from overflowing.
+    low_beam = (narrow_beam + wide_beam) / (
+        1.0 + np.exp(-(below_cut_off / 0.08).clip(-60.0, 60.0))
+    )
+    high_beam = (
         45000.0 * np.exp(-((h / 3.5) ** 2 + (v / 1.5) ** 2) / 2.0)
         if kind == "high"
         else 0.0
     )
-    return np.asarray(low + high)
+    return np.asarray(low_beam + high_beam)
 
 
 @lru_cache(maxsize=2)
 def make_candela_table(kind: str) -> Float32Array:
     """Return the intensities (ROWS, COLUMNS) of one headlamp on a plane before it.
 
-    In candela; row 0 on top.
+    In candela; row 0 on top. Over the outer tenth at each border they fade to zero.
     """
-    up = TABLE_HALF_WIDTH * ROWS / COLUMNS
-    aside, above = np.meshgrid(
+    half_height = TABLE_HALF_WIDTH * ROWS / COLUMNS
+    side_tangent, up_tangent = np.meshgrid(
         TABLE_HALF_WIDTH * (2.0 * (np.arange(COLUMNS) + 0.5) / COLUMNS - 1.0),
-        up * (1.0 - 2.0 * (np.arange(ROWS) + 0.5) / ROWS),
+        half_height * (1.0 - 2.0 * (np.arange(ROWS) + 0.5) / ROWS),
     )
-    values = compute_candela(
+    candela = compute_candela(
         kind,
-        np.degrees(np.arctan(aside)),
-        np.degrees(np.arctan2(above, np.hypot(1.0, aside))),
+        np.degrees(np.arctan(side_tangent)),
+        np.degrees(np.arctan2(up_tangent, np.hypot(1.0, side_tangent))),
     )
-    border = np.minimum(
-        (TABLE_HALF_WIDTH - np.abs(aside)) / (0.2 * TABLE_HALF_WIDTH),
-        (up - np.abs(above)) / (0.2 * up),
+    fade = np.minimum(
+        (TABLE_HALF_WIDTH - np.abs(side_tangent)) / (0.2 * TABLE_HALF_WIDTH),
+        (half_height - np.abs(up_tangent)) / (0.2 * half_height),
     )
-    return np.asarray(values * border.clip(0.0, 1.0), np.float32)
+    return np.asarray(candela * fade.clip(0.0, 1.0), np.float32)
 
 
 def add_lamps(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the lamps that are on, and no others.
 
-    Those of its object, its things and the car of its camera.
+    Those of its object, its things and the car of its camera; lamps that the scene has
+    already are replaced. The same scene is returned if there are neither.
 
     Raises:
         InputError: the light of the environment has no unit, the object's size is not
             known, or a name is taken.
     """
-    others = tuple(
+    other_parts = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
     kind_by_carrier = {
         "object": get_lamp_kind(scene, "object.lamps"),
         CAMERA: get_lamp_kind(scene, "camera.lamps"),
     }
-    for part in others:
+    for part in other_parts:
         if isinstance(part, ThingPart):
             kind_by_carrier[part.name] = part.lamps
-    lit = {
+    kind_by_lit_carrier = {
         carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS[0]
     }
-    if not lit:
-        if len(others) == len(scene.parts):
+    if not kind_by_lit_carrier:
+        if len(other_parts) == len(scene.parts):
             return scene
-        return replace(scene, parts=others)
-    unit = _check_units(scene, next(iter(lit)))
-    scene = replace(scene, parts=others)
-    weight = 1.0 / (2 * len(lit))
+        return replace(scene, parts=other_parts)
+    unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
+    scene = replace(scene, parts=other_parts)
+    # Two beams of each car; all of them are sampled as often as the environment.
+    weight = 1.0 / (2 * len(kind_by_lit_carrier))
     lamps: list[ScenePart] = []
-    for carrier, kind in lit.items():
+    for carrier, kind in kind_by_lit_carrier.items():
         lamps += _make_lamps(scene, carrier, kind, unit, weight)
-    duplicates = {part.name for part in others} & {lamp.name for lamp in lamps}
+    duplicates = {part.name for part in other_parts} & {lamp.name for lamp in lamps}
     if duplicates:
         raise InputError(
             "things: lamps of the scene are called "
             f"{', '.join(sorted(duplicates))}; give yours another name="
         )
-    return replace(scene, parts=(*others, *lamps))
+    return replace(scene, parts=(*other_parts, *lamps))
 
 
 def _check_units(scene: SceneDescription, carrier: str) -> float:
@@ -171,8 +183,8 @@ def _check_units(scene: SceneDescription, carrier: str) -> float:
     """
     settings = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}
     setting = settings.get(carrier, "things: lamps")
-    unit = None if scene.environment is None else scene.environment.candelas
-    if unit is None:
+    radiance_unit = None if scene.environment is None else scene.environment.candelas
+    if radiance_unit is None:
         raise InputError(
             f"{setting}: lamps are in candela, and the brightness of this environment "
             "has no unit; take one of the avenue, "
@@ -184,7 +196,7 @@ def _check_units(scene: SceneDescription, carrier: str) -> float:
             f"{scene.object_name} is is not known; give its "
             "longest side in metres, such as `size=4.5`"
         )
-    return unit
+    return radiance_unit
 
 
 def get_lamp_kind(scene: SceneDescription, setting: str) -> str:
@@ -193,15 +205,21 @@ def get_lamp_kind(scene: SceneDescription, setting: str) -> str:
 
 
 def _make_lamps(
-    scene: SceneDescription, carrier: str, kind: str, unit: float, weight: float
+    scene: SceneDescription,
+    carrier: str,
+    kind: str,
+    radiance_unit: float,
+    weight: float,
 ) -> Iterable[ScenePart]:
-    """Yield the lamps of one car: the glass of a mesh, and two beams.
+    """Yield the lamps of one car: the glass of head- and tail lamps, and two beams.
+
+    The camera's own car has no mesh, so that it has beams alone.
 
     Args:
         scene: in which they shine.
         carrier: the mesh that carries them, or `CAMERA`.
         kind: "low" or "high".
-        unit: luminance of a radiance of 1, cd/m2.
+        radiance_unit: luminance of a radiance of 1, cd/m2.
         weight: of each beam, see `BeamLamp`.
     """
     if carrier == CAMERA:
@@ -212,145 +230,170 @@ def _make_lamps(
         ]
     else:
         part = scene.meshes[carrier]
-        metres = part.metres if isinstance(part, ThingPart) else scene.metres
-        # a metre in its coordinates
-        step = float(np.ptp(part.mesh.vertices, axis=0).max()) / metres
-        front = _make_glass(
-            part, "headlamps", 1.0, step, HEADLAMP_CANDELA / unit * WHITE
+        carrier_metres = part.metres if isinstance(part, ThingPart) else scene.metres
+        # The carrier's size in metres is that of its longest side.
+        longest_side = float(np.ptp(part.mesh.vertices, axis=0).max())
+        units_per_metre = longest_side / carrier_metres
+        front_power = HEADLAMP_CANDELA / radiance_unit * WHITE
+        rear_power = TAILLAMP_CANDELA / radiance_unit * RED
+        headlamp_glass = _make_glass(
+            part, "headlamps", 1.0, units_per_metre, front_power
         )
-        yield from (
-            front,
-            _make_glass(part, "taillamps", -1.0, step, TAILLAMP_CANDELA / unit * RED),
-        )
-        positions = _find_beam_positions(front.mesh.vertices, step)
-    red, green, blue = map(float, WHITE / (unit * scene.metres**2))
+        yield headlamp_glass
+        yield _make_glass(part, "taillamps", -1.0, units_per_metre, rear_power)
+        positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
+    red, green, blue = map(float, WHITE / (radiance_unit * scene.metres**2))
     for name, position in zip(("left", "right"), positions, strict=True):
-        seat = make_pose([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], position)
         yield BeamLamp(
-            f"{carrier}-{name}-beam",
-            carrier,
-            seat,
-            make_candela_table(kind),
-            (red, green, blue),
-            weight,
+            name=f"{carrier}-{name}-beam",
+            carrier=carrier,
+            pose_on_carrier=make_pose(BEAM_AXES, position),
+            table=make_candela_table(kind),
+            tint=(red, green, blue),
+            weight=weight,
         )
 
 
-def _find_beam_positions(vertices: Float32Array, step: float) -> list[Float64Array]:
+def _find_beam_positions(
+    vertices: Float32Array, units_per_metre: float
+) -> list[Float64Array]:
     """Return where the left and the right beam start, before the glass of a car.
+
+    The glass is one mesh: what lies to the left of its mean is the left lamp. A beam
+    starts just before the middle of its lamp, so that the glass does not hide it.
 
     Args:
         vertices: (V, 3) of the glass.
-        step: a metre in the car's coordinates.
+        units_per_metre: a metre in the car's coordinates.
     """
     positions = []
     for side in (1.0, -1.0):
         offset = vertices[:, 1] - vertices[:, 1].mean()
-        lamp = vertices[side * offset >= 0.0]
-        lower = lamp.min(axis=0)
-        upper = lamp.max(axis=0)
-        middle = (lower + upper)[1:] / 2.0
-        positions.append(np.array([upper[0] + 5.0 * GLASS_OFFSET * step, *middle]))
+        lamp_vertices = vertices[side * offset >= 0.0]
+        lower = lamp_vertices.min(axis=0)
+        upper = lamp_vertices.max(axis=0)
+        center_yz = (lower + upper)[1:] / 2.0
+        positions.append(
+            np.array([upper[0] + 5.0 * GLASS_OFFSET * units_per_metre, *center_yz])
+        )
     return positions
 
 
 def _make_glass(
-    part: MeshPart, where: str, ahead: float, step: float, power: Float64Array
+    part: MeshPart,
+    lamp_type: str,
+    facing: float,
+    units_per_metre: float,
+    power: Float64Array,
 ) -> LampGlass:
     """Return the glass of a car's two headlamps or tail lamps.
 
-    It is the faces of a material with such a name, or else two disks before what is
-    foremost there.
+    It is the faces of a material with such a name, moved out along their normals, or
+    else two disks before what is foremost there. It moves with the car's nearest
+    vertices.
 
     Args:
         part: the car.
-        where: of `MATERIAL_NAMES`.
-        ahead: 1 for lamps that shine along +x, -1 along -x.
-        step: a metre in the car's coordinates.
-        power: (3,) the radiance times square metres that each of the two sends
-            there.
+        lamp_type: of `MATERIAL_NAMES`.
+        facing: 1 for lamps that shine along +x, -1 along -x.
+        units_per_metre: a metre in the car's coordinates.
+        power: (3,) the radiance times square metres that each of the two sends there.
     """
     mesh = part.mesh
     named_faces = [
         faces
         for name, faces in mesh.materials.items()
-        if MATERIAL_NAMES[where].search(name) and len(faces)
+        if MATERIAL_NAMES[lamp_type].search(name) and len(faces)
     ]
     if named_faces:
-        lies_on = np.concatenate(named_faces)
-        follows, faces = np.unique(
-            mesh.faces[lies_on].astype(np.int64), return_inverse=True
+        carrier_face = np.concatenate(named_faces)
+        carrier_vertex, faces = np.unique(
+            mesh.faces[carrier_face].astype(np.int64), return_inverse=True
         )
         faces = faces.reshape(-1, 3)
-        normals = mesh.normals[follows].astype(np.float64)
-        vertices = mesh.vertices[follows] + GLASS_OFFSET * step * normals
+        normals = mesh.normals[carrier_vertex].astype(np.float64)
+        vertices = (
+            mesh.vertices[carrier_vertex] + GLASS_OFFSET * units_per_metre * normals
+        )
     else:
-        vertices, faces = _make_disks(mesh, where, ahead, step)
-        normals = np.tile([[ahead, 0.0, 0.0]], (len(vertices), 1))
-        follows = cKDTree(mesh.vertices).query(vertices)[1]
-        lies_on = cKDTree(mesh.vertices[mesh.faces].mean(axis=1)).query(
+        vertices, faces = _make_disks(mesh, lamp_type, facing, units_per_metre)
+        normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
+        carrier_vertex = cKDTree(mesh.vertices).query(vertices)[1]
+        carrier_face = cKDTree(mesh.vertices[mesh.faces].mean(axis=1)).query(
             vertices[faces].mean(axis=1)
         )[1]
-    corners = vertices[faces] / step
-    facing_area = ahead * compute_area_vectors(corners)[:, 0] / 2.0
-    shape = (
-        vertices.astype(np.float32),
-        faces.astype(np.uint32),
-        normals.astype(np.float32),
-        mesh.uvs[follows],
+    corners = vertices[faces] / units_per_metre
+    # square metres, as seen from where the lamps shine to
+    facing_area = facing * compute_area_vectors(corners)[:, 0] / 2.0
+    glass_mesh = Mesh(
+        vertices=vertices.astype(np.float32),
+        faces=faces.astype(np.uint32),
+        normals=normals.astype(np.float32),
+        uvs=mesh.uvs[carrier_vertex],
     )
+    # the color of the light, not quite as bright as a base color may be
+    glass_color = (0.8 * power / power.max()).astype(np.float32)
     radiance = 2.0 * power / max(float(facing_area.clip(0.0).sum()), 1e-9)
     return LampGlass(
-        name=f"{part.name}-{where}",
-        mesh=Mesh(*shape),
-        base_color=np.tile((0.8 * power / power.max()).astype(np.float32), (2, 2, 1)),
+        name=f"{part.name}-{lamp_type}",
+        mesh=glass_mesh,
+        base_color=np.tile(glass_color, (2, 2, 1)),
         material=GLASS_MATERIAL,
         emission=radiance.astype(np.float32)[None, None],
         carrier=part.name,
-        vertex_of_carrier=follows,
-        face_of_carrier=lies_on,
+        vertex_of_carrier=carrier_vertex,
+        face_of_carrier=carrier_face,
     )
 
 
 def _make_disks(
-    mesh: Mesh, where: str, ahead: float, step: float
+    mesh: Mesh, lamp_type: str, facing: float, units_per_metre: float
 ) -> tuple[Float64Array, IntArray]:
     """Make two disks before what is foremost of a car, for lamps without a material.
 
+    They lie at the height and to the sides that `LAMP_HEIGHTS` and `LAMP_OFFSET` have.
+
     Args:
         mesh: of the car.
-        where: of `MATERIAL_NAMES`.
-        ahead: 1 for lamps that shine along +x, -1 along -x.
-        step: a metre in the car's coordinates.
+        lamp_type: of `MATERIAL_NAMES`.
+        facing: 1 for lamps that shine along +x, -1 along -x.
+        units_per_metre: a metre in the car's coordinates.
 
     Returns:
         Vertices (V, 3) and faces (F, 3).
     """
-    corners = mesh.vertices[mesh.faces].astype(np.float64) * [ahead, 1.0, 1.0]
+    # mirrored for tail lamps, so that they look along +x too
+    corners = mesh.vertices[mesh.faces].astype(np.float64) * [facing, 1.0, 1.0]
     lower = corners.min(axis=(0, 1))
     upper = corners.max(axis=(0, 1))
-    height, height_fraction = LAMP_HEIGHTS[where]
+    height, height_fraction = LAMP_HEIGHTS[lamp_type]
     width = upper[1] - lower[1]
-    rim = min(LAMP_RADIUS * step, 0.1 * width) * _make_circle(ahead)
+    rim_offsets = min(LAMP_RADIUS * units_per_metre, 0.1 * width) * _make_circle(facing)
     vertices = list[Float64Array]()
     for side in (1.0, -1.0):
         center_y = (lower[1] + upper[1]) / 2.0 + side * LAMP_OFFSET * width
         center = np.array([0.0, center_y, lower[2]])
-        center[2] += min(height * step, height_fraction * (upper[2] - lower[2]))
-        disk = np.concatenate([[center], center + rim])
-        disk[:, 0] = ahead * (
-            _find_foremost(corners, disk, upper[0]) + GLASS_OFFSET * step
+        center[2] += min(
+            height * units_per_metre, height_fraction * (upper[2] - lower[2])
         )
-        vertices.append(disk)
+        disk_vertices = np.concatenate([[center], center + rim_offsets])
+        disk_vertices[:, 0] = facing * (
+            _find_foremost(corners, disk_vertices, upper[0])
+            + GLASS_OFFSET * units_per_metre
+        )
+        vertices.append(disk_vertices)
     disk_faces = _make_disk_faces()
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     return np.concatenate(vertices), faces
 
 
-def _make_circle(ahead: float) -> Float64Array:
-    """Return points (N, 3) on a unit circle in the plane x = 0."""
-    turn = ahead * np.linspace(0.0, 2.0 * np.pi, N_SPOKES, endpoint=False)
-    return np.stack([0.0 * turn, np.cos(turn), np.sin(turn)], axis=1)
+def _make_circle(facing: float) -> Float64Array:
+    """Return points (N, 3) on a unit circle in the plane x = 0.
+
+    They go round so that the disk's front faces along x by `facing`, 1 or -1.
+    """
+    angle = facing * np.linspace(0.0, 2.0 * np.pi, N_SPOKES, endpoint=False)
+    return np.stack([0.0 * angle, np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _make_disk_faces() -> IntArray:
@@ -359,13 +402,18 @@ def _make_disk_faces() -> IntArray:
     return np.stack([0 * spoke, 1 + spoke, 1 + (spoke + 1) % N_SPOKES], axis=1)
 
 
-def _find_foremost(
-    corners: Float64Array, disk: Float64Array, otherwise: float
-) -> float:
-    """Return the largest x of triangles (F, 3, 3) where a disk (V, 3) covers them."""
-    is_apart = (corners.min(axis=1) > disk.max(axis=0)) | (
+def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) -> float:
+    """Return the largest x of triangles (F, 3, 3) where a disk (V, 3) covers them.
+
+    It is taken at the disk's vertices; `default` where none of them has a triangle
+    behind it.
+    """
+    is_disjoint = (corners.min(axis=1) > disk.max(axis=0)) | (
         corners.max(axis=1) < disk.min(axis=0)
     )
-    near = corners[~is_apart[:, 1:].any(axis=1)][:, :, [1, 2, 0]]
-    heights = [x for point in disk[:, 1:] for x in find_triangle_heights(near, point)]
-    return max(heights, default=otherwise)
+    # The axis x becomes the height, since `find_triangle_heights` looks along z.
+    faces_around = corners[~is_disjoint[:, 1:].any(axis=1)][:, :, [1, 2, 0]]
+    heights = [
+        x for point in disk[:, 1:] for x in find_triangle_heights(faces_around, point)
+    ]
+    return max(heights, default=default)

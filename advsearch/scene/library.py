@@ -43,8 +43,9 @@ def make_finished_surface(
 ) -> dict[str, object]:
     """Return a principled surface, in Mitsuba's words, as `ObjectAsset.surface` has it.
 
-    Some materials of the mesh as `finishes` say, and all other faces like `main`, whose
-    `specular` holds for all.
+    Some materials of the mesh are as `finishes` say, by name, and all other faces like
+    `main`, whose `specular` holds for all. Roughness, metallic and clear coat become
+    textures whose texels are not interpolated.
     """
     face_values = np.tile(
         [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
@@ -65,10 +66,10 @@ def make_finished_surface(
         "clearcoat_gloss": 1.0,
     }
     for channel, name in enumerate(("roughness", "metallic", "clearcoat")):
-        picture = texel_values[:, :, channel : channel + 1]
+        texel_channel = texel_values[:, :, channel : channel + 1]
         surface[name] = {
             "type": "bitmap",
-            "bitmap": picture,
+            "bitmap": texel_channel,
             "raw": True,
             "filter_type": "nearest",
         }
@@ -87,15 +88,17 @@ MAP_HINT = "A path to an .hdr or .exr file, or to the .yaml file of a place, wor
 OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
 
 
-def _data_directory() -> Traversable:
+def _get_data_directory() -> Traversable:
+    """Return the directory of the bundled data."""
     return resources.files("advsearch.bundled") / "data"
 
 
 def list_objects() -> tuple[str, ...]:
+    """Return the sorted names of bundled objects."""
     return tuple(
         sorted(
             p.name
-            for p in (_data_directory() / "objects").iterdir()
+            for p in (_get_data_directory() / "objects").iterdir()
             if (p / "mesh.ply").is_file()
         )
     )
@@ -106,14 +109,21 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
 
     `split` selects those of "train", "heldout", "street" or "place".
     """
-    facts = _read_environment_facts().items()
+    facts_by_name = _read_environment_facts().items()
     return tuple(
-        sorted(name for name, fact in facts if split is None or fact["split"] == split)
+        sorted(
+            name
+            for name, fact in facts_by_name
+            if split is None or fact["split"] == split
+        )
     )
 
 
 def _read_environment_facts() -> dict[str, dict[str, Any]]:
-    text = (_data_directory() / "environments" / "environments.json").read_text("utf-8")
+    """Return what the scripts have stored about each bundled environment, by its name."""
+    text = (_get_data_directory() / "environments" / "environments.json").read_text(
+        "utf-8"
+    )
     facts: dict[str, dict[str, Any]] = json.loads(text)["environments"]
     return facts
 
@@ -127,10 +137,10 @@ def load_object(name: str) -> ObjectAsset:
     """
     import imageio.v3 as iio  # most scenes need no such file
 
-    known = list_objects()
-    if name not in known:
-        raise UnknownNameError("object", name, known, OBJECT_HINT)
-    directory = _data_directory() / "objects" / name
+    known_names = list_objects()
+    if name not in known_names:
+        raise UnknownNameError("object", name, known_names, OBJECT_HINT)
+    directory = _get_data_directory() / "objects" / name
     try:
         facts = json.loads((directory / "object.json").read_text("utf-8"))
         mesh = _read_mesh(name, directory, facts.get("faces", ()))
@@ -164,7 +174,7 @@ def load_object(name: str) -> ObjectAsset:
 def _read_mesh(
     name: str, directory: Traversable, material_runs: Sequence[tuple[str, int]]
 ) -> Mesh:
-    """Read the mesh of a bundled object.
+    """Read the mesh of a bundled object, with the rig of a body if it has one.
 
     Args:
         name: of the object, for messages.
@@ -215,13 +225,13 @@ def load_environment(name: str) -> EnvironmentAsset:
         FileFormatError: the installation is damaged.
         UnknownNameError: there is no such environment.
     """
-    known = list_environments()
-    if name not in known:
-        raise UnknownNameError("environment", name, known, MAP_HINT)
+    known_names = list_environments()
+    if name not in known_names:
+        raise UnknownNameError("environment", name, known_names, MAP_HINT)
     facts = _read_environment_facts()[name]
     try:
         content = (
-            _data_directory() / "environments" / f"{facts.get('map', name)}.exr"
+            _get_data_directory() / "environments" / f"{facts.get('map', name)}.exr"
         ).read_bytes()
         radiance: Float32Array = np.stack(
             read_exr(Path(name), content)[0], axis=2
@@ -268,7 +278,8 @@ class LightImage:
 def read_light(path: Path, label: str = "environment") -> LightImage:
     """Read an ``.hdr`` or ``.exr`` image of any shape.
 
-    Errors are those of `import_environment`.
+    Errors are those of `import_environment`; radiance that is not finite, or negative,
+    is one, of which the message names the first texel.
     """
     data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":
@@ -288,49 +299,50 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
         ),
         ("negative", lambda plane: plane < 0.0, "clamp them to 0"),
     )
-    for kind, bad, remedy in kinds:
-        texels = bad(planes[0]) | bad(planes[1]) | bad(planes[2])
-        if texels.any():
-            row, column = np.unravel_index(int(texels.argmax()), texels.shape)
+    for kind, is_bad, remedy in kinds:
+        bad_texels = is_bad(planes[0]) | is_bad(planes[1]) | is_bad(planes[2])
+        if bad_texels.any():
+            row, column = np.unravel_index(int(bad_texels.argmax()), bad_texels.shape)
             value = ", ".join(f"{float(plane[row, column]):.4g}" for plane in planes)
             raise InputError(
                 f"{path}: expected finite radiance of at least 0, got "
-                f"{int(texels.sum())} of {texels.size} texels"
+                f"{int(bad_texels.sum())} of {bad_texels.size} texels"
                 f" {kind} (the first in row {row}, column {column}: {value}); {remedy}"
             )
 
-    def stacked(top: int, end: int) -> Float32Array:
+    def read_rows(top: int, end: int) -> Float32Array:
+        """Return rows (n, W, 3) of the three planes."""
         return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
 
-    return LightImage(planes[0].shape, stacked, tuple(notes))
+    return LightImage(planes[0].shape, read_rows, tuple(notes))
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     """Read an equirectangular environment map from an ``.hdr`` or ``.exr`` file.
 
-    An ``.exr`` has channels R, G and B, or Y alone (grey), in half or float; see
-    `advsearch.scene.importing.hdr`.
-
-    A Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y alone
-    (grey), in half or float; see `advsearch.scene.importing.hdr`.
+    It is a Radiance ``.hdr`` (RGBE), or an ``.exr`` with channels R, G and B, or Y
+    alone (grey), in half or float; see `advsearch.scene.importing.hdr`.
 
     Maps larger than `MAX_MAP_SIZE` are averaged down, each texel weighted by the solid
     angle that it covers, so that the light from each direction stays the same in the
-    mean. Row 0 is up; columns stay in the file's order. Raises FileFormatError: the
-    file is missing, of another kind, damaged, or lacks channels; the message names it.
-    Raises InputError: values that are negative, NaN or infinite; the message counts
-    them and gives the first position.
+    mean. Row 0 is up; columns stay in the file's order.
+
+    Raises:
+        FileFormatError: the file is missing, of another kind, damaged, or lacks
+            channels; the message names it.
+        InputError: values are negative, NaN or infinite; the message counts them and
+            gives the first position.
     """
     file = Path(path)
-    picture = read_light(file)
-    notes = [f"{file.name}: {note}" for note in picture.notes]
-    height, width = picture.size
+    light_image = read_light(file)
+    notes = [f"{file.name}: {note}" for note in light_image.notes]
+    height, width = light_image.size
     if abs(width / (2 * height) - 1.0) > 0.01:
         notes.append(
             f"{file.name}: expected a map twice as wide as high, got {width} "
             f"x {height}; it appears stretched"
         )
-    radiance = _resize_map(picture.read_rows, picture.size)
+    radiance = _resize_map(light_image.read_rows, light_image.size)
     if not radiance.any():
         notes.append(
             f"{file.name}: the environment is black everywhere; it lights nothing"
@@ -345,29 +357,32 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 
 
 def _resize_map(
-    band: Callable[[int, int], Float32Array], size: tuple[int, int]
+    read_rows: Callable[[int, int], Float32Array], size: tuple[int, int]
 ) -> Float32Array:
     """Average a map down to at most `MAX_MAP_SIZE`, or repeat texels up to
     `MIN_MAP_SIZE`.
 
-    See `LightImage`.
+    Both sides shrink by the same factor. Texels are weighted by their solid angles, the
+    sine of the polar angle of their row. `read_rows` and `size` are as in `LightImage`.
     """
     height, width = size
-    scale = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
-    if scale == 1.0:
-        texels = band(0, height)
+    shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
+    if shrink == 1.0:
+        texels = read_rows(0, height)
     else:
-        target = max(1, round(height * scale)), max(1, round(width * scale))
+        target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
         polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(
             np.pi / height
         )
-        angle = np.sin(polar)[:, None, None]
-        covered = average_area(angle, target[0], 1)
+        row_weights = np.sin(polar)[:, None, None]
+        mean_weight = average_area(row_weights, target_shape[0], 1)
         texels = (
             average_in_bands(
-                lambda top, end: band(top, end) * angle[top:end], size, target
+                lambda top, end: read_rows(top, end) * row_weights[top:end],
+                size,
+                target_shape,
             )
-            / covered
+            / mean_weight
         )
     repeat_rows, repeat_columns = (
         -(-smallest // extent)

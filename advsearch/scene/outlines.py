@@ -71,9 +71,9 @@ def find_visible_meshes(
             continue
         mask = surfaces.visible_mask(name).numpy()
         if mask.any():
-            fraction, truncated = _compare_outline(renderer, inputs, name, mask)
+            fraction, is_truncated = _compare_outline(renderer, inputs, name, mask)
             distance = float(surfaces.depth.numpy()[mask].min())
-            visible.append(VisibleMesh(name, mask, fraction, truncated, distance))
+            visible.append(VisibleMesh(name, mask, fraction, is_truncated, distance))
     return visible
 
 
@@ -102,9 +102,9 @@ def _compare_outline(
     row, column = np.nonzero(outline.cells)
     x = outline.left + (column + 0.5) * outline.step
     y = outline.top + (row + 0.5) * outline.step
-    inside = (x > 0) & (x < width) & (y > 0) & (y < height)
+    is_inside = (x > 0) & (x < width) & (y > 0) & (y < height)
     fraction = float(mask.sum()) / (len(row) * outline.step**2)
-    return min(1.0, fraction), bool((~inside).any())
+    return min(1.0, fraction), bool((~is_inside).any())
 
 
 def _select_camera_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -156,26 +156,34 @@ class _Outline:
     step: int  # width of a cell in pixels
 
     def covers(self, mask: BoolArray) -> bool:
-        """Return whether visible pixels lie in the outline, or next to it."""
+        """Return whether visible pixels lie in the outline, or next to it.
+
+        At least `MIN_MATCHING_FRACTION` of those of the mask (H, W) have to.
+        """
         n_rows, n_columns = self.cells.shape
         pixel_row, pixel_column = np.nonzero(mask)
         row = ((pixel_row + 0.5 - self.top) // self.step).astype(np.int64)
         column = ((pixel_column + 0.5 - self.left) // self.step).astype(np.int64)
-        inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
-        near = ndimage.binary_dilation(self.cells, np.ones((3, 3)))
-        clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
-        return bool((inside & near[clipped]).mean() >= MIN_MATCHING_FRACTION)
+        is_inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
+        dilated_cells = ndimage.binary_dilation(self.cells, np.ones((3, 3)))
+        clipped_cell = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
+        return bool(
+            (is_inside & dilated_cells[clipped_cell]).mean() >= MIN_MATCHING_FRACTION
+        )
 
 
 def _rasterise_outline(corners: Float64Array) -> _Outline:
-    """Rasterise the outline of faces with corners (F, 3, 2) in pixels."""
+    """Rasterise the outline of faces with corners (F, 3, 2) in pixels.
+
+    A cell is a pixel, or several where the outline is wider than `MAX_OUTLINE_SIZE`.
+    """
     lower = np.floor(corners.min(axis=(0, 1)))
     upper = np.ceil(corners.max(axis=(0, 1)))
-    step = max(1, math.ceil(float((upper - lower).max()) / MAX_OUTLINE_SIZE))
-    n_columns, n_rows = map(int, (upper - lower) // step + 1)
+    cell_width = max(1, math.ceil(float((upper - lower).max()) / MAX_OUTLINE_SIZE))
+    n_columns, n_rows = map(int, (upper - lower) // cell_width + 1)
     _, row, column, _ = rasterize_triangles(
-        (corners - lower) / step - 0.5, (n_rows, n_columns)
+        (corners - lower) / cell_width - 0.5, (n_rows, n_columns)
     )
     cells = np.zeros((n_rows, n_columns), np.bool_)
     cells[row, column] = True
-    return _Outline(cells, left=lower[0], top=lower[1], step=step)
+    return _Outline(cells, left=lower[0], top=lower[1], step=cell_width)

@@ -102,9 +102,16 @@ class LampGlass(MeshPart):
 def make_mesh_part(
     name: str, shape: Shape, to_world: Float64Array, material: Material
 ) -> MeshPart:
-    """Return a shape with another name and material under a pose (4, 4)."""
-    looks = {look.name: getattr(shape, look.name) for look in fields(Shape)}
-    return MeshPart(**{**looks, "name": name, "material": material}, to_world=to_world)
+    """Return a shape in a scene: with a name and material of its own, under a pose (4,
+    4).
+    """
+    shape_fields = {
+        shape_field.name: getattr(shape, shape_field.name)
+        for shape_field in fields(Shape)
+    }
+    return MeshPart(
+        **{**shape_fields, "name": name, "material": material}, to_world=to_world
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,22 +178,24 @@ class SpotLamp(_Point):
     @property
     def to_world(self) -> Float64Array:
         """(4, 4) pose of the lamp, which shines along its own +z."""
-        ahead = (
+        forward = (
             np.array(self.direction)
             if any(self.direction)
             else np.array([0.0, 0.0, -1.0])
         )
-        aside = np.cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
-        aside /= np.linalg.norm(aside)
+        # perpendicular to the axis of the world that is the least parallel to it
+        right = np.cross(np.eye(3)[np.abs(forward).argmin()], forward)
+        right /= np.linalg.norm(right)
         return make_pose(
-            np.stack([aside, np.cross(ahead, aside), ahead], axis=1), self.position
+            np.stack([right, np.cross(forward, right), forward], axis=1), self.position
         )
 
     def compute_lighting(
         self, position: Float64Array
     ) -> tuple[Float64Array, Float64Array]:
-        """Return the vector (3,) from a position to the lamp, and its irradiance
-        (3,).
+        """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
+
+        The irradiance is that of a surface that faces the lamp.
         """
         to_lamp, irradiance = super().compute_lighting(position)
         cutoff, beam = self.cone
@@ -244,9 +253,9 @@ class BeamLamp(ScenePart):
     """
 
     carrier: str  # the mesh that carries it, or `CAMERA`
-    # (4, 4) its pose in what carries it (`geometry.seated`): it shines along its +z and
+    # (4, 4) its pose in what carries it (see `compute_carried_pose`): it shines along its +z and
     # has +y up
-    seat: Float64Array
+    pose_on_carrier: Float64Array
     # (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to
     # either side
     table: Float32Array
@@ -259,15 +268,18 @@ class BeamLamp(ScenePart):
     def compute_lighting(
         self, position: Float64Array
     ) -> tuple[Float64Array, Float64Array]:
-        """Return the vector (3,) from a position to the lamp, and its irradiance
-        (3,).
+        """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
+
+        The irradiance is that of a surface that faces the lamp; 0 behind the lamp and
+        outside of its table.
         """
         to_lamp = self.to_world[:3, 3] - position
-        aside, up, ahead = -to_lamp @ self.to_world[:3, :3]
+        # the position in the lamp's axes: x to the table's right, y up, z ahead
+        x, y, z = -to_lamp @ self.to_world[:3, :3]
         height, width = self.table.shape
-        column = math.floor((aside / max(ahead, 1e-9) + 1.0) / 2.0 * width)
-        row = math.floor((1.0 - up / max(ahead, 1e-9) * width / height) / 2.0 * height)
-        if ahead <= 0.0 or not (0 <= column < width and 0 <= row < height):
+        column = math.floor((x / max(z, 1e-9) + 1.0) / 2.0 * width)
+        row = math.floor((1.0 - y / max(z, 1e-9) * width / height) / 2.0 * height)
+        if z <= 0.0 or not (0 <= column < width and 0 <= row < height):
             return to_lamp, np.zeros(3)
         return to_lamp, self.table[row, column] * np.array(self.tint) / max(
             float(to_lamp @ to_lamp), 1e-12
@@ -294,6 +306,7 @@ class ProjectorPart(ScenePart):
 
     @property
     def aspect(self) -> float:
+        """Width over height of the picture."""
         return self.sides[1] / self.sides[0]
 
     @property
@@ -386,12 +399,14 @@ def make_polygon(corners: int) -> Mesh:
 
     Its middle, then its corners.
     """
-    turns = 2.0 * np.pi * np.arange(corners) / corners
-    rim = np.stack([np.cos(turns), np.sin(turns), np.zeros(corners)], axis=1)
-    vertices = np.concatenate([np.zeros((1, 3)), rim]).astype(np.float32)
-    first = np.arange(corners)
+    angles = 2.0 * np.pi * np.arange(corners) / corners
+    corner_points = np.stack(
+        [np.cos(angles), np.sin(angles), np.zeros(corners)], axis=1
+    )
+    vertices = np.concatenate([np.zeros((1, 3)), corner_points]).astype(np.float32)
+    corner = np.arange(corners)
     faces = np.stack(
-        [np.zeros(corners, np.int64), first + 1, (first + 1) % corners + 1], axis=1
+        [np.zeros(corners, np.int64), corner + 1, (corner + 1) % corners + 1], axis=1
     ).astype(np.uint32)
     normals = np.tile(np.array([0.0, 0.0, 1.0], dtype=np.float32), (corners + 1, 1))
     return Mesh(vertices, faces, normals, vertices[:, :2] / 2.0 + np.float32(0.5))
@@ -400,7 +415,8 @@ def make_polygon(corners: int) -> Mesh:
 def make_sphere(rows: int, columns: int) -> Mesh:
     """Return a sphere of diameter 1 around the origin.
 
-    `rows` bands from pole to pole, 2 (rows - 1) columns faces.
+    It has `rows` bands from pole to pole and `columns` around, hence 2 (rows - 1)
+    columns faces: two for each cell, one at the poles. v is 1 at the top.
     """
     v, u = (
         array.ravel()

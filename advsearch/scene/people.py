@@ -34,59 +34,89 @@ from advsearch.options import Value
 from advsearch.scene.settings import Parameter
 
 AGES = (10.0, 25.0, 90.0)  # years of MakeHuman's child, young and old
-_body_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
+_make_body_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
 
 
-def _joint_parameter(name: str, low: float, high: float, text: str) -> Parameter:
-    return _body_parameter(name, "degrees", low, high, 0.0, text)
+def _make_joint_parameter(name: str, low: float, high: float, text: str) -> Parameter:
+    """Return the parameter of a joint's angle, 0 by default."""
+    return _make_body_parameter(
+        name, unit="degrees", low=low, high=high, default=0.0, text=text
+    )
 
 
 PHENOTYPE = (
-    _body_parameter(
-        "height", "metres", 1.0, 2.1, 1.7, "Height without shoes and hair.", (1.5, 1.95)
+    _make_body_parameter(
+        "height",
+        unit="metres",
+        low=1.0,
+        high=2.1,
+        default=1.7,
+        text="Height without shoes and hair.",
+        search=(1.5, 1.95),
     ),
-    _body_parameter(
+    _make_body_parameter(
         "weight",
-        "1",
-        0.0,
-        1.0,
-        0.5,
-        "0 is thin, 0.5 average, 1 heavy; `body.mass` says kilograms.",
-        (0.2, 0.8),
+        unit="1",
+        low=0.0,
+        high=1.0,
+        default=0.5,
+        text="0 is thin, 0.5 average, 1 heavy; `body.mass` says kilograms.",
+        search=(0.2, 0.8),
     ),
-    _body_parameter(
+    _make_body_parameter(
         "age",
-        "years",
-        10.0,
-        90.0,
-        35.0,
-        "Age; children are smaller by `height` only.",
-        (18.0, 75.0),
+        unit="years",
+        low=10.0,
+        high=90.0,
+        default=35.0,
+        text="Age; children are smaller by `height` only.",
+        search=(18.0, 75.0),
     ),
-    _body_parameter(
+    _make_body_parameter(
         "gender",
-        "1",
-        0.0,
-        1.0,
-        1.0,
-        "0 is a woman, 1 a man, between them a mixture.",
-        (0.0, 1.0),
+        unit="1",
+        low=0.0,
+        high=1.0,
+        default=1.0,
+        text="0 is a woman, 1 a man, between them a mixture.",
+        search=(0.0, 1.0),
     ),
 )
 WALK = (
-    _body_parameter("walk", "degrees", -3600.0, 3600.0, 0.0, "Phase of a walk: the left heel "
-                                                      "strikes at 0, the right at 180.",
-             (0.0, 360.0), periodic=True),
-    _body_parameter("stride", "1", 0.0, 1.3, 0.0, "How far the walk swings: 0 stands, "
-                                                  "1 is an "
-                                           "ordinary step.", (0.0, 1.0)),
-)  # fmt: skip
+    _make_body_parameter(
+        "walk",
+        unit="degrees",
+        low=-3600.0,
+        high=3600.0,
+        default=0.0,
+        text="Phase of a walk: the left heel strikes at 0, the right at 180.",
+        search=(0.0, 360.0),
+        periodic=True,
+    ),
+    _make_body_parameter(
+        "stride",
+        unit="1",
+        low=0.0,
+        high=1.3,
+        default=0.0,
+        text="How far the walk swings: 0 stands, 1 is an ordinary step.",
+        search=(0.0, 1.0),
+    ),
+)
 SPINE = (
-    _joint_parameter("spine", -20.0, 60.0, "Bend of the back, ahead."),
-    _joint_parameter("spine_side", -25.0, 25.0, "Bend of the back to the left."),
-    _joint_parameter("spine_turn", -35.0, 35.0, "Turn of the chest to the left."),
-    _joint_parameter("neck", -45.0, 45.0, "Nod of the head, ahead."),
-    _joint_parameter("neck_turn", -70.0, 70.0, "Turn of the head to the left."),
+    _make_joint_parameter(
+        "spine", low=-20.0, high=60.0, text="Bend of the back, ahead."
+    ),
+    _make_joint_parameter(
+        "spine_side", low=-25.0, high=25.0, text="Bend of the back to the left."
+    ),
+    _make_joint_parameter(
+        "spine_turn", low=-35.0, high=35.0, text="Turn of the chest to the left."
+    ),
+    _make_joint_parameter("neck", low=-45.0, high=45.0, text="Nod of the head, ahead."),
+    _make_joint_parameter(
+        "neck_turn", low=-70.0, high=70.0, text="Turn of the head to the left."
+    ),
 )
 LIMBS = (
     ("shoulder", -50.0, 170.0, "arm, raised ahead"),
@@ -100,7 +130,9 @@ LIMBS = (
 )
 """Joints on both sides, with their limits in degrees."""
 _JOINTS = tuple(
-    _joint_parameter(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
+    _make_joint_parameter(
+        f"{side}_{name}", low=low, high=high, text=f"{side.capitalize()} {text}."
+    )
     for side in ("left", "right")
     for name, low, high, text in LIMBS
 )
@@ -154,11 +186,15 @@ class Person:
         data: Mapping[str, np.ndarray],
         defaults: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
+        """Convert the arrays to tensors, and pose the person at its defaults."""
         usual = {parameter.name: float(parameter.default) for parameter in PARAMETERS}
         self.data = data
         self.defaults = usual | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
+        # `mean` (P, 3) are points in tenths of a millimetre, `basis` (R, P, 3) the
+        # shapes, `shares` (G, A, W, H, R) their factors in each extreme body, with
+        # `stature` and `mass`, and `index` the point of each vertex.
         weight_sums = data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)
         self._tensors = {
             "mean": torch.from_numpy(data["mean"].astype(np.float32) * 1e-4),
@@ -168,6 +204,8 @@ class Person:
         } | {
             name: torch.from_numpy(data[name]) for name in ("shares", "stature", "mass")
         }
+        # Points of the left and of the right shoe; `points` is how many vertices each
+        # piece of clothing has, and `tags` what it is.
         is_shoe = np.repeat(data["tags"], data["points"]) == "shoes"
         shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
         is_left = data["mean"][shoe_points, 1] > 0
@@ -181,7 +219,7 @@ class Person:
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return how far vertices move from the standing person, (V, 3) in its size.
 
-        Arguments are those of `posed`; there are no clips.
+        Arguments are those of `pose`; there are no clips.
         """
         posed = self.pose(values)
         return (posed - self.standing_points.to(posed.device)) / self.size
@@ -195,72 +233,84 @@ class Person:
             values: scalar tensors by the names of `PARAMETERS`; this person's default
                 if one is missing.
         """
-        number = self._complete_values(values)
-        device = number["height"].device
-        mixture, scale = self._mix_phenotype(number)
+        number_by_name = self._complete_values(values)
+        device = number_by_name["height"].device
+        mixture, scale = self._mix_phenotype(number_by_name)
+        # Of each gender, age, weight and height (g, a, w, h), the factors of r shapes,
+        # each of which moves points p by coordinates c.
         coefficients = torch.einsum(
             "gawh,gawhr->r", mixture, self._get_tensor("shares", device)
         )
         points = self._get_tensor("mean", device) + torch.einsum(
             "r,rpc->pc", coefficients, self._get_tensor("basis", device)
         )
-        # The joints are the last points.
+        # The joints are the last points, in the order of bones.
         joints = points[-len(self._bones) :]
         points = points[: -len(self._bones)]
-        turns, shifts = self._pose_bones(joints, add_walk(number))
+        rotations, translations = self._pose_bones(joints, add_walk(number_by_name))
         weights = self._get_tensor("weights", device)
-        posed = skin_points(points, weights, turns, shifts)
-        if bool(number["stride"] > 0.0):
-            raised = self._compute_leg_corrections(points, joints, number)
-            posed = self._correct_legs(posed, turns, shifts, joints, raised)
-        pelvis = shifts[0] + turns[0] @ joints[0]
-        floor = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
-        return (scale * (posed - floor)).index_select(
+        posed = skin_points(points, weights, rotations, translations)
+        if bool(number_by_name["stride"] > 0.0):
+            raised = self._compute_leg_corrections(points, joints, number_by_name)
+            posed = self._correct_legs(posed, rotations, translations, joints, raised)
+        pelvis = translations[0] + rotations[0] @ joints[0]
+        foot_point = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
+        return (scale * (posed - foot_point)).index_select(
             0, self._get_tensor("index", device)
         )
 
     def _compute_leg_corrections(
-        self, points: Tensor, joints: Tensor, number: Mapping[str, Tensor]
+        self, points: Tensor, joints: Tensor, number_by_name: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return how much each foot has to rise, "l" and "r", to touch the ground.
 
         These are the corrections of the walk alone, without other joint angles.
         """
-        zero = torch.zeros_like(number["walk"])
+        zero = torch.zeros_like(number_by_name["walk"])
         without_joints = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
-        angles = add_walk({**number, **without_joints})
-        turns, shifts = self._pose_bones(joints, angles)
+        joint_angles = add_walk({**number_by_name, **without_joints})
+        rotations, translations = self._pose_bones(joints, joint_angles)
         weights = self._get_tensor("weights", points.device)
-        lowest = dict[str, Tensor]()
-        contact = dict[str, Tensor]()
+        lowest_heights = dict[str, Tensor]()
+        contacts = dict[str, Tensor]()
         for side, phase_shift in (("l", 0.0), ("r", 180.0)):
             shoe = self._get_tensor(f"shoe_{side}", points.device)
-            shoe_points = skin_points(points[shoe], weights[shoe], turns, shifts)
-            lowest[side] = shoe_points[:, 2].amin()
-            contact[side] = compute_contact(number["walk"] + phase_shift)
-        amount = (number["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
-        return _correct_heights(lowest, contact, amount)
+            shoe_points = skin_points(
+                points[shoe], weights[shoe], rotations, translations
+            )
+            lowest_heights[side] = shoe_points[:, 2].amin()
+            contacts[side] = compute_contact(number_by_name["walk"] + phase_shift)
+        amount = (number_by_name["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
+        return _correct_heights(lowest_heights, contacts, amount)
 
     def _correct_legs(
         self,
         posed: Tensor,
-        turns: Tensor,
-        shifts: Tensor,
+        rotations: Tensor,
+        translations: Tensor,
         joints: Tensor,
-        raised: Mapping[str, Tensor],
+        foot_rises: Mapping[str, Tensor],
     ) -> Tensor:
-        """Return posed points (P, 3) with feet risen, and legs stretched in
-        proportion.
+        """Return posed points (P, 3) with feet risen, and legs stretched in proportion.
+
+        Below the hip a point of the leg rises by how far down it is, from 0 at the hip
+        to all of the foot's rise at the ankle.
+
+        Args:
+            posed: (P, 3) points after skinning.
+            rotations, translations: of the bones, see `_pose_bones`.
+            joints: (J, 3) in the rest pose.
+            foot_rises: how much each foot rises, "l" and "r".
         """
         weights = self._get_tensor("weights", posed.device)
         rise = torch.zeros_like(posed[:, 2])
-        for side, foot_rise in raised.items():
+        for side, foot_rise in foot_rises.items():
             thigh, calf, foot = (
                 self._bones.index(f"{bone}_{side}")
                 for bone in ("thigh", "calf", "foot")
             )
-            hip_height = (turns[thigh] @ joints[thigh] + shifts[thigh])[2]
-            ankle_height = (turns[foot] @ joints[foot] + shifts[foot])[2]
+            hip_height = (rotations[thigh] @ joints[thigh] + translations[thigh])[2]
+            ankle_height = (rotations[foot] @ joints[foot] + translations[foot])[2]
             below_hip = (
                 (hip_height - posed[:, 2]) / (hip_height - ankle_height)
             ).clamp(0.0, 1.0)
@@ -298,74 +348,96 @@ class Person:
         """Return one of the tensors on a device."""
         return self._tensors[name].to(device)
 
-    def _mix_phenotype(self, number: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def _mix_phenotype(
+        self, number_by_name: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Tensor]:
         """Return the mixture of extreme bodies, and the scale that it still needs.
 
         Returns:
             (G, A, W, H) weights of the extremes of gender, age, weight and height,
             which sum to 1; and the factor to the requested height.
         """
-        gender = torch.stack([1.0 - number["gender"], number["gender"]])
-        age = compute_interpolation_weights(
-            number["age"], number["age"].new_tensor(AGES)
+        gender_weights = torch.stack(
+            [1.0 - number_by_name["gender"], number_by_name["gender"]]
         )
-        weight = compute_interpolation_weights(
-            number["weight"], number["weight"].new_tensor([0.0, 0.5, 1.0])
+        age_weights = compute_interpolation_weights(
+            number_by_name["age"], number_by_name["age"].new_tensor(AGES)
         )
-        mixture = torch.einsum("g,a,w->gaw", gender, age, weight)
+        weight_weights = compute_interpolation_weights(
+            number_by_name["weight"],
+            number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
+        )
+        mixture = torch.einsum(
+            "g,a,w->gaw", gender_weights, age_weights, weight_weights
+        )
         statures = torch.einsum(
             "gaw,gawh->h", mixture, self._get_tensor("stature", mixture.device)
         )
-        requested = number["height"]
-        clamped = torch.minimum(torch.maximum(requested, statures[0]), statures[2])
-        height = compute_interpolation_weights(clamped, statures)
-        return mixture[..., None] * height, requested / (height * statures).sum()
+        requested_height = number_by_name["height"]
+        clamped_height = torch.minimum(
+            torch.maximum(requested_height, statures[0]), statures[2]
+        )
+        height_weights = compute_interpolation_weights(clamped_height, statures)
+        return mixture[..., None] * height_weights, requested_height / (
+            height_weights * statures
+        ).sum()
 
     def _pose_bones(
-        self, joints: Tensor, angle: Mapping[str, Tensor]
+        self, joints: Tensor, angle_by_joint: Mapping[str, Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """Return the turn (J, 3, 3) and shift (J, 3) of each bone.
+        """Return the rotation (J, 3, 3) and translation (J, 3) of each bone.
 
-        A point p moves to `turn @ p + shift`.
+        A point p moves to `rotation @ p + translation`. Bones come after their parents.
+        A bone's rotation is that of its parent's joint times its own joint's, after the
+        one that makes it straight in the rest pose; its joint goes where the parent
+        bone puts it.
         """
-        straight = self._compute_straight_turns(joints)
-        joint_turns = compute_joint_turns(angle)
+        straight_rotations = self._compute_straight_turns(joints)
+        rotation_by_bone = compute_joint_turns(angle_by_joint)
         identity = torch.eye(3, device=joints.device, dtype=joints.dtype)
-        global_turns = list[Tensor]()
-        turns = list[Tensor]()
+        joint_rotations = list[Tensor]()
+        rotations = list[Tensor]()
         positions = list[Tensor]()
         for index, (bone, parent) in enumerate(
             zip(self._bones, self._parents, strict=True)
         ):
-            turn = joint_turns.get(bone, identity)
-            global_turns.append(turn if parent < 0 else global_turns[parent] @ turn)
-            turns.append(global_turns[-1] @ straight.get(bone, identity))
+            rotation = rotation_by_bone.get(bone, identity)
+            joint_rotations.append(
+                rotation if parent < 0 else joint_rotations[parent] @ rotation
+            )
+            rotations.append(
+                joint_rotations[-1] @ straight_rotations.get(bone, identity)
+            )
             if parent < 0:
                 positions.append(joints[index])
             else:
                 bone_vector = joints[index] - joints[parent]
-                positions.append(positions[parent] + turns[parent] @ bone_vector)
-        stacked = torch.stack(turns)
-        return stacked, torch.stack(positions) - torch.einsum(
-            "jik,jk->ji", stacked, joints
+                positions.append(positions[parent] + rotations[parent] @ bone_vector)
+        all_rotations = torch.stack(rotations)
+        return all_rotations, torch.stack(positions) - torch.einsum(
+            "jik,jk->ji", all_rotations, joints
         )
 
     def _compute_straight_turns(self, joints: Tensor) -> dict[str, Tensor]:
-        """Return the turns (3, 3) of limbs from the rest pose to all angles 0."""
-        straight = dict[str, Tensor]()
+        """Return the rotations (3, 3) of limbs from the rest pose to all angles 0, by
+        bone.
+
+        Hands follow the forearm, turned by 60 degrees about the vertical.
+        """
+        rotations = dict[str, Tensor]()
         for side, sign in (("l", 1.0), ("r", -1.0)):
             for bone, (end, (x, y, z)) in STRAIGHT.items():
                 start_point, end_point = (
                     joints[self._bones.index(f"{name}_{side}")] for name in (bone, end)
                 )
-                straight[f"{bone}_{side}"] = compute_least_rotation(
+                rotations[f"{bone}_{side}"] = compute_least_rotation(
                     end_point - start_point, joints.new_tensor([x, sign * y, z])
                 )
-            straight[f"hand_{side}"] = (
-                rotation_about("z", joints.new_tensor(sign * 60.0))
-                @ straight[f"lowerarm_{side}"]
+            rotations[f"hand_{side}"] = (
+                make_axis_rotation("z", joints.new_tensor(sign * 60.0))
+                @ rotations[f"lowerarm_{side}"]
             )
-        return straight
+        return rotations
 
 
 @lru_cache(maxsize=1)
@@ -381,8 +453,10 @@ def load_body() -> Mapping[str, np.ndarray]:
 def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     """Return the weights (n,) of linear interpolation between rising nodes (n,).
 
-    They sum to 1 from the first node to the last.
+    They sum to 1 from the first node to the last, and beyond these the nearest node has
+    all of the weight.
     """
+    # How far the value is through each of the n - 1 intervals.
     fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
     # At a node the derivative is that of one side, not the sum of both.
     is_within = (fraction >= 0.0) & (fraction < 1.0)
@@ -392,16 +466,20 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     )
 
 
-def add_walk(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the angles with those of the walk added, within each joint's limits."""
-    angle = dict(number)
-    phase = torch.deg2rad(number["walk"])
-    stride = number["stride"]
+    angle_by_joint = dict(angle_by_name)
+    phase = torch.deg2rad(angle_by_name["walk"])
+    stride = angle_by_name["stride"]
     for side, phase_shift in (("left", 0.0), ("right", np.pi)):
         for joint, tenths in GAIT.items():
             swing = _compute_gait_angle(tenths, phase, phase_shift)
-            angle[f"{side}_{joint}"] = angle[f"{side}_{joint}"] + stride * swing
-    angle["spine_turn"] = angle["spine_turn"] + stride * 5.0 * torch.cos(phase)
+            angle_by_joint[f"{side}_{joint}"] = (
+                angle_by_joint[f"{side}_{joint}"] + stride * swing
+            )
+    # The chest turns against the pelvis, by 5 degrees.
+    chest_turn = stride * 5.0 * torch.cos(phase)
+    angle_by_joint["spine_turn"] = angle_by_joint["spine_turn"] + chest_turn
     limits = {
         parameter.name: (parameter.low, parameter.high)
         for parameter in PARAMETERS
@@ -409,14 +487,17 @@ def add_walk(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
     }
     return {
         name: value.clamp(*limits[name]) if name in limits else value
-        for name, value in angle.items()
+        for name, value in angle_by_joint.items()
     }
 
 
 def _compute_gait_angle(
     tenths: Sequence[int], phase: Tensor, phase_shift: float
 ) -> Tensor:
-    """Return an angle of the gait at a phase, by a Fourier series of its samples."""
+    """Return an angle of the gait, degrees, at a phase in radians.
+
+    It is a Fourier series of the ten samples of a cycle, without the highest wave.
+    """
     waves = np.fft.rfft(tenths)[:5] / len(tenths)
     swing = phase.new_tensor(float(waves[0].real))
     for order, wave in enumerate(waves[1:], 1):
@@ -431,27 +512,29 @@ def _compute_gait_angle(
 def compute_contact(phase: Tensor) -> Tensor:
     """Return how much a foot is held to the ground, 0 to 1.
 
-    The phase is in degrees of the foot's cycle from its heel strike.
+    The phase is in degrees of the foot's cycle from its heel strike. It is 1 in stance
+    and 0 in the swing, with half a cosine wave in between.
     """
     degrees = torch.remainder(phase, 360.0)
-    lifted = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
-    lowered = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
-    return 0.5 + 0.5 * torch.cos(np.pi * (lifted - lowered))
+    lift_phase = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
+    lower_phase = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
+    return 0.5 + 0.5 * torch.cos(np.pi * (lift_phase - lower_phase))
 
 
 def skin_points(
-    points: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor
+    points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor
 ) -> Tensor:
     """Return points moved with bones: linear blend skinning.
 
     Args:
         points: (P, 3).
         weights: (P, J).
-        turns: (J, 3, 3) of the bones.
-        shifts: (J, 3).
+        rotations: (J, 3, 3) of the bones.
+        translations: (J, 3).
     """
+    # (P, 12): the weighted mean of the bones' rotations and translations
     blended = torch.einsum(
-        "pj,jk->pk", weights, torch.cat([turns.reshape(-1, 9), shifts], dim=1)
+        "pj,jk->pk", weights, torch.cat([rotations.reshape(-1, 9), translations], dim=1)
     )
     return (
         torch.einsum("pik,pk->pi", blended[:, :9].reshape(-1, 3, 3), points)
@@ -464,49 +547,54 @@ def _correct_heights(
 ) -> dict[str, Tensor]:
     """Return how much each foot has to rise to touch the ground.
 
+    The ground lies at the mean height of both feet, weighted by their contacts. A foot
+    goes there, or keeps its height above it as far as it has no contact.
+
     Args:
         lowest: height of the lowest point of each foot, "l" and "r".
         contact: of each foot with the ground, 0 to 1.
         amount: () fraction of the correction that is made.
     """
-    ground = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
+    ground_height = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (
         contact["l"] + contact["r"]
     )
-    raised = dict[str, Tensor]()
+    rises = dict[str, Tensor]()
     for side, height in lowest.items():
-        clearance = (height - ground).clamp(min=0.0) * (1.0 - contact[side])
-        raised[side] = amount * (ground + clearance - height)
-    return raised
+        clearance = (height - ground_height).clamp(min=0.0) * (1.0 - contact[side])
+        rises[side] = amount * (ground_height + clearance - height)
+    return rises
 
 
 def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return each bone's turn (3, 3) against its parent, of joint angles in degrees."""
+    """Return each bone's rotation (3, 3) against its parent, of joint angles in
+    degrees.
+    """
     # The back bends in three equal parts, neck and head share the nod.
     spine, side, turn = (
         angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
     )
-    bend = (
-        rotation_about("y", spine)
-        @ rotation_about("x", -side)
-        @ rotation_about("z", turn)
+    spine_rotation = (
+        make_axis_rotation("y", spine)
+        @ make_axis_rotation("x", -side)
+        @ make_axis_rotation("z", turn)
     )
-    nod = rotation_about("z", angle["neck_turn"] / 2.0) @ rotation_about(
-        "y", angle["neck"] / 2.0
-    )
-    turns = {
-        "spine_01": bend,
-        "spine_02": bend,
-        "spine_03": bend,
-        "neck_01": nod,
-        "head": nod,
+    neck_rotation = make_axis_rotation(
+        "z", angle["neck_turn"] / 2.0
+    ) @ make_axis_rotation("y", angle["neck"] / 2.0)
+    rotations = {
+        "spine_01": spine_rotation,
+        "spine_02": spine_rotation,
+        "spine_03": spine_rotation,
+        "neck_01": neck_rotation,
+        "head": neck_rotation,
     }
-    turns |= _compute_limb_turns(angle, "left", 1.0)
-    turns |= _compute_limb_turns(angle, "right", -1.0)
-    return turns
+    rotations |= _compute_limb_turns(angle, "left", 1.0)
+    rotations |= _compute_limb_turns(angle, "right", -1.0)
+    return rotations
 
 
 def _compute_limb_turns(
-    angle: Mapping[str, Tensor], side: str, sign: float
+    angle_by_joint: Mapping[str, Tensor], side: str, sign: float
 ) -> dict[str, Tensor]:
     """Return the turns (3, 3) of the bones of arm and leg of a side.
 
@@ -515,35 +603,35 @@ def _compute_limb_turns(
         side: "left" or "right".
         sign: 1 for the left, -1 for the right, which is its mirror image.
     """
-    limb = {joint: angle[f"{side}_{joint}"] for joint, *_ in LIMBS}
+    limb_angles = {joint: angle_by_joint[f"{side}_{joint}"] for joint, *_ in LIMBS}
     suffix = side[0]
-    turns = dict[str, Tensor]()
-    raised = rotation_about("x", sign * limb["shoulder_out"]) @ rotation_about(
-        "y", -limb["shoulder"]
-    )
-    shoulder_turn = rotation_about("z", -sign * limb["shoulder_turn"])
-    turns[f"upperarm_{suffix}"] = raised @ shoulder_turn
-    turns[f"lowerarm_{suffix}"] = rotation_about("y", -limb["elbow"])
-    turns[f"thigh_{suffix}"] = rotation_about(
-        "x", sign * limb["hip_out"]
-    ) @ rotation_about("y", -limb["hip"])
-    turns[f"calf_{suffix}"] = rotation_about("y", limb["knee"])
-    turns[f"foot_{suffix}"] = rotation_about("y", -limb["ankle"])
-    return turns
+    rotations = dict[str, Tensor]()
+    shoulder_rotation = make_axis_rotation(
+        "x", sign * limb_angles["shoulder_out"]
+    ) @ make_axis_rotation("y", -limb_angles["shoulder"])
+    shoulder_turn = make_axis_rotation("z", -sign * limb_angles["shoulder_turn"])
+    rotations[f"upperarm_{suffix}"] = shoulder_rotation @ shoulder_turn
+    rotations[f"lowerarm_{suffix}"] = make_axis_rotation("y", -limb_angles["elbow"])
+    rotations[f"thigh_{suffix}"] = make_axis_rotation(
+        "x", sign * limb_angles["hip_out"]
+    ) @ make_axis_rotation("y", -limb_angles["hip"])
+    rotations[f"calf_{suffix}"] = make_axis_rotation("y", limb_angles["knee"])
+    rotations[f"foot_{suffix}"] = make_axis_rotation("y", -limb_angles["ankle"])
+    return rotations
 
 
-def rotation_about(axis: str, degrees: Tensor) -> Tensor:
+def make_axis_rotation(axis: str, degrees: Tensor) -> Tensor:
     """Return the right-handed rotation (3, 3) about an axis of the body."""
-    c = torch.cos(torch.deg2rad(degrees))
-    s = torch.sin(torch.deg2rad(degrees))
-    zeros = torch.zeros_like(c)
-    ones = torch.ones_like(c)
-    rows = {
-        "x": (ones, zeros, zeros, zeros, c, -s, zeros, s, c),
-        "y": (c, zeros, s, zeros, ones, zeros, -s, zeros, c),
-        "z": (c, -s, zeros, s, c, zeros, zeros, zeros, ones),
+    cosine = torch.cos(torch.deg2rad(degrees))
+    sine = torch.sin(torch.deg2rad(degrees))
+    zeros = torch.zeros_like(cosine)
+    ones = torch.ones_like(cosine)
+    entries = {
+        "x": (ones, zeros, zeros, zeros, cosine, -sine, zeros, sine, cosine),
+        "y": (cosine, zeros, sine, zeros, ones, zeros, -sine, zeros, cosine),
+        "z": (cosine, -sine, zeros, sine, cosine, zeros, zeros, zeros, ones),
     }
-    return torch.stack(rows[axis]).reshape(3, 3)
+    return torch.stack(entries[axis]).reshape(3, 3)
 
 
 def compute_least_rotation(begin: Tensor, end: Tensor) -> Tensor:

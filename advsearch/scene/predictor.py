@@ -51,9 +51,10 @@ class Predictor(ABC):
     """Predict the images of a space without noise; differentiable.
 
     Args:
-        path_renderer: a renderer of the space, which traces paths.
+        traced: a renderer of the space, which traces paths.
 
     Attributes:
+        path_renderer: that renderer.
         non_finite: how many values were not finite while it was made, and were set to
             zero.
     """
@@ -102,7 +103,10 @@ class Predictor(ABC):
 
 
 def inputs_differ(first: Tensor | None, second: Tensor | None) -> bool:
-    """Return whether two inputs of a scene are not the same, bit for bit."""
+    """Return whether two inputs of a scene are not the same, bit for bit.
+
+    A missing one (None) differs from any other, and from a missing one.
+    """
     return (
         first is None
         or second is None
@@ -124,6 +128,7 @@ class LinearMap(torch.autograd.Function):
         transposed_times: Callable[[Tensor], Tensor],
         values: Tensor,
     ) -> Tensor:
+        """Return the map's `values`, and store its transpose for the derivative."""
         ctx.transpose = transposed_times, times
         return times(values.detach())
 

@@ -54,6 +54,7 @@ def rasterize_triangles(
         For each pixel of each triangle, triangle by triangle, the triangle, row and
         column (N,), and the corners' barycentric weights (N, 3).
     """
+    # Wide: which of the candidates lie in a triangle is decided by their weights.
     face, row, column = find_candidate_pixels(corners, shape, 10.0 * PIXEL_TOLERANCE)
     weights = compute_barycentric(corners[face], row, column)
     inside = (weights >= -tolerance).all(axis=1)
@@ -71,11 +72,11 @@ def find_candidate_pixels(
     Returns:
         Triangle, row and column (N,).
     """
-    face, row = _integers_within(
+    face, row = _list_integers_within(
         corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), shape[0], tolerance
     )
     left, right = _cross_rows(corners[face], row, tolerance)
-    span, column = _integers_within(left, right, shape[1], tolerance)
+    span, column = _list_integers_within(left, right, shape[1], tolerance)
     return face[span], row[span], column
 
 
@@ -83,16 +84,18 @@ def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray
     """Return the texels (h, w) that bilinear look-ups in triangles read.
 
     Look-ups repeat at the border. The triangles (F, 3, 2) are as for
-    `rasterize_triangles`, at most half a texel outside of the texture.
+    `rasterize_triangles`, at most half a texel outside of the texture. A look-up reads
+    the cell between four texels that it falls into: its first texel, and the next row
+    and column.
     """
-    # A look-up between two texels is in the cell of the first; -1 is the last one
-    # again.
+    # Cells have the index of their first texel. They begin at texel -1, which is the
+    # last one again: shifted by 1, indices begin at 0.
     shifted = corners + 1.0
     lowest_row = np.floor(shifted[..., 1].min(axis=1) - PIXEL_TOLERANCE)
     highest_row = np.floor(shifted[..., 1].max(axis=1) + PIXEL_TOLERANCE)
-    face, row = _integers_within(lowest_row, highest_row, shape[0] + 1, 0.0)
-    left, right = _span_of_rows(shifted[face], row)
-    span, column = _integers_within(
+    face, row = _list_integers_within(lowest_row, highest_row, shape[0] + 1, 0.0)
+    left, right = _find_column_span(shifted[face], row)
+    span, column = _list_integers_within(
         np.floor(left - PIXEL_TOLERANCE),
         np.floor(right + PIXEL_TOLERANCE),
         shape[1] + 1,
@@ -101,19 +104,20 @@ def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray
     is_read = np.zeros(shape, np.bool_)
     for row_offset in (0, 1):
         for column_offset in (0, 1):
+            # back from the shifted index of the cell
             read_row = (row[span] - 1 + row_offset) % shape[0]
             read_column = (column - 1 + column_offset) % shape[1]
             is_read[read_row, read_column] = True
     return is_read
 
 
-def _span_of_rows(
+def _find_column_span(
     corners: Float64Array, row: IntArray
 ) -> tuple[Float64Array, Float64Array]:
     """Return the columns that triangles (N, 3, 2) have between a row (N,) and the next.
 
-    The first and the last column are in the triangle's corners, or where its edges
-    cross one of the two rows.
+    The first and the last column are those of the triangle's corners in between, or of
+    where its edges cross one of the two rows. It is (inf, -inf) if there are none.
     """
     rows = row[:, None]
     y = corners[..., 1]
@@ -121,9 +125,13 @@ def _span_of_rows(
     left = np.where(is_between, corners[..., 0], np.inf).min(axis=1)
     right = np.where(is_between, corners[..., 0], -np.inf).max(axis=1)
     for offset in (0, 1):
-        first, last = _cross_rows(corners, row + offset, PIXEL_TOLERANCE)
-        left = np.where(first <= last, np.minimum(left, first), left)
-        right = np.where(first <= last, np.maximum(right, last), right)
+        first_column, last_column = _cross_rows(corners, row + offset, PIXEL_TOLERANCE)
+        left = np.where(
+            first_column <= last_column, np.minimum(left, first_column), left
+        )
+        right = np.where(
+            first_column <= last_column, np.maximum(right, last_column), right
+        )
     return left, right
 
 
@@ -139,9 +147,9 @@ def compute_barycentric(
     cx, cy = corners[:, 2].T
     with np.errstate(all="ignore"):
         scale = 1.0 / compute_doubled_areas(corners)
-        second = ((column - ax) * (cy - ay) - (row - ay) * (cx - ax)) * scale
-        third = ((bx - ax) * (row - ay) - (by - ay) * (column - ax)) * scale
-        return np.stack([1.0 - second - third, second, third], axis=-1)
+        weight_b = ((column - ax) * (cy - ay) - (row - ay) * (cx - ax)) * scale
+        weight_c = ((bx - ax) * (row - ay) - (by - ay) * (column - ax)) * scale
+        return np.stack([1.0 - weight_b - weight_c, weight_b, weight_c], axis=-1)
 
 
 def compute_doubled_areas(corners: Float64Array) -> Float64Array:
@@ -151,42 +159,44 @@ def compute_doubled_areas(corners: Float64Array) -> Float64Array:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _integers_within(
-    lower: Float64Array, upper: Float64Array, size: int, miss: float
+def _list_integers_within(
+    lower: Float64Array, upper: Float64Array, size: int, tolerance: float
 ) -> tuple[IntArray, IntArray]:
     """List the integers of many intervals within [0, size - 1].
 
-    The intervals are [lower, upper], wider by `miss` on each side.
+    The intervals are [lower, upper] (N,), wider by `tolerance` on each side; an empty
+    one has no integer.
 
     Returns:
-        The index of the interval, and the integer.
+        The index of the interval, and the integer, interval by interval.
     """
-    first = np.maximum(np.ceil(lower - miss), 0.0).astype(np.int64)
-    last = np.minimum(np.floor(upper + miss), size - 1.0).astype(np.int64)
-    counts = np.maximum(last - first + 1, 0)
+    first_integer = np.maximum(np.ceil(lower - tolerance), 0.0).astype(np.int64)
+    last_integer = np.minimum(np.floor(upper + tolerance), size - 1.0).astype(np.int64)
+    counts = np.maximum(last_integer - first_integer + 1, 0)
     interval = np.repeat(np.arange(len(counts)), counts)
     start = np.cumsum(counts) - counts
-    value = first[interval] + np.arange(len(interval)) - start[interval]
-    return interval, value
+    integer = first_integer[interval] + np.arange(len(interval)) - start[interval]
+    return interval, integer
 
 
 def _cross_rows(
-    corners: Float64Array, row: IntArray, miss: float
+    corners: Float64Array, row: IntArray, tolerance: float
 ) -> tuple[Float64Array, Float64Array]:
     """Return the first and last column (N,) of triangles (N, 3, 2) on rows (N,).
 
-    An empty range is 0 to -1.
+    They are those of the edges that cross a row, which may miss it by `tolerance`;
+    level edges do not count. An empty range is 0 to -1.
     """
     left = np.full(len(row), np.inf)
     right = np.full(len(row), -np.inf)
-    for first, second in ((0, 1), (1, 2), (2, 0)):
-        x0, y0 = corners[:, first].T
-        x1, y1 = corners[:, second].T
+    for start_corner, end_corner in ((0, 1), (1, 2), (2, 0)):
+        x0, y0 = corners[:, start_corner].T
+        x1, y1 = corners[:, end_corner].T
         rise = y1 - y0
         fraction = np.clip((row - y0) / np.where(rise == 0.0, 1.0, rise), 0.0, 1.0)
         crosses = (
-            (np.minimum(y0, y1) - miss <= row)
-            & (row <= np.maximum(y0, y1) + miss)
+            (np.minimum(y0, y1) - tolerance <= row)
+            & (row <= np.maximum(y0, y1) + tolerance)
             & (rise != 0.0)
         )
         x = x0 + fraction * (x1 - x0)
@@ -233,7 +243,9 @@ class Charts:
         )
 
     def compute_normals(self) -> Float32Array:
-        """Return (h, w, 3) unit shading normals."""
+        """Return (h, w, 3) unit shading normals; those of faces where normals cancel
+        out.
+        """
         corners = self.mesh.normals[self.mesh.faces[self.face]]
         normals = np.einsum("hwk,hwkc->hwc", self.weights, corners)
         lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -248,13 +260,13 @@ class Charts:
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         face_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
-        texels = np.abs(
+        texels_per_face = np.abs(
             compute_doubled_areas(
                 _to_texel_coordinates(self.mesh, self.is_covered.shape)
             )
         )
         area_per_texel = np.where(
-            texels > 0.0, face_areas / np.maximum(texels, 1e-12), 0.0
+            texels_per_face > 0.0, face_areas / np.maximum(texels_per_face, 1e-12), 0.0
         )
         return np.where(self.is_covered, area_per_texel[self.face], 0.0).astype(
             np.float32
@@ -272,20 +284,21 @@ def find_exclusive_texels(
         shape: height and width of the texture.
 
     Returns:
-        (h, w) texels that no look-up on other faces reads, and their fraction of those
-        that look-ups on these faces read.
+        (h, w) texels that look-ups on these faces read and none on other faces does,
+        and their fraction of those that look-ups on these faces read.
     """
     corners = _to_texel_coordinates(mesh, shape)
     is_selected = np.isin(np.arange(len(mesh.faces)), faces)
-    read = find_read_texels(corners[is_selected], shape)
-    exclusive = read & ~find_read_texels(corners[~is_selected], shape)
-    return exclusive, float(exclusive.sum()) / max(1, int(read.sum()))
+    is_read = find_read_texels(corners[is_selected], shape)
+    is_exclusive = is_read & ~find_read_texels(corners[~is_selected], shape)
+    return is_exclusive, float(is_exclusive.sum()) / max(1, int(is_read.sum()))
 
 
 def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights of every texel of a texture.
 
-    Where charts overlap, one of their faces wins.
+    Where charts overlap, the last of their faces wins. A texel in no chart has the
+    values of the nearest one that is.
 
     Args:
         mesh: with texture coordinates.
@@ -304,7 +317,7 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
             "again"
         )
     points = np.stack([column, row], axis=1)
-    weights = _clipped_weights(corners[face], points)
+    weights = _compute_clipped_weights(corners[face], points)
     face_map = np.zeros(shape, np.int64)
     weight_map = np.zeros((*shape, 3))
     covered = np.zeros(shape, np.bool_)
@@ -316,16 +329,17 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     return Charts(mesh, face_map[nearest], weight_map[nearest], covered, distance)
 
 
-def _clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
+def _compute_clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
     """Return the barycentric weights (N, 3) of points, clipped to their triangles."""
     doubled = compute_doubled_areas(corners)
+    # A triangle without area has even weights, see below.
     divisor = np.where(doubled == 0.0, 1.0, doubled)
-    columns = []
-    for first, second in ((1, 2), (2, 0), (0, 1)):
-        a = corners[:, first] - points
-        b = corners[:, second] - points
-        columns.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / divisor)
-    weights = np.maximum(np.stack(columns, axis=1), 0.0)
+    corner_weights = []
+    for next_corner, previous_corner in ((1, 2), (2, 0), (0, 1)):
+        a = corners[:, next_corner] - points
+        b = corners[:, previous_corner] - points
+        corner_weights.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / divisor)
+    weights = np.maximum(np.stack(corner_weights, axis=1), 0.0)
     total = weights.sum(axis=1, keepdims=True)
     return np.where(total > 0.0, weights / np.maximum(total, 1e-12), 1.0 / 3.0)
 
@@ -358,9 +372,14 @@ def look_up_texture(
 
 
 class MeshSurface:
-    """The faces of a mesh, prepared for rays and for neighbourhoods."""
+    """The faces of a mesh, prepared for rays and for neighbourhoods.
+
+    Attributes:
+        normals: (F, 3) unit normals of the faces.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
+        """Compute boxes and normals of the faces, and which faces are neighbours."""
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
@@ -370,9 +389,11 @@ class MeshSurface:
         edges = np.concatenate(
             [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
         )
+        # Sorted by their vertices, two sides of faces with the same edge are neighbours.
         edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
         is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
+        # The edges are in three blocks, of one edge of each face.
         face = order % len(mesh.faces)
         self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 
@@ -393,6 +414,7 @@ class MeshSurface:
         if np.isfinite(distance).any():
             face = int(distance.argmin())
             return face, origin + distance[face] * direction
+        # length of the cross product with a unit vector: the distance from the line
         to_corners = np.cross(self._corners - origin, direction)
         line_distance = np.linalg.norm(to_corners, axis=-1)
         face, corner = np.unravel_index(line_distance.argmin(), line_distance.shape)
@@ -401,7 +423,8 @@ class MeshSurface:
     def _intersect(self, origin: Float64Array, direction: Float64Array) -> Float64Array:
         """Return the distance (F,) at which a ray meets each face, or infinity.
 
-        Moeller and Trumbore 1997, all faces at once.
+        Moeller and Trumbore 1997, all faces at once, with the letters of the paper; a
+        ray in the plane of a face does not meet it.
         """
         a = self._corners[:, 0]
         b = self._corners[:, 1]
@@ -418,6 +441,7 @@ class MeshSurface:
         q = np.cross(t, b - a)
         v = (q @ direction) * inverse
         distance = ((c - a) * q).sum(axis=1) * inverse
+        # so that no ray slips through between two faces
         slack = 1e-9
         is_hit = (inverse != 0.0) & (u >= -slack) & (v >= -slack)
         is_hit &= (u + v <= 1.0 + slack) & (distance > 0.0)
@@ -428,17 +452,18 @@ class MeshSurface:
     ) -> BoolArray:
         """Return the faces (F,) around a point that are connected to a face.
 
-        They lie within a radius of the point (3,), face a direction (3,), and are
-        reached from the face, which always counts, over edges between such faces. The
-        other wall of a cup, or the next slat of a chair, are not.
+        Their bounding boxes reach within a radius of the point (3,), they face a
+        direction (3,), and are reached from the face, which always counts, over edges
+        between such faces. The other wall of a cup, or the next slat of a chair, are
+        not.
         """
-        gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
-        is_near = np.linalg.norm(gap, axis=1) <= radius
-        inside = is_near & (self.normals @ normal > 0.0)
-        inside[face] = True
-        links = self._neighbours[inside[self._neighbours].all(axis=1)]
-        labels = find_components(len(inside), *links.T)
-        return np.asarray(inside & (labels == labels[face]))
+        box_gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
+        is_near = np.linalg.norm(box_gap, axis=1) <= radius
+        is_inside = is_near & (self.normals @ normal > 0.0)
+        is_inside[face] = True
+        links_inside = self._neighbours[is_inside[self._neighbours].all(axis=1)]
+        labels = find_components(len(is_inside), *links_inside.T)
+        return np.asarray(is_inside & (labels == labels[face]))
 
 
 def weld_vertices(mesh: Mesh) -> tuple[IntArray, int]:

@@ -43,7 +43,8 @@ from advsearch.scene.gradients import (
     forbid_second_derivatives,
     make_first_plan,
 )
-from advsearch.scene.mitsuba_backend.denoise import denoise
+from advsearch.scene.image_quality import blur_image
+from advsearch.scene.mitsuba_backend.denoise import denoise_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
 from advsearch.scene.window import Window
@@ -56,7 +57,8 @@ Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 Predict = Callable[[Mapping[str, Tensor]], Tensor]
 """From scene inputs to linear radiance (H, W, 3); differentiable.
 
-It is (H, W, 4) with coverage where there is a backdrop.
+It is (H, W, 4) with coverage where there is a backdrop, and (H, W, 7) with the change
+of the plane that takes the shadow in a photograph.
 """
 
 
@@ -343,11 +345,12 @@ class Renderer:
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
         with self.scene.limit_window(window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
-        traced = mean[..., :3] if window is None else window.select(mean)[..., :3]
-        clean = denoise(traced.contiguous(), albedo, normal)
+        traced = mean if window is None else window.select(mean)
+        plane_radiance = self.scene.plane_radiance if hide else None
+        clean = denoise_image(traced, albedo, normal, plane_radiance)
         if self.crop is not None:
-            clean = self.crop.window.paste(clean, self.crop.surroundings[..., :3])
-        return halves, torch.cat([clean, mean[..., 3:]], dim=-1)
+            clean = self.crop.window.paste(clean, self.crop.surroundings)
+        return halves, clean
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration (d,), without a
@@ -383,6 +386,11 @@ class Renderer:
             surfaces = self.scene.find_surfaces(
                 _select_scene_inputs(inputs), subdivision
             )
+            if "backdrop.front" in inputs:
+                is_hidden = inputs["backdrop.front"][..., 0] > 0.5
+                for dim in (0, 1):
+                    is_hidden = is_hidden.repeat_interleave(subdivision, dim)
+                surfaces.id[is_hidden] = 0
         metres = self.scene.definition[0].metres
         return replace(
             surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
@@ -427,7 +435,7 @@ class Renderer:
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         difference_spp = self.plan.spp or spp
         with torch.no_grad():
-            for group in self.plan.groups_with("secant"):
+            for group in self.plan.select_groups("secant"):
                 write_central_differences(
                     lambda at: loss(self._render_image(at, noise_seed, difference_spp)),
                     group,
@@ -554,19 +562,19 @@ class Renderer:
 
     @torch.no_grad()
     def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
-        """Return by how much a denoiser changes radiance (H, W, 3 or 4).
+        """Return by how much a denoiser changes an image (H, W, 3, 4 or 7).
 
         `guides` are albedo and normals (H, W, 6).
         """
-        noisy = exposed[..., :3].contiguous()
-        clean = denoise(
-            noisy,
+        has_plane = exposed.shape[-1] > 4
+        clean = denoise_image(
+            exposed,
             guides[..., :3].contiguous(),
             guides[..., 3:].contiguous(),
+            self.scene.plane_radiance if has_plane else None,
             quick=self.formation.quick,
         )
-        no_coverage = torch.zeros_like(exposed[..., 3:])
-        return torch.cat([clean - noisy, no_coverage], dim=-1)
+        return clean - exposed
 
     def finish_image(
         self,
@@ -579,22 +587,52 @@ class Renderer:
         """Return the image of rendered radiance.
 
         Args:
-            rendered: radiance (H, W, 3), or (H, W, 4) with coverage.
+            rendered: radiance (H, W, 3), or (H, W, 4) with coverage, or (H, W, 7) with
+                the change of the plane that takes the shadow.
             inputs: scene inputs, of which exposure and backdrop are applied.
             u: configuration, for what controls do to the finished image.
             display: if False, return the radiance that is to be displayed.
         """
         exposure = inputs.get("camera.exposure")
         backdrop = inputs.get("backdrop.color")
+        if "backdrop.blur" in inputs:
+            rendered = blur_image(rendered, float(inputs["backdrop.blur"]))
         radiance = rendered[..., :3]
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)
         if backdrop is not None:
-            uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
-            radiance = radiance + uncovered * (backdrop / self.formation.gain)
+            radiance = self._compose(radiance, rendered, inputs)
         if not display:
             return radiance
-        return self.space.apply_to_image(u, self.formation.display(radiance))
+        image = self.formation.display(radiance)
+        if "backdrop.noise" in inputs:
+            coverage = rendered[..., 3:4].detach()
+            if "backdrop.front" in inputs:
+                coverage = coverage * (1.0 - inputs["backdrop.front"])
+            image = (image + coverage * inputs["backdrop.noise"]).clamp(0.0, 1.0)
+        return self.space.apply_to_image(u, image)
+
+    def _compose(
+        self, radiance: Tensor, rendered: Tensor, inputs: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Return radiance (H, W, 3) over its backdrop, see `advsearch.scene.backdrop`.
+
+        Args:
+            radiance: times its coverage.
+            rendered: the same with coverage and change of the plane.
+            inputs: of the scene.
+        """
+        behind = inputs["backdrop.color"] / self.formation.gain
+        shade = (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0)
+        if "backdrop.plane" in inputs:
+            change = rendered[..., 4:] / inputs["backdrop.plane"]
+            shade = (shade + change).clamp_min(0.0)
+        composed = radiance + shade * behind
+        if "backdrop.front" not in inputs:
+            return composed
+        return torch.lerp(
+            composed, behind.expand_as(composed), inputs["backdrop.front"]
+        )
 
     def render_radiance(
         self,
@@ -617,7 +655,8 @@ class Renderer:
             denoised: denoise it if the formation requires it.
 
         Returns:
-            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden.
+            (H, W, 3), or (H, W, 4) with coverage if the environment is hidden, or (H,
+            W, 7) with the change of the plane that takes the shadow in a photograph.
         """
         if self._predict is not None:
             return self._predict(inputs)
@@ -640,7 +679,7 @@ class Renderer:
 
     def _groups_by_differences(self) -> tuple[Group, ...]:
         """Return the groups that use differences."""
-        return self.plan.groups_with(*(DIFFERENCE_ESTIMATORS - self._left_out))
+        return self.plan.select_groups(*(DIFFERENCE_ESTIMATORS - self._left_out))
 
     def compute_differences(
         self, u: Tensor, cotangent: Tensor, seed: int, spp: int
@@ -791,13 +830,13 @@ class _Radiance(torch.autograd.Function):
                 )
         rendered = renderer.replace_non_finite(rendered)
         for guide in guides:
-            clean = denoise(
-                rendered[..., :3].contiguous(),
+            rendered = denoise_image(
+                rendered,
                 guide[..., :3],
                 guide[..., 3:],
+                renderer.scene.plane_radiance if hide else None,
                 quick=renderer.formation.quick,
             )
-            rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
         renderer.renders += 1
         return rendered
 
@@ -812,7 +851,7 @@ class _Radiance(torch.autograd.Function):
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
-        cotangent = renderer.replace_non_finite(cotangent[..., :3])
+        cotangent = renderer.replace_non_finite(cotangent)
         by_input = dict[str, Tensor]()
         remaining = list(inputs)
         # what two reach goes to the more general one
@@ -825,7 +864,7 @@ class _Radiance(torch.autograd.Function):
             if estimator == "material":
                 meshes = sorted({name.rpartition(".")[0] for name in wrt})
                 gradients = renderer.scene.render_material_adjoint(
-                    inputs, cotangent, noise_seed, ctx.spp, meshes=meshes
+                    inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
                 )
             else:
                 method = "hidden" if ctx.hide else "path"
@@ -846,7 +885,7 @@ def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
     Of the interior adjoint, only those that it differentiates correctly count.
     """
     reached: frozenset[str] = frozenset()
-    for group in renderer.plan.groups_with(estimator):
+    for group in renderer.plan.select_groups(estimator):
         reached |= renderer.routes.get(group.name, frozenset())
     return (
         reached & renderer.scene.interior_inputs if estimator == "adjoint" else reached

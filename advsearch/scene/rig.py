@@ -23,7 +23,7 @@ from advsearch.scene.assets import Float64Array, make_pose
 from advsearch.scene.camera_files import LENS_KEYS, MAX_JSON_SIZE, read_camera
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.geometry import make_rotation
-from advsearch.scene.skeleton import rotation_entries
+from advsearch.scene.skeleton import compute_rotation_entries
 from advsearch.trust.stored_files import (
     parse_json,
     parse_text,
@@ -76,20 +76,26 @@ class Mount:
     ) -> dict[str, Tensor]:
         """Return the scene inputs of this camera, given those of the first camera.
 
+        The first camera's pose, times the mount's, is turned about the vertical through
+        the object by the mount's azimuth. A field of view or a lens of its own replaces
+        the first's.
+
         Args:
             inputs: scene inputs of the first camera.
             first_pose: (4, 4) its pose, if the inputs have none.
             center: (3,) center of the object.
             unit_metres: length of a unit of the scene.
         """
-        pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
-        pose[:3, 3] /= unit_metres
-        turn = torch.eye(4)
-        turn[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
-        turn[:3, 3] = center - turn[:3, :3] @ center
+        mount_pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
+        mount_pose[:3, 3] /= unit_metres
+        orbit_rotation = torch.eye(4)
+        orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
+        orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
         camera_inputs = {
             **inputs,
-            "camera.to_world": turn @ inputs.get("camera.to_world", first_pose) @ pose,
+            "camera.to_world": orbit_rotation
+            @ inputs.get("camera.to_world", first_pose)
+            @ mount_pose,
         }
         if self.fov is not None:
             camera_inputs["camera.fov"] = torch.tensor([self.fov])
@@ -116,12 +122,12 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
         FileFormatError: there are more than `MAX_CAMERAS`, numbers that no camera has,
             or models of different kinds.
     """
-    path, _, which = spec.partition("#")
+    path, _, camera_names = spec.partition("#")
     if Path(path).name == COLMAP_IMAGES:
-        return _read_colmap(path, which)
-    if Path(path).suffix.lower() == ".json" and "," in which:
-        return _read_transforms(path, which)
-    if which or Path(spec).suffix.lower() not in (".yaml", ".yml"):
+        return _read_colmap(path, camera_names)
+    if Path(path).suffix.lower() == ".json" and "," in camera_names:
+        return _read_transforms(path, camera_names)
+    if camera_names or Path(spec).suffix.lower() not in (".yaml", ".yml"):
         return ()
     try:
         data = parse_yaml(read_text(Path(spec), "a camera file", MAX_YAML_BYTES))
@@ -156,9 +162,9 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
         )
     if len({mount.name for mount in mounts}) < len(mounts):
         raise FileFormatError(f"{spec}: expected a name of its own for each camera")
-    first = mounts[0]
-    is_moved = not np.allclose(first.pose, np.eye(4))
-    if is_moved or first.azimuth or first.delay:
+    first_mount = mounts[0]
+    is_moved = not np.allclose(first_mount.pose, np.eye(4))
+    if is_moved or first_mount.azimuth or first_mount.delay:
         raise FileFormatError(
             f"{spec}: the first camera is the scene's own; it takes "
             "no place, turn, around or later"
@@ -166,7 +172,11 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
 
 
 def _read_entry(spec: str, index: int, entry: Any) -> Mount:
-    """Return the camera of an entry of our own format."""
+    """Return the camera of an entry of our own format.
+
+    Each of `ENTRY_KEYS` may be missing: it stands where the first camera does, looks
+    the same way and has its lens. `index` counts from 0, for a name and errors.
+    """
     where = f"{spec}: camera {index + 1}"
     if not isinstance(entry, dict) or not set(entry) <= set(ENTRY_KEYS):
         raise FileFormatError(
@@ -181,7 +191,7 @@ def _read_entry(spec: str, index: int, entry: Any) -> Mount:
     angles = entry.get("turn", [0.0] * 3)
     yaw, pitch, roll = _parse_numbers(where, "turn", angles, 3, 3600.0)
     # About y, x and z.
-    turn = (
+    rotation = (
         make_rotation(0.0, yaw, 0.0)
         @ make_rotation(0.0, 0.0, pitch)
         @ make_rotation(roll, 0.0, 0.0)
@@ -189,8 +199,10 @@ def _read_entry(spec: str, index: int, entry: Any) -> Mount:
     position = _parse_numbers(
         where, "place", entry.get("place", [0.0] * 3), 3, MAX_DISTANCE
     )
-    pose = make_pose(turn, position)
-    (around,) = _parse_numbers(where, "around", [entry.get("around", 0.0)], 1, 3600.0)
+    pose = make_pose(rotation, position)
+    (orbit_angle,) = _parse_numbers(
+        where, "around", [entry.get("around", 0.0)], 1, 3600.0
+    )
     fov = None
     if "fov" in entry:
         (fov,) = _parse_numbers(where, "fov", [entry["fov"]], 1, 170.0)
@@ -198,12 +210,12 @@ def _read_entry(spec: str, index: int, entry: Any) -> Mount:
             raise FileFormatError(
                 f"{where}: fov: expected 1 to 170 degrees, got {fov:g}"
             )
-    (later,) = _parse_numbers(where, "later", [entry.get("later", 0.0)], 1, MAX_DELAY)
-    if later < 0.0:
+    (delay,) = _parse_numbers(where, "later", [entry.get("later", 0.0)], 1, MAX_DELAY)
+    if delay < 0.0:
         raise FileFormatError(
-            f"{where}: later: expected 0 to {MAX_DELAY:g} seconds, got {later:g}"
+            f"{where}: later: expected 0 to {MAX_DELAY:g} seconds, got {delay:g}"
         )
-    return Mount(name, pose, around, fov, delay=later)
+    return Mount(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
 
 
 def _parse_numbers(
@@ -234,7 +246,11 @@ def _to_rows(value: Any) -> list[list[Any]]:
 
 
 def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
-    """Return the cameras of Kalibr's camchain; empty if it has no extrinsics."""
+    """Return the cameras of Kalibr's camchain; empty if it has no extrinsics.
+
+    Cameras are in the order of their numbers; each but the first states its transform
+    from the one before.
+    """
     cameras = {
         name: camera
         for name, camera in data.items()
@@ -247,6 +263,7 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
         or not all(KALIBR_TRANSFORM in cameras[name] for name in names[1:])
     ):
         return ()
+    # Each transform leads from the previous camera's coordinates to the camera's.
     poses = [np.eye(4)]
     for name in names[1:]:
         from_previous = _parse_rigid(
@@ -258,7 +275,11 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
 
 
 def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
-    """Return frames of nerfstudio's transforms.json as cameras."""
+    """Return frames of nerfstudio's transforms.json as cameras.
+
+    `frame_names` are their indices, with commas. Positions are divided by the scale
+    that the file has applied.
+    """
     text = read_existing_text(path, "a camera file", MAX_JSON_SIZE)
     data = parse_text(path, text, "JSON", parse_json)
     frames = data.get("frames") if isinstance(data, dict) else None
@@ -319,10 +340,10 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
         cells = [cell for row in rows for cell in row]
         count = 12 if len(rows) == 3 else 16
         numbers = _parse_numbers(path, "applied_transform", cells, count, MAX_DISTANCE)
-        turn = np.reshape(numbers, (-1, 4))[:3, :3]
-        turn_scale = abs(float(np.linalg.det(turn))) ** (1.0 / 3.0)
+        linear = np.reshape(numbers, (-1, 4))[:3, :3]
+        turn_scale = abs(float(np.linalg.det(linear))) ** (1.0 / 3.0)
         if not np.allclose(
-            turn @ turn.T, turn_scale**2 * np.eye(3), atol=1e-3 * turn_scale**2
+            linear @ linear.T, turn_scale**2 * np.eye(3), atol=1e-3 * turn_scale**2
         ):
             raise FileFormatError(
                 f"{path}: applied_transform: expected a rotation, a shift and a scale, "
@@ -346,29 +367,37 @@ def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
     """
     text = read_existing_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
-    rows = {words[0]: words for line in lines[::2] if (words := line.split(maxsplit=9))}
-    if not rows:
+    # Every second line has points.
+    image_lines = [line.split(maxsplit=9) for line in lines[::2]]
+    words_by_id = {words[0]: words for words in image_lines if words}
+    if not words_by_id:
         raise FileFormatError(
             f"{path}: expected 2 to {MAX_CAMERAS} different cameras, got none"
         )
-    if len(rows) < sum(bool(line.strip()) for line in lines[::2]):
+    if len(words_by_id) < sum(bool(line.strip()) for line in lines[::2]):
         raise FileFormatError(
             f"{path}: expected each image once, got one with the "
             "same number twice; correct the file"
         )
-    names = _parse_names(path, image_ids or ",".join(rows), list(rows))
+    names = _parse_names(path, image_ids or ",".join(words_by_id), list(words_by_id))
     poses = list[Float64Array]()
     models = list[CameraModel]()
     cameras_path = Path(path).with_name("cameras.txt")
     for name in names:
-        words = rows[name]
+        words = words_by_id[name]
         poses.append(_parse_image(f"{path}: image {name[:40]}", words))
-        models.append(read_camera(f"{cameras_path}#{words[8]}"))
+        camera_id = words[8]
+        models.append(read_camera(f"{cameras_path}#{camera_id}"))
     return _make_mounts(path, names, poses, models)
 
 
 def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
-    """Return the pose (4, 4), from the camera to the world, of an image of COLMAP."""
+    """Return the pose (4, 4), from the camera to the world, of an image of COLMAP.
+
+    `words` are its line: the id, a quaternion with the real part first, a shift, from
+    the world to the camera, the camera's id and the file. Raises FileFormatError for
+    others.
+    """
     if len(words) != 10:
         raise FileFormatError(
             f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got "
@@ -385,10 +414,10 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
         raise FileFormatError(
             f"{where}: expected a quaternion of length 1, got one of {length:.3g}"
         )
-    turn = np.reshape(
-        rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
+    rotation = np.reshape(
+        compute_rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
     )
-    return np.asarray(np.linalg.inv(make_pose(turn, shift)), np.float64)
+    return np.asarray(np.linalg.inv(make_pose(rotation, shift)), np.float64)
 
 
 def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> list[str]:
@@ -437,9 +466,10 @@ def _parse_rigid(where: str, key: str, value: Any) -> Float64Array:
     cells = [cell for row in _to_rows(value) for cell in row]
     numbers = _parse_numbers(where, key, cells, 16, MAX_DISTANCE)
     matrix = np.array(numbers).reshape(4, 4)
-    turn = matrix[:3, :3]
+    rotation = matrix[:3, :3]
     is_rotation = (
-        np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.linalg.det(turn) > 0.0
+        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        and np.linalg.det(rotation) > 0.0
     )
     if not is_rotation or not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise FileFormatError(

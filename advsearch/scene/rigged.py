@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,28 +25,28 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.options import Value
 from advsearch.scene.assets import Float64Array, IntArray
-from advsearch.scene.people import PARAMETERS, rotation_about
+from advsearch.scene.people import PARAMETERS, make_axis_rotation
 from advsearch.scene.settings import Parameter
 from advsearch.scene.skeleton import (
     Clip,
     Movable,
     Track,
-    rotation_entries,
+    compute_rotation_entries,
     with_ancestors,
 )
 
 AXES = ("x", "y", "z")
 PERSON_PARAMETERS = PARAMETERS  # all parameters of a person
 WEIGHT = "weight"
-_rig_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
-TIME = _rig_parameter(
+_make_rig_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
+TIME = _make_rig_parameter(
     "time",
-    "1",
-    0.0,
-    1.0,
-    0.0,
-    "Of the clip of a rigged file: 0 is its beginning, 1 its end.",
-    (0.0, 1.0),
+    unit="1",
+    low=0.0,
+    high=1.0,
+    default=0.0,
+    text="Of the clip of a rigged file: 0 is its beginning, 1 its end.",
+    search=(0.0, 1.0),
 )
 # Cosine of the angle between rotations beyond which arc and chord are the same.
 MAX_ARC_COSINE = 1.0 - 1e-9
@@ -59,16 +60,21 @@ def find_rig_parameter(name: str) -> Parameter | None:
     if not (owner and dot and component in (*AXES, WEIGHT)):
         return None
     if component == WEIGHT:
-        return _rig_parameter(
-            name, "1", 0.0, 1.0, 0.0, f"How much of the morph target {owner} there is."
+        return _make_rig_parameter(
+            name,
+            unit="1",
+            low=0.0,
+            high=1.0,
+            default=0.0,
+            text=f"How much of the morph target {owner} there is.",
         )
-    return _rig_parameter(
+    return _make_rig_parameter(
         name,
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        f"Turn of the joint {owner} about {component}.",
+        unit="degrees",
+        low=-360.0,
+        high=360.0,
+        default=0.0,
+        text=f"Turn of the joint {owner} about {component}.",
     )
 
 
@@ -88,6 +94,17 @@ def _compose_matrices(translation: Tensor, rotation: Tensor, scale: Tensor) -> T
     return torch.cat([upper_rows, last_row], dim=1)
 
 
+class _MeshTarget(NamedTuple):
+    """A morph target of one node, for those vertices of the mesh that it moves."""
+
+    name: str
+    node: int
+    index: int  # among the targets of the node
+    rest_weight: float
+    rows: Tensor  # (K,) of the mesh's vertices
+    offsets: Tensor  # (K, 3) at weight 1
+
+
 class SkeletonRig:
     """Moves the mesh of a glTF file.
 
@@ -96,14 +113,23 @@ class SkeletonRig:
         vertices: (V,) for each vertex of the mesh its index in the concatenated
             vertices of all parts.
         to_mesh: (3, 3) from the file's axes and unit to those of the mesh.
+
+    Attributes:
+        skeleton: the nodes and clips of the file.
     """
 
     def __init__(
         self, parts: Sequence[Movable], vertices: IntArray, to_mesh: Float64Array
     ) -> None:
+        """Bring the arrays of all parts into the order of the mesh's vertices, as
+        tensors.
+        """
         self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
-        self._upright = torch.from_numpy(to_mesh / np.cbrt(np.linalg.det(to_mesh)))
+        # without the scale
+        self._rotation_to_mesh = torch.from_numpy(
+            to_mesh / np.cbrt(np.linalg.det(to_mesh))
+        )
         # The arrays of all parts are concatenated, then rows are selected for the mesh.
         max_joints = max(part.joints.shape[1] for part in parts)
         node_starts = np.cumsum([0, *(len(part.nodes) for part in parts)])
@@ -120,33 +146,37 @@ class SkeletonRig:
             ]
         )
         weights = np.concatenate([pad_joints(part.weights) for part in parts])
+        # Of each vertex: where it is, its joints (rows of `_nodes`) and their weights.
         self._points = torch.from_numpy(points[vertices])
         self._joints = torch.from_numpy(joints[vertices])
         self._weights = torch.from_numpy(weights[vertices])
         self._nodes = torch.from_numpy(np.concatenate([part.nodes for part in parts]))
-        self._inverse = torch.from_numpy(
+        self._inverse_binds = torch.from_numpy(
             np.concatenate([part.inverse_binds for part in parts])
         )
-        # Name, node, index, weight at rest, vertices and offsets of each morph target.
-        self._targets: list[tuple[str, int, int, float, Tensor, Tensor]] = []
+        self._targets: list[_MeshTarget] = []
         self._add_targets(parts, vertices)
-        self._levels = _group_by_depth(self.skeleton.parents)
+        self._nodes_by_depth = _group_by_depth(self.skeleton.parents)
         self._node_order = torch.argsort(
-            torch.cat([nodes for nodes, _ in self._levels])
+            torch.cat([nodes for nodes, _ in self._nodes_by_depth])
         )
         self._local_matrices = torch.from_numpy(self.skeleton.local_matrices)
         # The rotation nearest to each node's matrix in the scene, without its scale and
         # shear.
         world = self._compute_world(self._local_matrices)[:, :3, :3].numpy()
-        left, _, right = np.linalg.svd(world)
+        left, _, right = np.linalg.svd(world)  # polar decomposition
         self._axes = torch.from_numpy(left @ right)
         self._rest = self.pose({})
 
     def _add_targets(self, parts: Sequence[Movable], vertices: IntArray) -> None:
-        """Store the morph targets of parts, for the vertices of the mesh."""
+        """Store the morph targets of parts, for the vertices (V,) of the mesh.
+
+        Of a target only the vertices count that the mesh has; they become rows of the
+        mesh.
+        """
         counts = [len(part.vertices) for part in parts]
-        starts = np.cumsum([0, *counts])
-        for part, start, count in zip(parts, starts, counts, strict=False):
+        vertex_starts = np.cumsum([0, *counts])
+        for part, start, count in zip(parts, vertex_starts, counts, strict=False):
             is_of_part = (vertices >= start) & (vertices < start + count)
             mesh_rows = np.flatnonzero(is_of_part)
             for index, target in enumerate(part.targets):
@@ -155,13 +185,13 @@ class SkeletonRig:
                 target_rows = row_of_vertex[vertices[mesh_rows] - start]
                 is_moved = target_rows >= 0
                 self._targets.append(
-                    (
-                        target.name,
-                        part.node,
-                        index,
-                        float(part.rest_weights[index]),
-                        torch.from_numpy(mesh_rows[is_moved]),
-                        torch.from_numpy(target.offsets[target_rows[is_moved]]),
+                    _MeshTarget(
+                        name=target.name,
+                        node=part.node,
+                        index=index,
+                        rest_weight=float(part.rest_weights[index]),
+                        rows=torch.from_numpy(mesh_rows[is_moved]),
+                        offsets=torch.from_numpy(target.offsets[target_rows[is_moved]]),
                     )
                 )
 
@@ -183,19 +213,19 @@ class SkeletonRig:
     @property
     def targets(self) -> tuple[str, ...]:
         """Names of the morph targets, each once."""
-        return tuple(dict.fromkeys(name for name, *_ in self._targets))
+        return tuple(dict.fromkeys(target.name for target in self._targets))
 
     @property
     def defaults(self) -> Mapping[str, float]:
         """Values of all parameters at rest, by name."""
         time = {TIME.name: 0.0} if self.clips else {}
-        turns = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
+        angles = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
         # Of targets with the same name, the first counts.
         weights = {
-            f"{name}.{WEIGHT}": rest
-            for name, _, _, rest, _, _ in reversed(self._targets)
+            f"{target.name}.{WEIGHT}": target.rest_weight
+            for target in reversed(self._targets)
         }
-        return time | turns | weights
+        return time | angles | weights
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -248,20 +278,23 @@ class SkeletonRig:
         Arguments are those of `offsets`.
         """
         device = next(iter(values.values()), torch.zeros(())).device
-        number = {name: value.double() for name, value in values.items()}
+        number_by_name = {name: value.double() for name, value in values.items()}
         local_matrices = self._local_matrices.to(device)
         clip_weights = dict[int, Tensor]()
         if clip is not None:
-            playing, seconds = self._find_clip_time(clip, number)
-            local_matrices, clip_weights = self._play_clip(playing, seconds.to(device))
-        local_matrices = self._turn_joints(local_matrices, number)
+            playing_clip, seconds = self._find_clip_time(clip, number_by_name)
+            local_matrices, clip_weights = self._play_clip(
+                playing_clip, seconds.to(device)
+            )
+        local_matrices = self._turn_joints(local_matrices, number_by_name)
         joint_matrices = (
             self._compute_world(local_matrices)[self._nodes.to(device)]
-            @ self._inverse.to(device)
+            @ self._inverse_binds.to(device)
         )[:, :3]
-        points = self._morphed_points(number, clip_weights, device)
+        points = self._compute_morphed_vertices(number_by_name, clip_weights, device)
         weights = self._weights.to(device)
         joints = self._joints.to(device)
+        # (V, 3, 4): the weighted mean of the matrices of a vertex's joints
         matrices = sum(
             weights[:, k, None, None] * joint_matrices[joints[:, k]]
             for k in range(joints.shape[1])
@@ -271,30 +304,30 @@ class SkeletonRig:
             torch.einsum("vij,vj->vi", matrices[:, :, :3], points) + matrices[:, :, 3]
         )
 
-    def _morphed_points(
+    def _compute_morphed_vertices(
         self,
-        number: Mapping[str, Tensor],
+        number_by_name: Mapping[str, Tensor],
         clip_weights: Mapping[int, Tensor],
         device: torch.device,
     ) -> Tensor:
         """Return the vertices (V, 3) of the meshes with morph targets applied.
 
         Args:
-            number: values of parameters, which override those of a clip.
+            number_by_name: values of parameters, which override those of a clip.
             clip_weights: weights of a clip, by node.
             device: of the result.
         """
         points = self._points.to(device)
-        for name, node, index, rest, rows, moves in self._targets:
-            weight = number.get(f"{name}.{WEIGHT}")
-            if weight is None and node in clip_weights:
-                weight = clip_weights[node][index]
+        for target in self._targets:
+            weight = number_by_name.get(f"{target.name}.{WEIGHT}")
+            if weight is None and target.node in clip_weights:
+                weight = clip_weights[target.node][target.index]
             elif weight is None:
-                weight = torch.tensor(rest, dtype=torch.float64)
+                weight = torch.tensor(target.rest_weight, dtype=torch.float64)
+            # A weight of 0 is left out, unless its derivative is wanted.
             if weight.requires_grad or float(weight) != 0.0:
-                points = points.index_add(
-                    0, rows.to(device), weight.to(device) * moves.to(device)
-                )
+                offsets = weight.to(device) * target.offsets.to(device)
+                points = points.index_add(0, target.rows.to(device), offsets)
         return points
 
     def _find_clip_time(
@@ -314,15 +347,16 @@ class SkeletonRig:
         """
         skeleton = self.skeleton
         device = seconds.device
-        rest = {
+        rest_values = {
             "translation": skeleton.translations,
             "rotation": skeleton.rotations,
             "scale": skeleton.scales,
         }
         properties = {
-            path: torch.from_numpy(values).to(device) for path, values in rest.items()
+            path: torch.from_numpy(values).to(device)
+            for path, values in rest_values.items()
         }
-        for path in rest:
+        for path in rest_values:
             tracks = [track for track in clip.tracks if track.path == path]
             if tracks:
                 nodes = torch.tensor([track.node for track in tracks], device=device)
@@ -341,33 +375,38 @@ class SkeletonRig:
         return local_matrices, weights
 
     def _turn_joints(
-        self, local_matrices: Tensor, number: Mapping[str, Tensor]
+        self, local_matrices: Tensor, number_by_name: Mapping[str, Tensor]
     ) -> Tensor:
         """Return local matrices (N, 4, 4) with the turns of joints applied.
 
-        Turns are about the axes of the object as it stands at rest.
+        Turns, in degrees by `JOINT.x` and so on, are about the axes of the object as it
+        stands at rest: first x, then y, then z.
         """
         device = local_matrices.device
-        upright = self._upright.to(device)
+        rotation_to_mesh = self._rotation_to_mesh.to(device)
         joints = dict.fromkeys(
             name.rpartition(".")[0]
-            for name in number
+            for name in number_by_name
             if name.rpartition(".")[2] in AXES
         )
         for joint in joints:
             node = self.joints[joint]
-            turn = torch.eye(3, dtype=torch.float64, device=device)
+            rotation = torch.eye(3, dtype=torch.float64, device=device)
             for axis in AXES:
-                if f"{joint}.{axis}" in number:
-                    turn = rotation_about(axis, number[f"{joint}.{axis}"]) @ turn
-            # From the axes of the object to those of the file, then of the parent.
-            turn = upright.T @ turn @ upright
+                if f"{joint}.{axis}" in number_by_name:
+                    rotation = (
+                        make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
+                        @ rotation
+                    )
+            # From the axes of the object to those of the file, then of the parent node
+            # at rest, in which local matrices are.
+            rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
             parent = int(self.skeleton.parents[node])
             if parent >= 0:
-                axes = self._axes[parent].to(device)
-                turn = axes.T @ turn @ axes
+                parent_axes = self._axes[parent].to(device)
+                rotation = parent_axes.T @ rotation @ parent_axes
             matrix = local_matrices[node]
-            upper_rows = torch.cat([turn @ matrix[:3, :3], matrix[:3, 3:]], dim=1)
+            upper_rows = torch.cat([rotation @ matrix[:3, :3], matrix[:3, 3:]], dim=1)
             turned_matrix = torch.cat([upper_rows, matrix[3:]])
             local_matrices = local_matrices.index_copy(
                 0, torch.tensor([node], device=device), turned_matrix[None]
@@ -375,10 +414,14 @@ class SkeletonRig:
         return local_matrices
 
     def _compute_world(self, local_matrices: Tensor) -> Tensor:
-        """Return the matrices (N, 4, 4) from nodes to the scene."""
+        """Return the matrices (N, 4, 4) from nodes to the scene.
+
+        They are computed depth by depth, from the roots on, and put back into the order
+        of nodes.
+        """
         device = local_matrices.device
         world_by_level = list[Tensor]()
-        for nodes, parent_rows in self._levels:
+        for nodes, parent_rows in self._nodes_by_depth:
             matrices = local_matrices[nodes.to(device)]
             if world_by_level:
                 matrices = world_by_level[-1][parent_rows.to(device)] @ matrices
@@ -409,59 +452,60 @@ def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
 def sample_track(track: Track, seconds: Tensor) -> Tensor:
     """Return the value (W,) of a track at a time (glTF 2.0, appendix C).
 
-    Before its first key and after its last it is constant.
+    Before its first key and after its last it is constant; rotations have length 1. It
+    is differentiable in the time, but for steps.
     """
     times = torch.from_numpy(track.times).to(seconds.device)
     keys = torch.from_numpy(track.values).to(seconds.device)
     # Of a cubic spline the value is between two tangents.
     value_index = keys.shape[1] // 2
     is_rotation = track.path == "rotation"
-    after = int(torch.searchsorted(times, seconds.detach(), right=True))
-    if track.interpolation == "STEP" or not 0 < after < len(times):
-        value = keys[max(0, after - 1), value_index]
+    end_key = int(torch.searchsorted(times, seconds.detach(), right=True))
+    if track.interpolation == "STEP" or not 0 < end_key < len(times):
+        value = keys[max(0, end_key - 1), value_index]
         return value / value.norm() if is_rotation else value
-    before = after - 1
-    span = times[after] - times[before]
-    fraction = (seconds - times[before]) / span
-    first = keys[before, value_index]
-    second = keys[after, value_index]
+    start_key = end_key - 1
+    span = times[end_key] - times[start_key]
+    fraction = (seconds - times[start_key]) / span
+    start_value = keys[start_key, value_index]
+    end_value = keys[end_key, value_index]
     if track.interpolation == "CUBICSPLINE":
         square = fraction**2
         cube = fraction**3
         spline = (
-            (2.0 * cube - 3.0 * square + 1.0) * first
-            + span * (cube - 2.0 * square + fraction) * keys[before, 2]
-            + (3.0 * square - 2.0 * cube) * second
-            + span * (cube - square) * keys[after, 0]
+            (2.0 * cube - 3.0 * square + 1.0) * start_value
+            + span * (cube - 2.0 * square + fraction) * keys[start_key, 2]
+            + (3.0 * square - 2.0 * cube) * end_value
+            + span * (cube - square) * keys[end_key, 0]
         )
         return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
     if is_rotation:
-        return slerp(first, second, fraction)
-    return first + fraction * (second - first)
+        return slerp(start_value, end_value, fraction)
+    return start_value + fraction * (end_value - start_value)
 
 
-def slerp(first: Tensor, second: Tensor, fraction: Tensor) -> Tensor:
+def slerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
     """Interpolate between two rotations (4,) along the shorter arc.
 
-    `fraction` is 0 at the first and 1 at the second.
+    `fraction` is 0 at the start and 1 at the end. Rotations that are almost the same
+    are interpolated along the chord, since the arc's formula divides by zero there.
     """
-    first = first / first.norm()
-    second = second / second.norm()
-    cosine = first @ second
-    second = torch.where(cosine < 0.0, -second, second)
+    start = start / start.norm()
+    end = end / end.norm()
+    cosine = start @ end
+    end = torch.where(cosine < 0.0, -end, end)
     cosine = cosine.abs()
     if float(cosine) > MAX_ARC_COSINE:
-        chord: Tensor = first + fraction * (second - first)
+        chord: Tensor = start + fraction * (end - start)
         return chord.div(chord.norm())
     angle = torch.arccos(cosine)
     arc: Tensor = (
-        torch.sin((1.0 - fraction) * angle) * first
-        + torch.sin(fraction * angle) * second
+        torch.sin((1.0 - fraction) * angle) * start + torch.sin(fraction * angle) * end
     )
     return arc / torch.sin(angle)
 
 
 def quaternions_to_matrices(quaternions: Tensor) -> Tensor:
     """Return the rotations (N, 3, 3) of unit quaternions (N, 4), x, y, z, w."""
-    entries = rotation_entries(*quaternions.unbind(dim=1))
+    entries = compute_rotation_entries(*quaternions.unbind(dim=1))
     return torch.stack(entries, dim=1).reshape(-1, 3, 3)

@@ -64,7 +64,7 @@ class Parameter:
     def is_number(value: object) -> TypeGuard[float]:
         """Return whether a value is a number that float32 has.
 
-        No truth value, not NaN, and at most `LARGEST`.
+        No truth value, not NaN, and at most `MAX_VALUE` either way.
         """
         is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
         return is_real and abs(value) <= Parameter.MAX_VALUE  # type: ignore[arg-type]
@@ -86,17 +86,17 @@ class Parameter:
     ) -> Parameter:
         """Make a number that moves no outlines; see `moving` for one that does."""
         return cls(
-            name,
-            (),
-            unit,
-            low,
-            high,
-            default,
-            text,
-            periodic,
-            False,
-            search,
-            log,
+            name=name,
+            shape=(),
+            unit=unit,
+            low=low,
+            high=high,
+            default=default,
+            description=text,
+            periodic=periodic,
+            moves_silhouettes=False,
+            search=search,
+            log=log,
             estimators=estimators,
         )
 
@@ -117,17 +117,17 @@ class Parameter:
     ) -> Parameter:
         """Make a number that can move an outline in the image."""
         return cls(
-            name,
-            (),
-            unit,
-            low,
-            high,
-            default,
-            text,
-            periodic,
-            True,
-            search,
-            log,
+            name=name,
+            shape=(),
+            unit=unit,
+            low=low,
+            high=high,
+            default=default,
+            description=text,
+            periodic=periodic,
+            moves_silhouettes=True,
+            search=search,
+            log=log,
             estimators=estimators,
         )
 
@@ -142,17 +142,17 @@ class Parameter:
         estimators: tuple[str, ...] = (),
         moves_silhouettes: bool = False,
     ) -> Parameter:
-        """Make a choice among names."""
+        """Make a choice among names, whose values are the indices of its options."""
         return cls(
-            name,
-            (),
-            "name",
-            0.0,
-            len(options) - 1.0,
-            default,
-            text,
-            False,
-            moves_silhouettes,
+            name=name,
+            shape=(),
+            unit="name",
+            low=0.0,
+            high=len(options) - 1.0,
+            default=default,
+            description=text,
+            periodic=False,
+            moves_silhouettes=moves_silhouettes,
             options=options,
             estimators=estimators,
         )
@@ -174,13 +174,13 @@ class Parameter:
         descriptions = [f"{name.capitalize()} {text}" for name in CHANNELS]
         return tuple(
             cls(
-                name,
-                (),
-                "sRGB",
-                low,
-                1.0,
-                default,
-                description,
+                name=name,
+                shape=(),
+                unit="sRGB",
+                low=low,
+                high=1.0,
+                default=default,
+                description=description,
                 search=search,
                 estimators=estimators,
             )
@@ -190,89 +190,91 @@ class Parameter:
         )
 
 
-def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
+def _make_surface_parameter(
+    name: str, text: str, search: tuple[float, float]
+) -> Parameter:
     """Return a parameter of the principled surface."""
     return Parameter(
-        name,
-        (),
-        "1",
-        0.0,
-        1.0,
-        "the material's own",
-        text,
+        name=name,
+        shape=(),
+        unit="1",
+        low=0.0,
+        high=1.0,
+        default="the material's own",
+        description=text,
         search=search,
         estimators=Parameter.LIT,
     )
 
 
-_pose = partial(Parameter.moving, Parameter.GEOMETRIC)
-_camera = partial(Parameter.moving, Parameter.ORBIT)
+_make_pose_parameter = partial(Parameter.moving, Parameter.GEOMETRIC)
+_make_camera_parameter = partial(Parameter.moving, Parameter.ORBIT)
 
 POSE = (
-    _pose(
+    _make_pose_parameter(
         "yaw",
-        "degrees",
-        -3600.0,
-        3600.0,
-        0.0,
-        "Rotation about the vertical.",
-        (0.0, 360.0),
+        unit="degrees",
+        low=-3600.0,
+        high=3600.0,
+        default=0.0,
+        text="Rotation about the vertical.",
+        search=(0.0, 360.0),
         periodic=True,
     ),
-    _pose(
+    _make_pose_parameter(
         "pitch",
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        "Rotation about the object's y axis.",
-        (-15.0, 15.0),
+        unit="degrees",
+        low=-360.0,
+        high=360.0,
+        default=0.0,
+        text="Rotation about the object's y axis.",
+        search=(-15.0, 15.0),
         periodic=True,
     ),
-    _pose(
+    _make_pose_parameter(
         "roll",
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        "Rotation about the object's x axis.",
-        (-15.0, 15.0),
+        unit="degrees",
+        low=-360.0,
+        high=360.0,
+        default=0.0,
+        text="Rotation about the object's x axis.",
+        search=(-15.0, 15.0),
         periodic=True,
     ),
-    _pose(
+    _make_pose_parameter(
         "x",
-        "object sizes",
-        -1e4,
-        1e4,
-        0.0,
-        "Shift of the object along x.",
-        (-0.15, 0.15),
+        unit="object sizes",
+        low=-1e4,
+        high=1e4,
+        default=0.0,
+        text="Shift of the object along x.",
+        search=(-0.15, 0.15),
     ),
-    _pose(
+    _make_pose_parameter(
         "y",
-        "object sizes",
-        -1e4,
-        1e4,
-        0.0,
-        "Shift of the object along y.",
-        (-0.15, 0.15),
+        unit="object sizes",
+        low=-1e4,
+        high=1e4,
+        default=0.0,
+        text="Shift of the object along y.",
+        search=(-0.15, 0.15),
     ),
-    _pose(
+    _make_pose_parameter(
         "z",
-        "object sizes",
-        -1e4,
-        1e4,
-        0.0,
-        "Height of the lowest point above the ground.",
+        unit="object sizes",
+        low=-1e4,
+        high=1e4,
+        default=0.0,
+        text="Height of the lowest point above the ground.",
     ),
-    _pose(
+    _make_pose_parameter(
         "scale",
-        "1",
-        0.01,
-        100.0,
-        1.0,
-        "Size relative to the default.",
-        (0.8, 1.25),
+        unit="1",
+        low=0.01,
+        high=100.0,
+        default=1.0,
+        text="Size relative to the default.",
+        search=(0.8, 1.25),
         log=True,
     ),
 )
@@ -281,114 +283,114 @@ POSE = (
 ORBIT_CAMERA = "orbit"
 
 CAMERA = (
-    _camera(
+    _make_camera_parameter(
         "azimuth",
-        "degrees",
-        -3600.0,
-        3600.0,
-        40.0,
-        "Direction of the camera around the object.",
-        (0.0, 360.0),
+        unit="degrees",
+        low=-3600.0,
+        high=3600.0,
+        default=40.0,
+        text="Direction of the camera around the object.",
+        search=(0.0, 360.0),
         periodic=True,
     ),
-    _camera(
+    _make_camera_parameter(
         "elevation",
-        "degrees",
-        -89.0,
-        89.0,
-        25.0,
-        "Height of the camera above the ground plane.",
-        (5.0, 60.0),
+        unit="degrees",
+        low=-89.0,
+        high=89.0,
+        default=25.0,
+        text="Height of the camera above the ground plane.",
+        search=(5.0, 60.0),
     ),
-    _camera(
+    _make_camera_parameter(
         "roll",
-        "degrees",
-        -360.0,
-        360.0,
-        0.0,
-        "Rotation of the picture, counter-clockwise.",
-        (-15.0, 15.0),
+        unit="degrees",
+        low=-360.0,
+        high=360.0,
+        default=0.0,
+        text="Rotation of the picture, counter-clockwise.",
+        search=(-15.0, 15.0),
         periodic=True,
     ),
-    _camera(
+    _make_camera_parameter(
         "distance",
-        "metres",
-        1e-4,
-        1e5,
-        "fits the object",
-        "Distance to the object's middle; in object sizes where its size in metres "
+        unit="metres",
+        low=1e-4,
+        high=1e5,
+        default="fits the object",
+        text="Distance to the object's middle; in object sizes where its size in metres "
         "is not known.",
-        (0.8, 1.5),
+        search=(0.8, 1.5),
         log=True,
     ),
-    _camera(
+    _make_camera_parameter(
         "height",
-        "metres",
-        -1e4,
-        1e5,
-        "as the elevation says",
-        "Height of the lens above the ground, in place of `elevation`; in object "
+        unit="metres",
+        low=-1e4,
+        high=1e5,
+        default="as the elevation says",
+        text="Height of the lens above the ground, in place of `elevation`; in object "
         "sizes as `distance`.",
     ),
-    _camera(
+    _make_camera_parameter(
         "fov",
-        "degrees",
-        1.0,
-        170.0,
-        35.0,
-        "Field of view along the larger side of the picture.",
+        unit="degrees",
+        low=1.0,
+        high=170.0,
+        default=35.0,
+        text="Field of view along the larger side of the picture.",
     ),
     Parameter(
         "exposure",
-        (),
-        "stops",
-        -10.0,
-        10.0,
-        0.0,
-        "Brightness over the metered exposure.",
+        shape=(),
+        unit="stops",
+        low=-10.0,
+        high=10.0,
+        default=0.0,
+        description="Brightness over the metered exposure.",
         estimators=("image",),
     ),
 )
 EXPOSURE_VALUE = Parameter(
     "ev",
-    (),
-    "EV at ISO 100",
-    -10.0,
-    24.0,
-    "metered",
-    "Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 "
+    shape=(),
+    unit="EV at ISO 100",
+    low=-10.0,
+    high=24.0,
+    default="metered",
+    description="Absolute exposure in place of the metered one, in the avenue: 14 is for sun, 5 "
     "for lit streets.",
     estimators=(),
 )
 RAINDROPS = (
     Parameter(
         "drops",
-        (),
-        "1",
-        0.0,
-        2000.0,
-        0.0,
-        "Raindrops on a sheet of glass 6 cm before the camera.",
+        shape=(),
+        unit="1",
+        low=0.0,
+        high=2000.0,
+        default=0.0,
+        description="Raindrops on a sheet of glass 6 cm before the camera.",
         estimators=(),
     ),
     Parameter(
         "drop_size",
-        (),
-        "mm",
-        0.2,
-        10.0,
-        1.5,
-        "Median of the radii of these drops.",
+        shape=(),
+        unit="mm",
+        low=0.2,
+        high=10.0,
+        default=1.5,
+        description="Median of the radii of these drops.",
         estimators=(),
     ),
     Parameter(
         "drop_seed",
-        (),
-        "1",
-        0.0,
-        1e6,
-        0.0,
-        "Where they are, and how large: a whole number.",
+        shape=(),
+        unit="1",
+        low=0.0,
+        high=1e6,
+        default=0.0,
+        description="Where they are, and how large: a whole number.",
         estimators=(),
     ),
 )
@@ -396,20 +398,20 @@ RAINDROPS = (
 LAMPS = ("off", "low", "high")
 
 
-def _lamps(whose: str) -> Parameter:
+def _make_lamp_parameter(whose: str) -> Parameter:
     """Return the parameter for the lamps of a car."""
     text = (
         f"Headlamps of {whose}, with its tail lamps: the low beam, or the high "
         "beam; in the avenue."
     )
     return Parameter(
-        "lamps",
-        (),
-        "name",
-        0.0,
-        len(LAMPS) - 1.0,
-        LAMPS[0],
-        text,
+        name="lamps",
+        shape=(),
+        unit="name",
+        low=0.0,
+        high=len(LAMPS) - 1.0,
+        default=LAMPS[0],
+        description=text,
         options=LAMPS,
         estimators=(),
     )
@@ -418,24 +420,24 @@ def _lamps(whose: str) -> Parameter:
 ENVIRONMENT = (
     Parameter(
         "rotation",
-        (),
-        "degrees",
-        -3600.0,
-        3600.0,
-        0.0,
-        "Rotation about the vertical.",
+        shape=(),
+        unit="degrees",
+        low=-3600.0,
+        high=3600.0,
+        default=0.0,
+        description="Rotation about the vertical.",
         periodic=True,
         search=(0.0, 360.0),
         estimators=Parameter.LIT,
     ),
     Parameter(
         "exposure",
-        (),
-        "stops",
-        -10.0,
-        10.0,
-        0.0,
-        "Brightness, after metering.",
+        shape=(),
+        unit="stops",
+        low=-10.0,
+        high=10.0,
+        default=0.0,
+        description="Brightness, after metering.",
         search=(-1.0, 1.0),
         estimators=Parameter.LIT,
     ),
@@ -474,13 +476,13 @@ TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
 GROUND = (
     Parameter(
         "kind",
-        (),
-        "name",
-        0.0,
-        len(GROUND_KINDS) - 1.0,
-        "what the environment has: photograph where the map is a file, a road in "
+        shape=(),
+        unit="name",
+        low=0.0,
+        high=len(GROUND_KINDS) - 1.0,
+        default="what the environment has: photograph where the map is a file, a road in "
         "a street, else table",
-        "What the object stands on: a square table, the floor that the "
+        description="What the object stands on: a square table, the floor that the "
         "environment's photograph shows, a road, "
         "or a place with all that stands in it: an avenue, a crossing, a car "
         "park or a room.",
@@ -488,63 +490,98 @@ GROUND = (
     ),
     Parameter(
         "size",
+        shape=(),
+        unit="object sizes",
+        low=0.0,
+        high=1000.0,
+        default=3.0,
+        description="Side of the table; 0 leaves the ground out.",
+    ),
+    Parameter(
+        "level",
         (),
         "object sizes",
+        -1e4,
+        1e4,
         0.0,
-        1000.0,
-        3.0,
-        "Side of the table; 0 leaves the ground out.",
+        "Height of the ground that takes the shadow in a photograph (`backdrop`).",
     ),
     *Parameter.colors(
         "of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)
     ),
     Parameter(
         "height",
-        (),
-        "metres",
-        1e-3,
-        1000.0,
-        f"1.6, or {DEFAULT_PHOTOGRAPH_HEIGHT:g} object sizes",
-        "Height above the floor from which the photograph was taken; in object "
+        shape=(),
+        unit="metres",
+        low=1e-3,
+        high=1000.0,
+        default=f"1.6, or {DEFAULT_PHOTOGRAPH_HEIGHT:g} object sizes",
+        description="Height above the floor from which the photograph was taken; in object "
         "sizes as `camera.distance`.",
     ),
     Parameter(
         "radius",
-        (),
-        "metres",
-        1e-3,
-        1e5,
-        "5 heights",
-        "How far from the photograph's camera its floor is empty; in object "
+        shape=(),
+        unit="metres",
+        low=1e-3,
+        high=1e5,
+        default="5 heights",
+        description="How far from the photograph's camera its floor is empty; in object "
         "sizes as `camera.distance`.",
     ),
 )
 MATERIAL = (
-    _surface(
+    _make_surface_parameter(
         "roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)
     ),
-    _surface(
+    _make_surface_parameter(
         "metallic",
         "How metallic it is: 0 is paint, wood or glaze, 1 is bare metal.",
         (0.0, 1.0),
     ),
-    _surface(
+    _make_surface_parameter(
         "specular", "Strength of the reflection off what is not metal.", (0.0, 1.0)
     ),
-    _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
+    _make_surface_parameter(
+        "clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)
+    ),
+)
+# how what is rendered into a photograph is made to look like the rest of it
+BACKDROP = (
+    Parameter(
+        "noise",
+        (),
+        "levels of 255",
+        0.0,
+        100.0,
+        "as the photograph has",
+        "Noise of what is rendered into a photograph (`backdrop`).",
+        estimators=(),
+    ),
+    Parameter(
+        "blur",
+        (),
+        "pixels",
+        0.0,
+        20.0,
+        "as the photograph has",
+        "Blur of what is rendered into a photograph, a standard deviation.",
+        estimators=(),
+    ),
 )
 FAMILIES = {
     "camera": (
         *CAMERA,
         EXPOSURE_VALUE,
         *RAINDROPS,
-        _lamps("the car that the camera is in"),
+        _make_lamp_parameter("the car that the camera is in"),
     ),
     "pose": POSE,
     "environment": ENVIRONMENT,
     "ground": GROUND,
+    "backdrop": BACKDROP,
     "material": MATERIAL,
-    "object": (_lamps("the object, a car"),),
+    "object": (_make_lamp_parameter("the object, a car"),),
 }
 
 SETTINGS: Mapping[str, Parameter] = {
@@ -564,9 +601,9 @@ def find_parameter(name: str) -> Parameter | None:
 
     Also for settings of a mesh around the object.
     """
-    family, _, rest = name.partition(":")
-    if rest and family in MESH_FAMILIES:
-        name = f"{family}.{rest.rpartition('.')[2]}"
+    family, _, full_name = name.partition(":")
+    if full_name and family in MESH_FAMILIES:
+        name = f"{family}.{full_name.rpartition('.')[2]}"
     return SETTINGS.get(name)
 
 
@@ -582,11 +619,12 @@ def parse_mesh_name(name: str) -> str | None:
 def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
     """Return every setting's value: the defaults, and over them what was given.
 
-    None where the scene works a value out. Settings of meshes around the object are
-    there where they were given.
+    None where the scene works a value out. A choice has the index of its option.
+    Settings of meshes around the object are there where they were given.
 
     Raises:
-        InputError: a value is not a finite number inside its range.
+        InputError: a value is not a finite number inside its range, or two settings
+            contradict each other.
         UnknownNameError: a name is not a setting.
     """
     if "camera.elevation" in settings and "camera.height" in settings:

@@ -97,7 +97,7 @@ def with_ancestors(
     return reached
 
 
-def rotation_entries(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
+def compute_rotation_entries(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
     """Return the nine entries, row by row, of the rotation of a unit quaternion.
 
     Its real part is `w`.

@@ -86,6 +86,7 @@ def _make_grid_uvs(count: int) -> Float64Array:
     face = np.arange(count)
     cell = face // 2
     cell_corner = np.stack([cell % n_columns, cell // n_columns], axis=1)[:, None, :]
+    # A margin in each cell, and a gap between its two halves, keep faces apart.
     lower_half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
     is_lower = (face % 2 == 0)[:, None, None]
     in_cell = np.where(is_lower, lower_half, 1.0 - lower_half)
@@ -138,9 +139,10 @@ def _find_patches(soup: Soup) -> IntArray:
     Returns:
         The patch of each face (F,), numbered from 0.
     """
-    normals: Float64Array = normalize_vectors(soup.face_vectors())
+    normals: Float64Array = normalize_vectors(soup.compute_face_vectors())
     count = len(normals)
     left, right, _ = find_shared_edges(soup.faces)
+    # faces of both corners (3 face + k) of an edge
     face = left // 3
     neighbour = right // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
@@ -237,6 +239,7 @@ class SurfaceParts:
     """
 
     def __init__(self, mesh: Mesh) -> None:
+        """Rasterise the map, and find the center of each cell and of each face."""
         self.mesh = mesh
         self._mesh_uvs = mesh.uvs[mesh.faces].astype(np.float64)
         self.is_unwrapped = not _has_unique_uvs(mesh, self._mesh_uvs)
@@ -286,22 +289,26 @@ class SurfaceParts:
 
 
 def _unwrap_mesh(mesh: Mesh) -> Float64Array:
-    """Return new texture coordinates (F, 3, 2) of a mesh that do not overlap."""
+    """Return new texture coordinates (F, 3, 2) of a mesh that do not overlap.
+
+    Vertices at the same position count as one, so that charts are not cut at old seams,
+    and the mesh is scaled to a size of 1, as `unwrap` expects. Old texture coordinates,
+    normals and colors play no part.
+    """
     lower = mesh.vertices.min(axis=0)
     upper = mesh.vertices.max(axis=0)
     extent = max(float((upper - lower).max()), 1e-12)
     points = (mesh.vertices - lower).astype(np.float64) / extent
-    unique_points, index = np.unique(points, axis=0, return_inverse=True)
-    corners = index.reshape(-1)[mesh.faces.astype(np.int64)]
-    unknown = np.full((len(corners), 3, 3), np.nan)
-    part = np.zeros(len(corners), np.int64)
+    unique_points, unique_index = np.unique(points, axis=0, return_inverse=True)
+    faces = unique_index.reshape(-1)[mesh.faces.astype(np.int64)]
+    n_faces = len(faces)
     soup = Soup(
-        unique_points,
-        corners,
-        part,
-        unknown,
-        unknown[..., :2],
-        np.ones_like(unknown),
+        points=unique_points,
+        faces=faces,
+        part=np.zeros(n_faces, np.int64),
+        normals=np.full((n_faces, 3, 3), np.nan),
+        uvs=np.full((n_faces, 3, 2), np.nan),
+        colors=np.ones((n_faces, 3, 3)),
     )
     return unwrap(soup).uvs
 
@@ -318,7 +325,11 @@ def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
 
 
 def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
-    """Return whether texture coordinates (F, 3, 2) tell points of a surface apart."""
+    """Return whether texture coordinates (F, 3, 2) tell points of a surface apart.
+
+    They lie in the unit square, give almost all of the surface an area, cover enough of
+    the square, and hardly any of it twice.
+    """
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
     corners = mesh.vertices[mesh.faces].astype(np.float64)

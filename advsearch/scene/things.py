@@ -88,7 +88,13 @@ class ThingPart(MeshPart):
 
 
 def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
-    """Read the things of a setting, see above. Raises InputError: it is invalid."""
+    """Read the things of a setting, see above.
+
+    A name that is taken gets a number behind it, unless it was chosen with `name=`.
+
+    Raises:
+        InputError: it is invalid, or has more than `MAX_THINGS`.
+    """
     things: list[RequestedThing] = []
     for part in filter(None, map(str.strip, (things_spec or "").split(";"))):
         thing = _parse_thing(part)
@@ -111,18 +117,19 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
 
 
 def _parse_thing(part: str) -> RequestedThing:
-    """Read one thing.
+    """Read one thing of a setting, see `parse_things`.
 
-    Raises InputError, UnknownNameError: it is not as described above.
+    The name is that of the object unless it has one of its own. Raises InputError,
+    UnknownNameError: it is not as described there.
     """
     object_spec, separator, rest = part.rpartition("@")
-    fields = [word.strip() for word in rest.split(",")]
-    options = dict(word.partition("=")[::2] for word in fields[2:])
+    words = [word.strip() for word in rest.split(",")]
+    options = dict(word.partition("=")[::2] for word in words[2:])
     if (
         not separator
         or not object_spec.strip()
-        or len(fields) < 2
-        or any("=" not in word for word in fields[2:])
+        or len(words) < 2
+        or any("=" not in word for word in words[2:])
     ):
         raise InputError(
             "things: expected WHAT@X,Y in metres, such as "
@@ -136,31 +143,27 @@ def _parse_thing(part: str) -> RequestedThing:
         raise UnknownNameError(f"lamps of things {part!r}:", lamps, LAMPS)
     x, y = (
         _parse_number(part, name, word, -MAX_DISTANCE, MAX_DISTANCE)
-        for name, word in zip("xy", fields, strict=False)
+        for name, word in zip("xy", words, strict=False)
     )
-    heading = (
-        _parse_number(part, "heading", options["heading"], -3600.0, 3600.0)
-        if "heading" in options
-        else 0.0
-    )
-    size = (
-        _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
-        if "size" in options
-        else None
-    )
+    heading = 0.0
+    if "heading" in options:
+        heading = _parse_number(part, "heading", options["heading"], -3600.0, 3600.0)
+    size = None
+    if "size" in options:
+        size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
     name = make_safe_name(
         Path(options.get("name") or object_spec.strip().partition("#")[0])
     )
     return RequestedThing(
-        object_spec.strip(),
-        x,
-        y,
-        heading,
-        size,
-        name,
-        options.get("label"),
-        lamps,
-        options.get("facing"),
+        object_spec=object_spec.strip(),
+        x=x,
+        y=y,
+        heading=heading,
+        size=size,
+        name=name,
+        label=options.get("label"),
+        lamps=lamps,
+        facing=options.get("facing"),
     )
 
 
@@ -245,10 +248,10 @@ def add_things(
         if isinstance(part, ThingPart)
     }
     remarks += [
-        f"{first[0].upper()}{first[1:]} and {other} stand in each other: their "
+        f"{first_name[0].upper()}{first_name[1:]} and {second_name} stand in each other: their "
         "outlines on the ground overlap."
-        for first, other in combinations(footprints, 2)
-        if is_overlapping(footprints[first], footprints[other])
+        for first_name, second_name in combinations(footprints, 2)
+        if is_overlapping(footprints[first_name], footprints[second_name])
     ]
     return replace(scene, remarks=(*scene.remarks, *remarks))
 
@@ -259,14 +262,22 @@ def _compute_pose(
     requested: RequestedThing,
     metres: float,
 ) -> Float64Array:
-    foot, extent = find_footing(asset.mesh.vertices.astype(np.float64))
-    linear = metres / scene.metres / extent * make_rotation(requested.heading, 0.0, 0.0)
+    """Return the pose (4, 4) of a thing: at its place, on the ground, turned and
+    scaled.
+
+    `metres` is the longest side that it has.
+    """
+    foot_point, extent = find_footing(asset.mesh.vertices.astype(np.float64))
+    scaled_rotation = (
+        metres / scene.metres / extent * make_rotation(requested.heading, 0.0, 0.0)
+    )
     position = (
         compute_center(scene)[:2] + np.array([requested.x, requested.y]) / scene.metres
     )
     return make_pose(
-        linear,
-        np.array([*position, find_ground_height(scene, position)]) - linear @ foot,
+        scaled_rotation,
+        np.array([*position, find_ground_height(scene, position)])
+        - scaled_rotation @ foot_point,
     )
 
 
@@ -290,20 +301,24 @@ def find_ground_height(scene: SceneDescription, position: Float64Array) -> float
 
 
 def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list[float]:
-    """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,)."""
+    """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,).
+
+    Only triangles that have the point inside count, seen from above; those that stand
+    upright do not.
+    """
     a, b, c = np.moveaxis(corners, 1, 0)
     doubled_areas = [
-        (end[:, 0] - begin[:, 0]) * (position[1] - begin[:, 1])
-        - (end[:, 1] - begin[:, 1]) * (position[0] - begin[:, 0])
-        for begin, end in ((b, c), (c, a), (a, b))
+        (end[:, 0] - start[:, 0]) * (position[1] - start[:, 1])
+        - (end[:, 1] - start[:, 1]) * (position[0] - start[:, 0])
+        for start, end in ((b, c), (c, a), (a, b))
     ]
     total_area = doubled_areas[0] + doubled_areas[1] + doubled_areas[2]
     barycentric = np.stack(doubled_areas) / np.where(
         np.abs(total_area) > 1e-12, total_area, np.nan
     )
-    is_under = (barycentric >= 0.0).all(axis=0)
+    is_over_point = (barycentric >= 0.0).all(axis=0)
     heights: list[float] = (
-        (barycentric * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[is_under].tolist()
+        (barycentric * [a[:, 2], b[:, 2], c[:, 2]]).sum(axis=0)[is_over_point].tolist()
     )
     return heights
 
@@ -346,26 +361,27 @@ def list_camera_remarks(
     """Return a remark where cameras, at positions (3,) in metres, are inside a
     solid.
     """
-    inside = list[str]()
+    solid_names = list[str]()
     for eye in eyes:
+        # A camera is a tiny square.
         x, y, z = eye / scene.metres
-        around = np.array(
+        corners = np.array(
             [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
         )
         solid = find_overlapping_solid(
-            scene, Footprint(around, z - EYE_SIZE, z + EYE_SIZE)
+            scene, Footprint(corners, z - EYE_SIZE, z + EYE_SIZE)
         )
         if solid is not None:
-            inside.append(solid)
-    if not inside:
+            solid_names.append(solid)
+    if not solid_names:
         return ()
     if len(eyes) == 1:
         return (
-            f"The camera is inside {inside[0]} of the place: it sees no object "
+            f"The camera is inside {solid_names[0]} of the place: it sees no object "
             "from there; move it.",
         )
-    solids = " or ".join(dict.fromkeys(inside))
-    fraction = 100.0 * len(inside) / len(eyes)
+    solids = " or ".join(dict.fromkeys(solid_names))
+    fraction = 100.0 * len(solid_names) / len(eyes)
     return (
         f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: "
         "it sees no object from there; "

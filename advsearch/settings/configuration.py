@@ -298,6 +298,11 @@ class Config(BaseModel):
     )
 
     def __init__(self, **data: Any) -> None:
+        """Check the settings; numpy and torch values become Python's first.
+
+        Raises:
+            InputError: a value is wrong; the message names the setting.
+        """
         _check_shallow(type(self), data)
         values = _read_mappings(type(self), written.to_python(data))
         _check_shallow(type(self), values)

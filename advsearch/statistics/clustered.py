@@ -208,9 +208,10 @@ def one_sided_p_value(
     bets (`_betting_p_value`). All units weigh the same (`mean_rate`).
 
     Args:
-        n_right_inside, of: (n,) of each unit, right predictions and predictions inside.
-        n_right_outside, rest: (n,) of each unit, right predictions and predictions
-            outside.
+        n_right_inside: (n,) right predictions of each unit inside.
+        n_inside: (n,) predictions of each unit inside.
+        n_right_outside: (n,) right predictions of each unit outside.
+        n_outside: (n,) predictions of each unit outside.
         copies: how many copies there are of each of these units.
     """
     right_inside = np.asarray(n_right_inside, dtype=np.float64)

@@ -14,15 +14,15 @@ SIGNIFICANCE = 0.05
 
 @dataclass(frozen=True)
 class Dip:
-    """A distance at which an object is seen less often than beyond it.
+    """A distance at which an object is recognised less often than beyond it.
 
     Attributes:
         distance: the nearer one.
-        counts: pictures that are right there, and how many there are.
+        counts: images that are right there, and how many there are.
         until: the farthest of the distances beyond it that are compared with it.
-        counts_beyond: pictures that are right at these, and how many there are.
-        p_value: how likely so large a difference is where the share falls with the
-            distance; of all differences that were looked at together.
+        counts_beyond: images that are right at these, and how many there are.
+        p_value: probability of so large a difference if the rate falls with the
+            distance, times the number of comparisons.
     """
 
     distance: float

@@ -38,6 +38,9 @@ def paired_difference(
     phi = _phi_coefficient(both, first, second, neither)
 
     def combine(a: float, b: float) -> float:
+        """Return the distance of the difference's bound, by those of both rates; the
+        root of a number below 0 by rounding is 0.
+        """
         return math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b))
 
     difference = second_rate - first_rate

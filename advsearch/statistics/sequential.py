@@ -45,11 +45,11 @@ Large ones decide soon where nearly all samples agree.
 
 @dataclass
 class ConfidenceSequence:
-    """Draws in [0, 1], and an interval of their mean that holds after each of them: one
-    may stop as soon as it decides.
+    """Samples in [0, 1], and an interval of their mean that holds after each of them:
+    one may stop as soon as it decides.
 
-    Of draws x_1, x_2, ... whose mean is m, whatever was drawn before, a gambler who
-    stakes a share c of what he has, on "more than m" or on "less than m", plays a fair
+    For samples x_1, x_2, ... whose mean is m given those before, a gambler who stakes a
+    fraction c of his capital on "more than m" (K) or on "less than m" (L) plays a fair
     game:
 
         K_t(m, c) = prod_s (1 - c + c x_s / m)
@@ -63,9 +63,9 @@ class ConfidenceSequence:
 
     Attributes:
         confidence: of the interval, at all times together; over 0 and under 1.
-        sides: 2 of the whole interval; 1 of each end by itself, for a claim "at least
-            so much": if it is true only `is_under` can be wrong, and else only
-            `is_over`, so that each may be as often as the other says.
+        sides: 2 for the interval; 1 for each bound by itself, to decide a claim "the
+            mean is at least m": if it is true only `is_under` can be wrong, and if not
+            only `is_over`, so that each may be wrong as often as the confidence allows.
     """
 
     confidence: float = CONFIDENCE
@@ -79,6 +79,7 @@ class ConfidenceSequence:
             )
 
     def add(self, value: float) -> None:
+        """Add a sample. Raises InputError: it is not in [0, 1]."""
         if not 0.0 <= value <= 1.0:
             raise InputError(f"draw: expected a number from 0 to 1, got {value}")
         self._counts[value] += 1
@@ -113,6 +114,11 @@ class ConfidenceSequence:
         return lower, find_threshold(self.is_under)
 
     def _has_won(self, mean: float, counts: Mapping[float, int]) -> bool:
+        """Return whether bets on "more than `mean`" have won against samples.
+
+        Only as long as the capital stays above the threshold, so that adding samples
+        may undo it.
+        """
         threshold = np.log(self.sides / (1.0 - self.confidence))
         return bool(log_capital_of_counts(mean, counts) >= threshold)
 
@@ -120,8 +126,8 @@ class ConfidenceSequence:
 def count_needed_samples(mean: float, *, confidence: float, value: float = 1.0) -> int:
     """Return how many equal samples show that the true mean is over a number.
 
-    It is by one side of a `ConfidenceSequence`; where the value is 1, no other samples
-    show it sooner.
+    One side of a `ConfidenceSequence` shows it. With the value 1 it is the minimum: no
+    other samples show it sooner.
 
     Args:
         mean: the number, in (0, 1).

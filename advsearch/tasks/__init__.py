@@ -42,8 +42,8 @@ from advsearch.tasks.classification import (
     Classification,
     ClassTask,
     Labels,
-    compute_target_lead,
-    compute_wrong_lead,
+    compute_misclassification_margin,
+    compute_target_margin,
     make_class_mask,
 )
 from advsearch.tasks.detection import Detection
@@ -256,8 +256,8 @@ __all__ = [
     "Task",
     "Truth",
     "Truths",
-    "compute_target_lead",
-    "compute_wrong_lead",
+    "compute_misclassification_margin",
+    "compute_target_margin",
     "get_task_function",
     "join_predictions",
     "make_class_mask",

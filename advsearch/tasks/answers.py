@@ -151,11 +151,13 @@ class FreeAnswer(Task):
                 is_right = [float(has_word(text, truth)) for text in _texts(answer)]
                 losses.append(1.0 - 2.0 * torch.tensor(is_right).mean())
                 continue
-            lead = _token_lead(answer["logits"], answer["begins"], truth)
+            margin = _compute_token_margin(answer["logits"], answer["begins"], truth)
+            # The text decides the sign, the margin only the size: below 0 if the answer
+            # has a right word, over 0 if not.
             if has_word(answer["text"], truth):
-                losses.append(functional.logsigmoid(-lead))
+                losses.append(functional.logsigmoid(-margin))
             else:
-                losses.append(-functional.logsigmoid(lead))
+                losses.append(-functional.logsigmoid(margin))
         return torch.stack(losses)
 
     def predictions(
@@ -176,7 +178,7 @@ class FreeAnswer(Task):
         truth: Words,
         margins: Sequence[float],
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.said`: of several texts, the most frequent among those that
+        """See `Task.describe`: of several texts, the most frequent among those that
         decided.
 
         The payload has all of them.
@@ -192,18 +194,19 @@ class FreeAnswer(Task):
         return results
 
 
-def _token_lead(
+def _compute_token_margin(
     logits: Tensor, begins: Callable[[str], Sequence[int]], words: Words
 ) -> Tensor:
-    """Compute the largest lead over all steps of tokens that begin one of the words.
+    """Compute the margin of the tokens that begin one of the words, at the step at
+    which it is largest.
 
     Args:
-        logits: (T, tokens).
+        logits: (T, tokens) of each step of the answer.
         begins: returns the tokens that may begin a word.
         words: at least one.
 
     Returns:
-        Their largest logit minus that of all other tokens, ().
+        The largest logit of these tokens minus that of all others, ().
 
     Raises:
         InputError: no token begins one of the words.

@@ -85,8 +85,10 @@ class Judgement:
         prediction: Prediction,
         payload: JsonValue = None,
     ) -> Judgement:
-        """Create the judgement of an output; `NOT_A_NUMBER` if its margin is not
-        finite.
+        """Create the judgement of an output.
+
+        If its margin is not finite, the prediction is `NOT_A_NUMBER`, neither right nor
+        a success, without a payload.
         """
         if not math.isfinite(margin):
             not_a_number = Prediction(NOT_A_NUMBER)
@@ -104,7 +106,7 @@ class Judgement:
         return get_outcome(self.payload)
 
     @property
-    def is_not_a_number(self) -> bool:
+    def is_non_finite(self) -> bool:
         """Whether the model returned NaN or infinity, neither right nor a success."""
         return self.prediction.label == NOT_A_NUMBER
 

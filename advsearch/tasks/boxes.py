@@ -58,6 +58,7 @@ def compute_fraction_inside(boxes: Tensor, box: Tensor) -> Tensor:
 
 
 def _intersection_area(boxes: Tensor, box: Tensor) -> Tensor:
+    """Return the area that boxes (..., 4) have in common with others, (...)."""
     lower = torch.maximum(boxes[..., :2], box[..., :2])
     upper = torch.minimum(boxes[..., 2:], box[..., 2:])
     return (upper - lower).clamp_min(0.0).prod(dim=-1)
@@ -204,7 +205,11 @@ def list_boxes(
 
 
 def _top_scores(detections: Detections) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the row, class and score (K,) each of the best scores, falling."""
+    """Return row, class and score, (K,) each, of the best scores in descending order.
+
+    K is at most `MAX_CANDIDATES`. A box with a score of every class may be there more
+    than once.
+    """
     scores = detections["scores"].detach()
     top_scores, flat_index = scores.flatten().topk(min(MAX_CANDIDATES, scores.numel()))
     if "labels" in detections:

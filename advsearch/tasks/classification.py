@@ -194,11 +194,11 @@ class Classification(ClassTask):
         return output.index_fill(1, indices, -math.inf)
 
     def loss(self, output: Tensor, truth: Labels) -> Tensor:
-        return compute_wrong_lead(self.as_logits(output, truth), truth)
+        return compute_misclassification_margin(self.as_logits(output, truth), truth)
 
     def score(self, output: Tensor, truth: Labels) -> Tensor:
         if self.target is not None:
-            return compute_target_lead(self.as_logits(output, truth), self.target)
+            return compute_target_margin(self.as_logits(output, truth), self.target)
         return super().score(output, truth)
 
     def predictions(
@@ -240,7 +240,7 @@ class Classification(ClassTask):
         logits = self.as_logits(output, truth)
         task_class = type(self)
         if task_class.loss is Classification.loss:
-            losses = compute_wrong_lead(logits, truth)
+            losses = compute_misclassification_margin(logits, truth)
         else:
             losses = self.loss(output, truth)
         if task_class.score is not Classification.score or self.target is not None:
@@ -264,11 +264,11 @@ class Classification(ClassTask):
 # ---- logits ----
 
 
-def compute_wrong_lead(logits: Tensor, right: Labels) -> Tensor:
+def compute_misclassification_margin(logits: Tensor, right: Labels) -> Tensor:
     """Compute the largest wrong logit minus the largest right one, (N,).
 
-    It is over 0 exactly if the prediction is wrong. Raises InputError as
-    `make_class_mask`.
+    It is over 0 if the prediction is wrong, and below 0 if it is right; 0 at a tie.
+    Raises InputError as `make_class_mask`.
     """
     is_right = make_class_mask(logits, right)
     return compute_largest_logit(logits, ~is_right) - compute_largest_logit(
@@ -276,11 +276,11 @@ def compute_wrong_lead(logits: Tensor, right: Labels) -> Tensor:
     )
 
 
-def compute_target_lead(logits: Tensor, targets: Labels) -> Tensor:
+def compute_target_margin(logits: Tensor, targets: Labels) -> Tensor:
     """Compute the largest logit of the targets minus the largest other one, (N,).
 
-    It is over 0 exactly if a target is predicted. Raises InputError as
-    `make_class_mask`.
+    It is over 0 if a target is predicted, and below 0 if not; 0 at a tie. Raises
+    InputError as `make_class_mask`.
     """
     is_target = make_class_mask(logits, targets, "target")
     return compute_largest_logit(logits, is_target) - compute_largest_logit(

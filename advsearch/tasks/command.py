@@ -91,7 +91,7 @@ class Command(Task):
                 )
 
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
-        """See `Task.wrapped`: a policy gets the state next to images."""
+        """See `Task.wrap_network`: a policy gets the state next to images."""
         if isinstance(network, models.AllAtOnce):
             inner: Any = self.wrap_network(network.network)
             return models.AllAtOnce(inner, network.cameras, network.layout)
@@ -264,9 +264,10 @@ class Command(Task):
         return () if truth is None else (self._format_action(truth.tolist()),)
 
     def _deviation(self, output: Tensor, center: Tensor | None) -> Tensor:
-        """Compute the deviation of each element from an action in envelopes, (N, A).
+        """Compute the deviation of each element from an action `center` (A,), in
+        envelopes, (N, A).
 
-        It is 0 where the action is NaN.
+        It is 0 for an element that is NaN in `center`, which is not judged.
         """
         if center is None:
             raise InputError(
@@ -291,7 +292,7 @@ class Command(Task):
     def describe(
         self, output: Tensor, truth: Tensor | None, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.said`: whether an action left its envelope, and by which element.
+        """See `Task.describe`: whether an action left its envelope, and by which element.
 
         The payload has the action and the clean one, also as text, and the number of
         envelopes between them.

@@ -115,6 +115,8 @@ class DepthTruth:
         disparity = self.z.reciprocal()
         column = torch.arange(width).expand(height, width)
         # Nearest columns outside the object; -1 and `width` if there are none.
+        # A running maximum (from the left) and minimum (from the right) carries the
+        # column of the last pixel outside on over the object.
         left = torch.where(self.mask, -1, column).cummax(dim=1).values
         right_edges = torch.where(self.mask, width, column).flip(1)
         right = right_edges.cummin(dim=1).values.flip(1)
@@ -391,15 +393,18 @@ class Depth(Task):
         else:
             ratio = predicted[mask] / z[mask]
         log_ratio = ratio.clamp(1.0 / MAX_FACTOR, MAX_FACTOR).log()
-        # A number that is NaN anywhere in the map makes all of them NaN.
-        nan_anywhere = predicted.sum() * 0.0
-        return (-log_ratio if is_inverse else log_ratio) + nan_anywhere
+        log_factors = -log_ratio if is_inverse else log_ratio
+        # 0, or NaN if the map has a NaN anywhere, also outside the object
+        nan_or_zero = predicted.sum() * 0.0
+        return log_factors + nan_or_zero
 
     def _align(self, depth_map: DepthMap, truth: DepthTruth) -> tuple[Tensor, bool]:
         """Return the predicted z-depth of every pixel in units of the truth, (H, W), or
         its inverse; and whether it is the inverse.
 
-        A map is resized as transformers does it in `post_process_depth_estimation`.
+        It is the inverse for a map of disparity. Scale and shift of a map are fitted to
+        the truth by least squares, unless it is in metres. A map of another size is
+        resized as transformers does it in `post_process_depth_estimation`.
         """
         ((stated_kind, values),) = depth_map.items()
         kind = self.kind or stated_kind
@@ -409,7 +414,11 @@ class Depth(Task):
                 values[None, None], size=size, mode="bicubic", align_corners=False
             )[0, 0]
         if kind == METRIC:
-            scale = (truth.metres or 1.0) / self.size if self.size else 1.0
+            # If the user states a size, metres of that object become those of the
+            # scene's, or object sizes.
+            scale = 1.0
+            if self.size:
+                scale = (truth.metres or 1.0) / self.size
             return values * scale, False
         z = truth.z.to(values.device)
         fit_mask = truth.fit_mask.to(values.device)
@@ -420,9 +429,10 @@ class Depth(Task):
     def _relief(self, log_factors: Tensor, truth: DepthTruth) -> Tensor:
         """Compute the remaining fraction of the object's relief, ().
 
-        It is 1 if all distances are true, and 0 if the object is as far as what is
-        behind it: the least-squares coefficient over its pixels, in disparity. It is 1
-        if nothing is known to be behind the object.
+        The relief is the disparity of the object's pixels minus that of what is behind
+        them, and the fraction the least-squares coefficient of the predicted relief on
+        the true one: 1 if all distances are true, 0 if the object is as far as what is
+        behind it. It is 1 too if that is unknown, or the true relief is negligible.
         """
         mask = truth.mask
         disparity = truth.z[mask].reciprocal().to(log_factors)
@@ -431,6 +441,7 @@ class Depth(Task):
         true_relief = (disparity - behind)[is_known]
         squared_relief = true_relief.square().sum()
         if float(squared_relief) <= 1e-6 * float(disparity.square().sum()):
+            # The product keeps the value attached to the graph.
             return log_factors.sum() * 0.0 + 1.0
         predicted_disparity = disparity * (-log_factors).exp()
         predicted_relief = (predicted_disparity - behind)[is_known]
@@ -456,7 +467,7 @@ class Depth(Task):
     def describe(
         self, output: Sequence[DepthMap], truth: DepthTruth, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.said`; the payload has the factor by which the distance is off, the
+        """See `Task.describe`; the payload has the factor by which the distance is off, the
         remaining relief, and where scale and shift were fitted.
         """
         if not truth.is_visible:

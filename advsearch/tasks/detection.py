@@ -291,12 +291,15 @@ class Detection(ClassTask):
     def _infer_order(self, output: Sequence[Detections]) -> str:
         """Return the order that an output shows, "" if it leaves it open.
 
+        A DETR head that the user does not state has a last class for no object if the
+        name of the model's last class says so.
+
         Raises:
             InputError: the output contradicts the options or the number of classes.
         """
         grids = [detections["raw"] for detections in output if "raw" in detections]
         has_logits = any("logits" in detections for detections in output)
-        head = self._head
+        head = self._stated_class_count_order
         if not head and has_logits and self.named and is_nothing_name(self.labels[-1]):
             head = QUERIES[1]
         n_classes = len(self.labels) if self.named else None
@@ -374,15 +377,18 @@ class Detection(ClassTask):
     @property
     def _box_format(self) -> BoxFormat:
         """How the model's boxes are read: by the options, else as inferred."""
-        order = self._head or self.inferred_order
+        order = self._stated_class_count_order or self.inferred_order
         default_form = "cxcywh" if order in CLASS_COUNT_ORDERS else FORMS[0]
         unit = self.unit or self.inferred_unit or UNITS[1]
         return BoxFormat(self.boxes or default_form, unit, self.input_size)
 
     @property
-    def _head(self) -> str:
-        """The head of `HEADS` or `QUERIES` that the option `order` names; "" if
-        none.
+    def _stated_class_count_order(self) -> str:
+        """The option `order` in its normal form, with single blanks, if it is one of
+        `CLASS_COUNT_ORDERS`; else "".
+
+        These are a YOLO head, with or without a layout, and a DETR output. Other orders
+        name the components or columns of an output.
         """
         if not self.order:
             return ""
@@ -495,8 +501,8 @@ class Detection(ClassTask):
         """
         wrong_score = self._scores_of_rivals(self._suppress(detections), truth.labels)
         best_score = max_or_zero(wrong_score, self._is_at_object(detections, truth))
-        wrong_lead = compute_log_odds(best_score) - self._min_log_odds
-        return torch.minimum(self._score_vanish(detections, truth), wrong_lead)
+        wrong_excess = compute_log_odds(best_score) - self._min_log_odds
+        return torch.minimum(self._score_vanish(detections, truth), wrong_excess)
 
     def _score_displace(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Compute the lesser of two: how far the best overlap of a box that counts is
@@ -506,12 +512,13 @@ class Detection(ClassTask):
         log-odds.
         """
         scores = self._scores_of_classes(detections, truth.labels)
-        score_lead = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
+        score_excess = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
         best_overlap = max_or_zero(
             compute_iou_with_truth(detections, truth), scores >= self.confidence
         )
-        overlap_lead = (self.iou - best_overlap) / (self.iou * (1.0 - self.iou))
-        return torch.minimum(overlap_lead, score_lead)
+        # the slope of log-odds at `iou` is 1 / (iou (1 - iou))
+        overlap_shortfall = (self.iou - best_overlap) / (self.iou * (1.0 - self.iou))
+        return torch.minimum(overlap_shortfall, score_excess)
 
     def _score_create(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Compute by how much the best box where nothing is exceeds `confidence`."""
@@ -544,7 +551,8 @@ class Detection(ClassTask):
         """Return the detections of each image with boxes as fractions of the image.
 
         Classes that stand for nothing get a score of 0. Boxes that are not finite are
-        dropped if all their scores are below the minimum.
+        dropped if all their scores are below the minimum, so that they do not make the
+        output broken (`_is_broken`).
         """
         images = list[Detections]()
         box_format = self._box_format
@@ -645,10 +653,12 @@ class Detection(ClassTask):
         return is_on_nothing
 
     def _phantom_scores(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Return the score of each box as one where nothing is, (D,).
+        """Return the score of each box as one where nothing is, (D,); 0 of one that is
+        not.
 
-        The score is that of a target class, or of any class without a target. A loose
-        box of the object's class is no phantom.
+        The score is that of a target class, or of any class without a target. A box of
+        a right class is a phantom if it is on no thing of these classes, however
+        loosely; a box of another class, if it is elsewhere than the object.
         """
         right_classes = set(truth.labels)
         if self.target is not None:
@@ -719,7 +729,7 @@ class Detection(ClassTask):
         truth: DetectionTruth,
         margins: Sequence[float],
     ) -> list[PredictionWithPayload]:
-        """See `Task.said`: what becomes of the object; the payload has boxes in
+        """See `Task.describe`: what becomes of the object; the payload has boxes in
         pixels.
         """
         results: list[PredictionWithPayload] = []

@@ -163,6 +163,8 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
     if queries is not None:
         return _split_queries(*queries)
 
+    # One tensor (N, A, B) is a YOLO grid, unless its rows are six numbers (a box, a
+    # score and a class), with or without mask coefficients.
     returned, channels = _split_off_maps(returned)
     map_channels = torch.tensor(sorted(channels), dtype=torch.long)
     is_grid = (
@@ -253,8 +255,10 @@ def _split_batch_rows(
     names_before: Sequence[str] = ()
     if "batch" in order_names:
         names_before = order_names[: order_names.index("batch")]
-    # A box takes four columns.
-    batch_column = len(names_before) + 3 * ("boxes" in names_before)
+    # each name before takes one column, boxes take four
+    batch_column = len(names_before)
+    if "boxes" in names_before:
+        batch_column += 3
     image_index = rows.detach()[:, batch_column]
     is_index = (
         (image_index == image_index.round())
@@ -665,8 +669,17 @@ def infer_order(
 
 
 def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
-    """Return which of `QUERIES` logits of a box are, by their number."""
-    order = head or QUERIES[n_logits == classes + 1]
+    """Return which of `QUERIES` logits of a box are, by their number.
+
+    One more logit than classes is that of no object, unless the user states the head.
+
+    Raises:
+        ValueError: the number fits neither.
+    """
+    order = head
+    if not order:
+        has_nothing = n_logits == classes + 1
+        order = QUERIES[1] if has_nothing else QUERIES[0]
     is_softmax = order == QUERIES[1]
     if n_logits == classes or (is_softmax and n_logits == classes + 1):
         return order
@@ -702,7 +715,13 @@ def _order_of_grids(grids: Sequence[Detections], classes: int, head: str) -> str
 def _order_of_pairs(
     detections_of_images: Sequence[Detections], classes: int | None
 ) -> str:
-    """Return the order of the two numbers of boxes in `either`, "" if it is open."""
+    """Return the order of the two numbers of boxes in `either`, "" if it is open.
+
+    The column of scores has values in [0, 1] only, that of classes integers only. If
+    both may be either, the one that never rises within an image is the scores. If
+    neither can be classes, both are scores of a network with two classes, or
+    objectness and score of one with a single class.
+    """
     pairs_of_images = []
     for detections in detections_of_images:
         if "either" in detections:
@@ -720,8 +739,11 @@ def _order_of_pairs(
     if not scores_first and not labels_first:
         has_integers = any(bool((x == x.round()).all()) for x in columns)
         if all(are_scores) and not has_integers and classes in (1, 2):
-            return f"{list(HEADS)[2 - classes]} {LAYOUTS[1]}"
+            scores_head, objectness_head = HEADS
+            head = scores_head if classes == 2 else objectness_head
+            return f"{head} {LAYOUTS[1]}"
         if classes is not None:
+            # The number of classes may be wrong: try without it.
             return infer_order(detections_of_images)
         raise ValueError(
             "expected for each box a score in [0, 1] and the number of a "

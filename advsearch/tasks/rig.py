@@ -178,7 +178,7 @@ class Rig(tasks.JointTask):
                 self.part.judge(image_output, image_truth)[0]
                 for image_output, image_truth in zip(image_outputs, truth, strict=True)
             ]
-            if any(judgement.is_not_a_number for judgement in judgements):
+            if any(judgement.is_non_finite for judgement in judgements):
                 margin = math.nan
             image_payloads: list[tasks.JsonValue] = [
                 {

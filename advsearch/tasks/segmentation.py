@@ -22,7 +22,7 @@ EXPECTED = (
 MIN_PARTIAL_ACCURACY = 0.1
 
 # Computes the lead (P,) of classes from logits (P, classes).
-Lead = Callable[[Tensor, tasks.Labels], Tensor]
+PixelMargin = Callable[[Tensor, tasks.Labels], Tensor]
 
 
 @dataclass(frozen=True)
@@ -105,13 +105,14 @@ class Segmentation(tasks.ClassTask):
         return self.get_class_names(truth.labels)
 
     def loss(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
-        """Compute the lead of wrong classes at the deciding pixel, in logits, (N,).
+        """Compute the margin of wrong classes at the deciding pixel, in logits, (N,).
 
-        It is over 0 if too few pixels are right. Of the object's pixels in the order of
-        that lead, the deciding one is that at which `accuracy` of them is reached.
+        It is over 0 if too few pixels are right. Of the object's pixels in ascending
+        order of that margin, the deciding one is that at which `accuracy` of them is
+        reached.
         """
-        return self._compute_deciding_lead(
-            output, truth, tasks.compute_wrong_lead, truth.labels
+        return self._compute_deciding_margin(
+            output, truth, tasks.compute_misclassification_margin, truth.labels
         )
 
     def score(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
@@ -120,42 +121,49 @@ class Segmentation(tasks.ClassTask):
         """
         if self.target is None:
             return super().score(output, truth)
-        return -self._compute_deciding_lead(
+        return -self._compute_deciding_margin(
             output,
             truth,
-            lambda logits, labels: -tasks.compute_target_lead(logits, labels),
+            lambda logits, labels: -tasks.compute_target_margin(logits, labels),
             self.target,
         )
 
     def pixel_margin(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
         """Compute the mean over the object's pixels of what is sought, in logits, (N,).
 
-        That is the lead of wrong classes, or of the target's. Every pixel has a
+        That is the margin of wrong classes, or of the target's. Every pixel has a
         derivative, not only the deciding one as in `loss`.
         """
         pixels = self._object_logits(output, truth)
         if pixels is None:
             return _make_hidden_value(output)
         if self.target is None:
-            lead = tasks.compute_wrong_lead(pixels, truth.labels)
+            margin = tasks.compute_misclassification_margin(pixels, truth.labels)
         else:
-            lead = tasks.compute_target_lead(pixels, self.target)
-        mean_lead = lead.reshape(len(output), -1).mean(dim=1)
-        return -mean_lead if self.minimise else mean_lead
+            margin = tasks.compute_target_margin(pixels, self.target)
+        mean_margin = margin.reshape(len(output), -1).mean(dim=1)
+        return -mean_margin if self.minimise else mean_margin
 
-    def _compute_deciding_lead(
-        self, output: Tensor, truth: SegmentationTruth, lead: Lead, labels: tasks.Labels
+    def _compute_deciding_margin(
+        self,
+        output: Tensor,
+        truth: SegmentationTruth,
+        compute_margin: PixelMargin,
+        labels: tasks.Labels,
     ) -> Tensor:
-        """Compute the lead at the pixel at which `accuracy` of them is reached,
-        (N,).
+        """Compute the margin at the pixel at which `accuracy` of them is reached, (N,).
+
+        It is NaN if a margin is not finite, and that of a hidden object if it is out of
+        view. `compute_margin` is called with the logits (N * P, classes) of the pixels
+        and `labels`.
         """
         pixels = self._object_logits(output, truth)
         if pixels is None:
             return _make_hidden_value(output)
-        leads = lead(pixels, labels).reshape(len(output), -1)
-        rank = math.ceil(self.accuracy * leads.shape[1])
-        deciding_lead = leads.kthvalue(rank, dim=1).values
-        return torch.where(leads.isfinite().all(dim=1), deciding_lead, math.nan)
+        margins = compute_margin(pixels, labels).reshape(len(output), -1)  # (N, P)
+        rank = math.ceil(self.accuracy * margins.shape[1])
+        deciding_margin = margins.kthvalue(rank, dim=1).values
+        return torch.where(margins.isfinite().all(dim=1), deciding_margin, math.nan)
 
     @staticmethod
     def _object_logits(output: Tensor, truth: SegmentationTruth) -> Tensor | None:
@@ -200,7 +208,7 @@ class Segmentation(tasks.ClassTask):
     def describe(
         self, output: Tensor, truth: SegmentationTruth, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.said`: the class of most of the object's pixels.
+        """See `Task.describe`: the class of most of the object's pixels.
 
         If too few are right, it is the most frequent wrong class; if that is
         background, "no bottle", or "bottle in part" from `MIN_PARTIAL_ACCURACY` on. The
@@ -286,7 +294,7 @@ class Segmentation(tasks.ClassTask):
         """
         n_classes = logits.shape[0]
         pixels = logits.permute(1, 2, 0).reshape(-1, n_classes)
-        is_correct = tasks.compute_wrong_lead(pixels, truth.labels) <= 0.0
+        is_correct = tasks.compute_misclassification_margin(pixels, truth.labels) <= 0.0
         return is_correct.reshape(logits.shape[1:])
 
     def marks(self, output: Tensor, truth: SegmentationTruth) -> list[list[tasks.Mark]]:

@@ -200,7 +200,11 @@ def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tenso
 
 
 def _list_visible(folder: Path) -> list[Path]:
-    """List what is in a folder and not hidden, sorted. Raises InputError: no folder."""
+    """List what is in a folder of references and not hidden, sorted by name.
+
+    Raises:
+        InputError: it is no folder, or cannot be read.
+    """
     try:
         return sorted(
             path for path in folder.iterdir() if not path.name.startswith(".")
@@ -348,8 +352,8 @@ class Similarity(tasks.Classification):
         return tuple(name for name, _ in list_name_folders(self.references)), True
 
     def find_right_classes(self, facts: tasks.Facts) -> tasks.Labels:
-        """See `ClassTask.right_classes`; with a threshold the clean image defines what
-        is right.
+        """See `ClassTask.find_right_classes`; with a threshold the clean image defines
+        what is right, whose class is 0.
         """
         if self.references:
             return super().find_right_classes(facts)

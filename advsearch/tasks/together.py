@@ -295,7 +295,7 @@ class EnsembleTask(JointTask):
         """Join the models' judgements of one image."""
         worst = min(judgements, key=lambda judgement: judgement.margin)
         margin = worst.margin
-        if any(judgement.is_not_a_number for judgement in judgements):
+        if any(judgement.is_non_finite for judgement in judgements):
             margin = math.nan
         payload = None
         if any(judgement.payload is not None for judgement in judgements):
@@ -403,7 +403,7 @@ class EachThingTask(JointTask):
     def describe(
         self, output: Output, truth: TruthByThing, margins: Sequence[float]
     ) -> list[PredictionWithPayload]:
-        """See `Task.said`: the prediction about the worst visible thing.
+        """See `Task.describe`: the prediction about the worst visible thing.
 
         The payload is that of the worst thing, with the judgement of each.
         """

@@ -221,6 +221,7 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
 
 
 def _find_code_problem(content: bytes) -> str:
+    """Return what speaks against the code of a TorchScript archive, "" if nothing does."""
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
@@ -318,6 +319,12 @@ def _check_pickle(archive: Archive, name: str) -> None:
 
 
 def _check_values(archive: Archive, name: str, value: Any) -> None:
+    """Check the texts in a nested value: depth by depth, each object once.
+
+    Raises:
+        FileFormatError: a text has hidden characters, or the nesting is deeper than
+            `DEPTH`.
+    """
     level = [value]
     checked_ids = {id(value)}
     for _ in range(DEPTH):

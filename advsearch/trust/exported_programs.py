@@ -306,6 +306,14 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
 
 
 def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> None:
+    """Copy the tensors that a table names from an archive to the one that is written.
+
+    Only plain records of numbers are copied: no pickles, and no records that are
+    shorter than the sizes in the table say.
+
+    Raises:
+        FileFormatError: the table or an entry is something else.
+    """
     content = archive.read_json(config)
     table = content.get("config") if isinstance(content, dict) else None
     if not isinstance(table, dict) or not all(
@@ -329,11 +337,11 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
         member = f"{folder}{record}"
         meta = entry.get("tensor_meta")
         sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
-        listed = sizes if isinstance(sizes, list) else [None]
-        numbers: list[Any] = [
-            size.get("as_int") if isinstance(size, dict) else None for size in listed
+        entries = sizes if isinstance(sizes, list) else [None]
+        shape: list[Any] = [
+            size.get("as_int") if isinstance(size, dict) else None for size in entries
         ]
-        if not all(isinstance(number, int) and number >= 0 for number in numbers):
+        if not all(isinstance(size, int) and size >= 0 for size in shape):
             raise make_archive_error(
                 archive.path,
                 "expected the sizes of a tensor for "
@@ -343,11 +351,11 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
         if (
             member in archive
             and archive.members[member].file_size == 0
-            and math.prod(numbers) > 0
+            and math.prod(shape) > 0
         ):
             raise make_archive_error(
                 archive.path,
-                f"{member[:80]!r} is empty, but should hold a tensor of {numbers[:8]}",
+                f"{member[:80]!r} is empty, but should hold a tensor of {shape[:8]}",
             )
         if member not in copied:
             writer.write_bytes(member, archive.read(member))
@@ -385,6 +393,7 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
 
 
 def _problem(value: Any, key: str) -> str:
+    """Return what speaks against a value of a program, "" if nothing does."""
     if isinstance(value, str):
         return _TEXTS.get(key, _plain_problem)(value)
     if key == "expr_str":
@@ -399,6 +408,7 @@ def _plain_problem(text: str) -> str:
 
 
 def _identifier_problem(text: str) -> str:
+    """Return what speaks against a name that torch writes into code, "" if nothing does."""
     proper = text == "" or (
         text.isascii()
         and text.isidentifier()
@@ -418,6 +428,7 @@ def _argument_problem(text: str) -> str:
 
 
 def _operator_problem(text: str) -> str:
+    """Return what speaks against the name of an operator, "" if nothing does."""
     operator = _OPERATOR.fullmatch(text)
     if _ARITHMETIC.fullmatch(text) or (operator and operator[1] not in HARMFUL):
         return ""

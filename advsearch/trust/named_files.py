@@ -87,6 +87,12 @@ class References:
         return reason
 
     def _content(self, name: str) -> bytes:
+        """Return the bytes of a file that another file names; each is read once.
+
+        Raises:
+            FileFormatError: it is outside of the folder, missing, no ordinary file,
+                or all files together are too large.
+        """
         path = os.path.realpath(os.path.join(self._folder, name))
         if not is_inside(path, self._folder):
             raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)

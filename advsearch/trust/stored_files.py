@@ -222,6 +222,7 @@ def _parse_finite(text: str) -> float:
 
 
 def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> None:
+    """Check that a file is an ordinary one of at most `limit` bytes."""
     if not stat.S_ISREG(status.st_mode):
         got = next(
             (words for is_kind, words in _KINDS if is_kind(status.st_mode)),

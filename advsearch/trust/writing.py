@@ -190,11 +190,17 @@ LOCK = ".lock"
 
 
 class RunLock:
-    """The lock on a run directory, held until `release` or the end of the process; an
-    InputError names who else works on it.
-    """
+    """The lock on a run directory, held until `release` or the end of the process."""
 
     def __init__(self, folder: Path) -> None:
+        """Lock a run directory and write this process's number into the lock.
+
+        Raises:
+            InputError: another process holds the lock; the message names it.
+            StorageError: the file system has no locks, or the file cannot be
+                written.
+            FileFormatError: something that is no ordinary file stands in its place.
+        """
         self._path = folder / LOCK
         with storage_errors(self._path):
             self._descriptor = os.open(

@@ -95,6 +95,10 @@ class ConnectionPool:
         handle: Callable[[socket.socket, Any], None],
         context: ssl.SSLContext | None,
     ) -> None:
+        """Make a pool that passes each accepted connection to `handle`.
+
+        With an SSL `context` a connection is encrypted first.
+        """
         self._listening = listening_socket
         self._handle = handle
         self._context = context

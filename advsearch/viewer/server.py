@@ -375,6 +375,11 @@ class Dashboard(HTTPServer):
         https: bool = False,
         photographs: PhotographServer | None = None,
     ) -> None:
+        """Listen at an address; arguments as for the class.
+
+        Beyond this machine pages are encrypted and need a token. Runs of one name in
+        different folders get numbers.
+        """
         self._explicit_runs: dict[str, Path] = {}
         for path in runs:
             name = path.resolve().name

@@ -13,7 +13,6 @@ from PIL import Image
 import advsearch
 from advsearch import losses
 from advsearch.api.chart import CHART_COLORS, draw_chart_page
-from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import PAPERS
 
 Levels = np.ndarray
@@ -69,12 +68,3 @@ def test_what_was_printed_comes_back(
     assert palette.shape == (125, 3) and np.median(off) < 0.01 and off.max() < 0.04
     assert torch.allclose(losses.non_printability(palette.reshape(1, 25, 5, 3), palette), torch.zeros(1), atol=1e-6)
     assert float(losses.non_printability(torch.tensor(CHART_COLORS).float().reshape(1, 25, 5, 3), palette)[0]) > 0.05
-
-
-def test_a_picture_without_the_chart_is_refused(tmp_path: Path) -> None:
-    Image.new("RGB", (64, 64), (200, 200, 200)).save(tmp_path / "empty.png")
-    with pytest.raises(InputError, match="four black squares"):
-        advsearch.measured_palette(tmp_path / "empty.png")
-    (tmp_path / "text.jpg").write_text("no picture")
-    with pytest.raises(FileFormatError):
-        advsearch.measured_palette(tmp_path / "text.jpg")

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -99,14 +96,6 @@ def test_a_sweep_is_what_its_model_saw(swept: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.medium
-def test_failures_alone_are_taken_by_default_and_parts_are_read(swept: Path, tmp_path: Path) -> None:
-    found, rows = exported(swept, tmp_path / "out"), rows_of(swept / PARTS / "views")
-    wrong = [f"views-{row.step:06d}.png" for row in rows if not row.correct]
-    assert 0 < len(wrong) < len(rows) and [one["file_name"] for one in found["images"]] == wrong
-    assert sorted(one.name for one in (tmp_path / "out" / "images").iterdir()) == wrong
-
-
-@pytest.mark.medium
 def test_boxes_are_where_vertices_are_projected(tmp_path: Path) -> None:
     grid: Any = {"camera.azimuth": [10.0, 130.0], "camera.elevation": [5.0, 40.0]}
     advsearch.sweep("mug", EASY, grid, spp=1, resolution=(48, 64), denoise="none", trials=0, run=tmp_path / "run")
@@ -165,33 +154,6 @@ def test_yolo_has_a_line_for_each_box(swept: Path, tmp_path: Path) -> None:
         for (label, x, y, width, height), one in zip(lines, own, strict=True):
             box = [32 * (x - width / 2), 32 * (y - height / 2), 32 * width, 32 * height]
             assert label == one["category_id"] and box == pytest.approx(one["bbox"], abs=1e-4)
-
-
-@pytest.mark.medium
-def test_what_cannot_be_written_is_said(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def refused(run: Path, *more: str) -> str:
-        assert (
-            main(["export", str(run), "--format", "coco", "--out", str(tmp_path / "out"), "--code", EASY, *more]) == 2
-        )
-        return capsys.readouterr().err
-
-    run = shutil.copytree(swept / PARTS / "views", tmp_path / "run")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mine").touch()
-    assert "not empty" in refused(run)
-    (tmp_path / "out" / "mine").unlink()
-    with RunDirectory.create(tmp_path / "other") as other:
-        (other.path / "run.yaml").write_text("# advsearch run configuration\nschema: 2\ncommand: region\n")
-    assert "expected a run of sweep or attack" in refused(tmp_path / "other")
-    with closing(sqlite3.connect(run / NAME)) as rows, rows:
-        before = rows.execute("SELECT MAX(step) FROM evaluations").fetchone()
-        rows.execute("UPDATE evaluations SET correct = 1")
-        rows.commit()
-        assert "--all takes the others" in refused(run)
-        rows.execute("UPDATE evaluations SET step = 999999, correct = 0 WHERE step = ?", before)
-        rows.commit()
-        assert "expected rows of its 6 pictures" in refused(run)
-    assert not list((tmp_path / "out").iterdir()) and not list(tmp_path.glob(".export-*"))
 
 
 def seen_by_rays(parts: dict[str, npt.NDArray[np.float64]], size: tuple[int, int], focal: float) -> Any:

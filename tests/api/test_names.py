@@ -21,24 +21,12 @@ from advsearch.settings import HEADER
 WRONG = """
 attack --object mgu --control texture                                       'mug'
 attack --object mug --control textur                                        'texture'
-attack --object mug --control texture --environment studioo                 'studio'
 attack --object mug --control texture --over camra                          'camera'
-attack --object mug --control texture --policy pgdd                         'pgd'
-attack --object mug --control texture --task detecton                       'detection'
-attack --object mug --control texture --model referenc                      'reference'
 attack --object mug --control texture --labels coc0                         'coco90'
 attack --object car --environment street --with cra@3,1 --control pose      'car'
-attack --object car --with car@3,1 --judge carr --control pose              'car'
 sweep --object mug,bowll --grid pose.yaw=0:330:30                           'bowl'
-sweep --object mug --environment studio,noonn --grid pose.yaw=0:330:30      'noon'
-sweep --object mug --control camra --samples 4                              'camera'
-sweep --object mug --control camera --samples 4 --label mug --model refrence 'reference'
-harden --control textur --quick                                             'texture'
-harden --object mgu --control texture                                       'mug'
-harden --control texture --held-out-environment noonn                       'noon'
 region --object mug --control poze                                          'pose'
 explain mug-sweep-01                                                        'mug-sweep-001'
-compare mug-swep-001 mug-sweep-001                                          'mug-sweep-001'
 test sute.yaml                                                              suite.yaml
 """
 

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from advsearch.cluster import BatchResult, WorkerStats, WorkerTask
-from advsearch.errors import ClusterError
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
@@ -77,37 +76,6 @@ def test_a_shared_study_is_the_one_that_was_made_here(tmp_path: Path, monkeypatc
         assert {one.name for one in there.iterdir()} >= {"run.yaml", "summary.json", "report.html", "images"}
         assert "advsearch-part-" not in (there / "summary.json").read_text()
         assert str(there) in [one.run for one in shared.table]
-
-
-def test_an_attack_of_which_every_worker_dies_ends_the_study_by_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    elsewhere(monkeypatch, lost="no answer: 3 workers died of it")
-    with pytest.raises(ClusterError, match=r"^bowl: no answer: 3 workers died of it; leave it out"):
-        run_and_save(curve, RunContext(SMALL.model_copy(update={"run": str(tmp_path / "run"), "workers": 2})))
-
-
-def test_a_study_is_an_attack_for_every_object() -> None:
-    found = [part for (part,) in make_chains(SMALL.model_copy(update={"workers": 2}))]
-    assert [part.name for part in found] == ["00-mug", "01-bowl"]
-    assert all(part.config.run is None and part.config.workers is None for part in found)
-    assert [part.config.average for part in found] == [6, 6]
-
-
-@pytest.mark.medium
-def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = AttackConfig.from_config(
-        SMALL, object="mug", controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0
-    )
-    alone = run_and_save(curve, RunContext(small.model_copy(update={"run": str(tmp_path / "alone")})))
-    elsewhere(monkeypatch)
-    shared = run_and_save(curve, RunContext(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2})))
-    assert shared.parts == alone.parts and shared.curve == alone.curve
-    for name in alone.parts:
-        assert rows(tmp_path / "shared" / "parts" / name) == rows(tmp_path / "alone" / "parts" / name)
-    assert {one.name for one in (tmp_path / "shared" / "parts").iterdir()} == set(alone.parts)
 
 
 def test_a_curve_is_a_chain_for_each_object_and_a_matrix_one_attack_for_each_model() -> None:

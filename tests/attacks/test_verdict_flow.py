@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from advsearch.attacks import Ending
-from advsearch.attacks.trials import N_CONDITIONS, OVER_LADDER, choose_rate_spp, estimate_moved_fraction, limit_ladder
+from advsearch.attacks.trials import N_CONDITIONS, OVER_LADDER, choose_rate_spp, estimate_moved_fraction
 from advsearch.attacks.verification import TRIAL_LOOKS
 
 
@@ -82,11 +82,6 @@ def test_the_share_that_moves_is_that_of_a_mean_change() -> None:
     assert estimate_moved_fraction(here, here - 1.0) == pytest.approx(0.05, abs=0.005), (
         "a twentieth lies within 1 of zero"
     )
-
-
-def test_a_check_takes_no_more_than_its_share_of_the_searches() -> None:
-    assert limit_ladder(OVER_LADDER, 600, search_samples=76_800) == list(OVER_LADDER)
-    assert limit_ladder(OVER_LADDER, 600, search_samples=5_000) == list(OVER_LADDER[:2])
 
 
 @pytest.mark.parametrize("number", [0, 20, 60])

@@ -7,7 +7,6 @@ import os
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -48,13 +47,6 @@ def test_json_is_one_value_with_every_part(well: None, capsys: pytest.CaptureFix
     assert names >= set(TRIALS)
 
 
-def test_table_names_every_part_and_says_that_all_is_well(well: None, capsys: pytest.CaptureFixture[str]) -> None:
-    assert doctor.doctor.run(Namespace(json=False)) == 0
-    text = capsys.readouterr().out
-    assert all(name in text for name in ("numpy", "torch", "render", "libLLVM", "bundled scenes"))
-    assert "Everything that is necessary works." in text
-
-
 def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(
     well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -64,23 +56,6 @@ def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(
     assert "broken" in text and "ImportError: no such file" in text
     assert "xatlas: pip install --force-reinstall --no-deps xatlas" in text
     assert "Something necessary does not work." in text
-
-
-def test_a_missing_optional_part_is_a_warning(
-    well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(doctor, "find_installed_version", lambda name: None if name == "pyarrow" else "1.0")
-    assert doctor.doctor.run(Namespace(json=True)) == 0
-    (part,) = (p for p in json.loads(capsys.readouterr().out)["parts"] if p["name"] == "pyarrow")
-    assert part["status"] == "warning" and "Parquet" in part["detail"]
-
-
-def test_a_missing_package_is_told() -> None:
-    parts = {part.name: part for part in doctor.check_packages(ALL_WELL)}
-    assert {part.status for part in parts.values()} == {doctor.OK}
-    part = doctor.check_other_packages(["rich>=13", "surely-not-installed==1", 'dev-only; extra == "dev"', "numpy"])
-    assert (part.status, part.detail) == (doctor.MISSING, "not installed: surely-not-installed")
-    assert doctor.check_other_packages(["rich>=13"]).status == doctor.OK
 
 
 def test_a_process_that_is_taken_down_leaves_the_parts_before_it_and_how_it_ended() -> None:
@@ -102,47 +77,6 @@ def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(doctor, "SECONDS_ALLOWED", 0.5)
     tried = doctor.run_probe(process_that("import time; time.sleep(60)"))
     assert tried[""] == (False, "the trial took longer than 0.5 s")
-
-
-def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen, other = Path("/lib/libLLVM.so.19.1"), Path("/lib/libLLVM-15.so.1")
-    candidates = [llvm.LibraryFile(chosen, (19, 1)), llvm.LibraryFile(other, (15,), llvm.explain_refusal((15,)))]
-    monkeypatch.delenv(llvm.ENVIRONMENT_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "find_libraries", lambda: candidates)
-    monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LibraryFile(chosen, (19, 1)))
-    part = doctor.check_llvm()
-    assert (part.version, part.status, part.fix) == ("19.1", doctor.OK, "")
-    assert f"chosen: {chosen}" in part.detail
-    assert f"refused: {other} (15: it aborts the process" in part.detail
-
-
-def test_llvm_without_a_usable_one_tells_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(llvm.ENVIRONMENT_VARIABLE, raising=False)
-    monkeypatch.setattr(llvm, "find_libraries", lambda: [])
-    part = doctor.check_llvm()
-    assert part.status == doctor.MISSING
-    assert llvm.get_install_command() in part.fix and llvm.ENVIRONMENT_VARIABLE in part.fix
-
-
-def test_llvm_that_the_variable_names_wrongly_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, "/nowhere/libLLVM.so")
-    part = doctor.check_llvm()
-    assert part.status == doctor.BROKEN and "does not exist" in part.detail
-    assert part.fix == f"unset {llvm.ENVIRONMENT_VARIABLE}"
-
-
-def test_a_cache_folder_that_cannot_be_made_is_a_warning(tmp_path: Path) -> None:
-    assert doctor.check_kernel_cache(tmp_path / "cache").detail.endswith("0 files, 0 MB")
-    (tmp_path / "file").touch()
-    part = doctor.check_kernel_cache(tmp_path / "file" / "cache")
-    assert part.status == doctor.WARNING and "cannot be written" in part.detail
-
-
-def test_little_disk_or_memory_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (doctor.check_disk(tmp_path).status, doctor.check_hardware().status) == (doctor.OK, doctor.OK)
-    monkeypatch.setattr(doctor, "DISK_WANTED", 2**80)
-    monkeypatch.setattr(doctor, "MEMORY_WANTED", 2**80)
-    assert (doctor.check_disk(tmp_path).status, doctor.check_hardware().status) == (doctor.WARNING, doctor.WARNING)
 
 
 @pytest.mark.medium

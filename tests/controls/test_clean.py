@@ -14,7 +14,6 @@ from advsearch.cli.flags import format_as_flags
 from advsearch.cli.main import main
 from advsearch.controls import Space, make_control, make_space
 from advsearch.controls.base import describe_adjusted_defaults
-from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import sweep_from_config
@@ -32,55 +31,25 @@ def space_of(scene: SceneDescription, **controls: dict[str, Any]) -> Space:
 
 # ---- what was asked for is kept -------------------------------------------------------------------------------------
 
-REFUSED: dict[str, tuple[dict[str, float], str | None, dict[str, Any], str]] = {
-    "a range": (
-        {"camera.elevation": 80.0},
-        "studio",
-        {"camera": {"elevation": [5, 30]}},
-        "--set camera.elevation=80 and --control camera contradict each other: camera.elevation is from 5 to 30, which "
-        "leaves 80 out; change one of the two, or leave one out",
-    ),
-    "a value": (AZIMUTH, "studio", {"camera": {"azimuth": 10}}, "camera.azimuth is 10, which leaves 130 out"),
-    "a list": ({"pose.yaw": 0.0}, "studio", {"pose": {"yaw": {"choices": [10, 20]}}}, "one of 10, 20, which leaves 0"),
-    "an instance with a name of its own": (
-        {"pose.yaw": 10.0},
-        "studio",
-        {"mine": {"kind": "pose", "yaw": [20, 30]}},
-        "--set pose.yaw=10 and --control mine contradict each other: mine.yaw is from 20 to 30, which leaves 10 out",
-    ),
-    "another name for it": ({"camera.fov": 50.0}, "studio", {"camera": {"focal_length": [10, 20]}}, "leaves 38.6"),
-    "environments": (
-        {},
-        "loft",
-        {"environment": {"which": ["noon", "kitchen"]}},
-        "--environment loft and --control environment contradict each other: environment.which is one of noon, kitchen",
-    ),
-    "the default environment": (
-        {},
-        "studio",
-        {"environment": {"which": ["noon", "kitchen"]}},
-        "--environment studio and --control environment contradict each other: environment.which is one of noon",
-    ),
-    "an environment": ({}, "loft", {"environment": {"which": "noon", "rotation": [0, 90]}}, "--environment loft and"),
-    "a sky": ({}, "loft", {"sky": {}}, "--environment loft and --control sky contradict each other"),
-    "a turned sky": ({"environment.rotation": 90.0}, None, {"sky": {}}, "--set environment.rotation=90 and"),
-    "a hidden ground": ({"ground.size": 5.0}, "studio", {"background": {}}, "--set ground.size=5 and --control"),
-    "the surface of a named material": (
-        {"material.roughness": 0.9},
-        "studio",
-        {"material": {"which": ["wood", "marble"]}},
-        "--set material.roughness=0.9 and --control material contradict each other",
-    ),
-    "the exposure": ({"camera.exposure": 1.0}, "studio", {"camera": {"exposure": [-1, 0.5]}}, "leaves 1 out"),
-}
+REFUSED: list[tuple[dict[str, float], str, dict[str, Any], str]] = [
+    ({"camera.elevation": 80.0}, "studio", {"camera": {"elevation": [5, 30]}}, "--set camera.elevation=80"),
+    ({"pose.yaw": 0.0}, "studio", {"pose": {"yaw": {"choices": [10, 20]}}}, "pose.yaw is one of 10, 20"),
+    ({"pose.yaw": 10.0}, "studio", {"mine": {"kind": "pose", "yaw": [20, 30]}}, "--control mine"),
+    ({"camera.fov": 50.0}, "studio", {"camera": {"focal_length": [10, 20]}}, "38.6"),
+    ({}, "loft", {"environment": {"which": ["noon", "kitchen"]}}, "--environment loft"),
+    ({}, "loft", {"sky": {}}, "--control sky"),
+    ({"ground.size": 5.0}, "studio", {"background": {}}, "--set ground.size=5"),
+    ({"material.roughness": 0.9}, "studio", {"material": {"which": ["wood", "marble"]}}, "--set material.roughness"),
+]
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_control_that_leaves_out_what_was_asked_for_is_refused(name: str) -> None:
-    given, environment, controls, message = REFUSED[name]
+@pytest.mark.parametrize(("given", "environment", "controls", "named"), REFUSED)
+def test_a_control_that_leaves_out_what_was_asked_for_is_refused(
+    given: dict[str, float], environment: str, controls: dict[str, Any], named: str
+) -> None:
     with pytest.raises(InputError) as error:
         space_of(load_description("mug", environment, setting_values=given), **controls)
-    assert message in format_as_flags(str(error.value))
+    assert named in format_as_flags(str(error.value))
 
 
 @pytest.mark.parametrize(
@@ -89,13 +58,9 @@ def test_a_control_that_leaves_out_what_was_asked_for_is_refused(name: str) -> N
         (AZIMUTH, "studio", {"camera": {"azimuth": 130}}),
         (AZIMUTH, "studio", {"camera": {"azimuth": -230}}),
         (AZIMUTH, "studio", {"camera": {"azimuth": [0, 360]}}),
-        (AZIMUTH, "studio", {"camera": {"azimuth": [-300, -200]}}),
         (AZIMUTH, "studio", {"camera": {"elevation": [5, 60]}}),
-        ({"camera.distance": 2.0}, "studio", {"camera": {"distance": [2, 4]}}),
         ({"camera.fov": 50.0}, "studio", {"camera": {"focal_length": [30, 60]}}),
-        ({"material.roughness": 0.9}, "studio", {"material": {"which": ["own", "wood"]}}),
         ({}, "noon", {"environment": {"which": ["kitchen", "noon"]}}),
-        ({}, "noon", {"environment": {"which": "noon", "rotation": [0, 90]}}),
         ({}, "loft", {"environment": {"which": ["own", "noon"]}}),
         ({"ground.size": 5.0}, "studio", {"background": {"ground": "keep", "what": ["environment", "colour"]}}),
     ],
@@ -128,45 +93,40 @@ def test_the_default_environment_is_asked_for_only_where_it_is_named(
 
 # ---- what nobody asked for moves, and that is said ------------------------------------------------------------------
 
-MOVED: dict[str, tuple[dict[str, Any], str]] = {
-    "a range": ({"pose": {"yaw": [90, 180]}}, "pose.yaw 90 degrees instead of 0, which the control pose leaves out"),
-    "the nearer way around": ({"camera": {"azimuth": [350, 390]}}, "camera.azimuth 390 degrees instead of 40"),
-    "the nearest of a list": ({"pose": {"yaw": {"choices": [100, 300, 200]}}}, "pose.yaw 300 degrees instead of 0"),
-    "a name": ({"environment": {"which": ["noon", "kitchen"]}}, "environment noon instead of studio"),
-    "a sky": ({"sky": {}}, "environment sky instead of studio, which the control sky leaves out"),
-    "a lamp that is on": ({"light": {"x": [0, 1]}}, "light.power 6 instead of 0"),
-    "a distance that was worked out": ({"camera": {"distance": [2, 3]}}, "camera.distance 2 metres instead of 0.238,"),
-    "haze": ({"haze": {"density": [0.1, 0.2]}}, "haze.density 0.1 per object size instead of 0"),
-    "a backdrop": (
-        {"background": {}},
-        "ground.size 0 object sizes instead of 3 and background.what colour instead of environment",
-    ),
-    "a narrow printer": (
-        {"patch": {"pixels": [0.45, 0.5]}},
-        "patch.pixels the nearest from 0.45 to 0.5 instead of the texture underneath",
-    ),
-}
+MOVED: list[tuple[dict[str, Any], str]] = [
+    ({"pose": {"yaw": [90, 180]}}, "pose.yaw 90 degrees instead of 0"),
+    ({"camera": {"azimuth": [350, 390]}}, "camera.azimuth 390 degrees instead of 40"),  # the nearer way around
+    ({"pose": {"yaw": {"choices": [100, 300, 200]}}}, "pose.yaw 300 degrees instead of 0"),
+    ({"environment": {"which": ["noon", "kitchen"]}}, "environment noon instead of studio"),
+    ({"sky": {}}, "environment sky instead of studio"),
+    ({"light": {"x": [0, 1]}}, "light.power 6 instead of 0"),
+    ({"camera": {"distance": [2, 3]}}, "camera.distance 2 metres instead of 0.238"),  # which was worked out
+    ({"background": {}}, "ground.size 0 object sizes instead of 3"),
+    ({"patch": {"pixels": [0.45, 0.5]}}, "patch.pixels"),
+]
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("name", MOVED)
-def test_a_default_that_is_left_out_moves_and_is_said(name: str) -> None:
-    controls, sentence = MOVED[name]
+@pytest.mark.parametrize(("controls", "change"), MOVED)
+def test_a_default_that_is_left_out_moves_and_is_said(controls: dict[str, Any], change: str) -> None:
     (said,) = describe_adjusted_defaults(space_of(load_description("mug"), **controls).adjusted_defaults)
-    assert said.startswith("The clean scene has ") and said.endswith(" leaves out.") and sentence in said
+    assert change in said
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize(
     "controls",
     [
-        {"pose": {}}, {"camera": {}}, {"texture": {"resolution": 8}}, {"material": {}}, {"light": {}}, {"geometry": {}},
-        {"environment": {}}, {"patch": {}}, {"occlusion": {}}, {"contents": {}}, {"haze": {}}, {"lens": {}},
-        {"corruption": {}}, {"pose": {"yaw": 90, "pitch": [0, 10]}}, {"camera": {"azimuth": [0, 360]}},
-        {"camera": {"azimuth": [350, 410]}}, {"environment": {"which": ["noon", "studio"]}},
-        {"light": {"power": 3.0, "x": [4, 5]}}, {"occlusion": {"which": ["sphere", "book"]}},
+        {"pose": {}},
+        {"environment": {}},
+        {"lens": {}},
+        {"pose": {"yaw": 90, "pitch": [0, 10]}},
+        {"camera": {"azimuth": [350, 410]}},
+        {"environment": {"which": ["noon", "studio"]}},
+        {"light": {"power": 3.0, "x": [4, 5]}},
+        {"occlusion": {"which": ["sphere", "book"]}},
     ],
-)  # fmt: skip
+)
 def test_where_nothing_moves_nothing_is_said(controls: dict[str, Any]) -> None:
     assert space_of(load_description("mug"), **controls).adjusted_defaults == ()
 
@@ -231,44 +191,17 @@ def test_a_distance_that_is_set_does_not_follow_the_field_of_view() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "named"),
     [
-        (
-            {"environment": "studio,loft", "grid": {"environment.which": ["noon", "kitchen"]}},
-            "--environment studio,loft and --grid environment.which both choose what lights the scene; name",
-        ),
-        (
-            {"environment": "studio,loft", "controls": {"environment": {"which": ["own", "noon"]}}},
-            "--environment studio,loft and --control environment both choose what lights the scene",
-        ),
-        ({"environment": "loft", "grid": {"environment.which": ["noon"]}}, "--environment loft and --control environ"),
-        (
-            {"set": AZIMUTH, "controls": {"camera": {}}},
-            "--control camera: draws azimuth by chance, and --set camera.az",
-        ),
-        ({"set": AZIMUTH, "grid": {"camera.azimuth": [130, 140]}}, "--grid camera.azimuth: --set fixes it already"),
-        ({"exposure": 1.0, "grid": {"camera.exposure": [0, 1]}}, "--grid camera.exposure: --set fixes it already"),
+        ({"environment": "studio,loft", "grid": {"environment.which": ["noon", "kitchen"]}}, "--environment studio"),
+        ({"set": AZIMUTH, "controls": {"camera": {}}}, "--control camera"),
+        ({"exposure": 1.0, "grid": {"camera.exposure": [0, 1]}}, "--grid camera.exposure"),
     ],
 )
-def test_a_sweep_refuses_what_contradicts_its_scenes(options: dict[str, Any], message: str) -> None:
+def test_a_sweep_refuses_what_contradicts_its_scenes(options: dict[str, Any], named: str) -> None:
     with pytest.raises(InputError) as error:
         sweep_from_config(SweepConfig(**{"object": "mug", "trials": 0, **options}))
-    assert message in format_as_flags(str(error.value))
-
-
-def test_the_grid_of_a_control_of_ones_own_is_checked_too() -> None:
-    class Squat(PoseControl):
-        kind = "squat"
-
-    controls = [Squat(roll=[0, 10])]
-    found = advsearch.sweep("mug", grid={"squat.yaw": [0, 90]}, controls=controls, trials=0, resolution=8, spp=1)
-    assert [row.values["squat.yaw"]["value"] for row in found.rows()] == [0.0, 90.0]
-
-
-def test_a_sweep_of_a_loaded_scene_refuses_the_same() -> None:
-    scene = advsearch.load_scene("mug", settings=AZIMUTH)
-    with pytest.raises(InputError, match="fixes it already"):
-        advsearch.sweep(scene, grid={"camera.azimuth": [130, 140]})
+    assert named in format_as_flags(str(error.value))
 
 
 @pytest.mark.medium

@@ -10,8 +10,6 @@ import torch
 
 import advsearch
 from advsearch.controls.background import BACKDROP_COLOR, BackgroundControl, hsv_to_rgb
-from advsearch.errors import InputError
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
 
 
@@ -35,28 +33,6 @@ def test_the_derivatives_are_those_of_differences() -> None:
         assert torch.autograd.gradcheck(hsv_to_rgb, tuple(point), eps=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0 / 6.0, 0.5, 1.0])
-def test_every_corner_has_a_finite_colour_and_derivative(scene: SceneDescription, share: float) -> None:
-    bound = BackgroundControl().bind(scene)
-    u = torch.full((3,), share, requires_grad=True)
-    color = bound.inputs(u)[BACKDROP_COLOR]
-    color.sum().backward()
-    assert color.shape == (3,) and float(color.detach().min()) >= 0.0 and float(color.detach().max()) <= 1.0
-    assert u.grad is not None and bool(torch.isfinite(u.grad).all())
-
-
-def test_it_starts_at_mid_grey_with_a_slope(scene: SceneDescription) -> None:
-    bound = BackgroundControl().bind(scene)
-    u = bound.start.clone().requires_grad_()
-    color = bound.inputs(u)[BACKDROP_COLOR]
-    torch.testing.assert_close(color, srgb_to_linear(torch.full((3,), 0.5)))
-    (color * torch.tensor([1.0, 2.0, 4.0])).sum().backward()
-    assert u.grad is not None and float(u.grad[1].abs()) > 0.1 and float(u.grad[2].abs()) > 0.1
-    hue = bound.groups[0]
-    assert hue.parameter == "hue" and hue.periodic and hue.valid == ("image",)
-    assert bound.describe(u)["background.green"] == {"value": pytest.approx(0.5), "unit": "sRGB"}
-
-
 def test_it_asks_for_a_backdrop_and_takes_the_ground_away_unless_told_to_keep_it(scene: SceneDescription) -> None:
     prepared = BackgroundControl().prepare(scene)
     assert prepared.backdrop and prepared.number("ground.size") == 0.0
@@ -73,22 +49,6 @@ def test_the_environment_may_be_a_choice(scene: SceneDescription) -> None:
     there = bound.start.clone()
     there[0] = 0.25
     assert BACKDROP_COLOR in bound.inputs(there)
-
-
-def test_only_what_is_given_a_range_is_searched(scene: SceneDescription) -> None:
-    bound = BackgroundControl(hue=[0, 120], saturation=1.0).bind(scene)
-    assert [group.parameter for group in bound.groups] == ["hue"] and not bound.groups[0].periodic
-    color = linear_to_srgb(bound.inputs(torch.tensor([1.0]))[BACKDROP_COLOR])
-    torch.testing.assert_close(color, torch.tensor([0.0, 0.5, 0.0]), atol=1e-5, rtol=0)
-
-
-def test_bad_settings_are_refused() -> None:
-    with pytest.raises(InputError, match=r"background.ground: expected one of keep, hide, got 'gone'"):
-        BackgroundControl(ground="gone")
-    with pytest.raises(InputError, match=r"background.what: environment alone leaves nothing to search; use what="):
-        BackgroundControl(what="environment")
-    with pytest.raises(InputError, match=r"background.hue: expected a number from 0 to 360 \(degrees\), got 400"):
-        BackgroundControl(hue=400)
 
 
 def test_the_picture_has_that_colour_behind_the_object_and_its_slope() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,8 @@ import torch
 
 import advsearch
 from advsearch.controls import make_space
-from advsearch.controls.contents import FILL_LIMIT, INGREDIENTS, ContentsControl, find_interior, mix_liquid_color
+from advsearch.controls.contents import FILL_LIMIT, INGREDIENTS, ContentsControl, find_interior
 from advsearch.controls.pose import PoseControl
-from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.library import list_objects, load_object
@@ -67,10 +65,6 @@ def test_the_inside_of_a_turned_cup_is_that_of_its_profile() -> None:
     assert float(found.heights[0]) == pytest.approx(0.1, abs=1e-6)
     assert float(found.heights[-1]) == pytest.approx(0.1 + FILL_LIMIT * 0.9, abs=1e-6)
     np.testing.assert_allclose(found.radii, 0.4, atol=0.002)
-
-
-def test_a_pipe_holds_nothing() -> None:
-    assert find_interior(cup(bottom=False)) is None
 
 
 @pytest.mark.parametrize("name", ["mug", "bowl", "wine-glass"])
@@ -143,71 +137,6 @@ def test_proportions_add_up_to_one_within_their_ranges(scene: SceneDescription, 
         assert sum(shares.values()) == pytest.approx(1.0, abs=1e-6)
         for name, (low, high) in filled.proportion_bounds.items():
             assert low - 1e-6 <= shares[name] <= high + 1e-6
-
-
-def test_two_coordinates_reach_every_mixture(scene: SceneDescription) -> None:
-    filled = bound(scene)
-    assert [group.parameter for group in filled.groups] == ["level", "water", "milk"]
-    cuts = filled.find_cuts({"water": 0.2, "milk": 0.5, "coffee": 0.3})
-    shares = filled.values(torch.tensor([0.5, cuts["water"], cuts["milk"]]))
-    assert [float(shares[name]) for name in INGREDIENTS] == pytest.approx([0.2, 0.5, 0.3], abs=1e-6)
-    assert [float(filled.values(filled.start)[name]) for name in INGREDIENTS] == [0.0, 0.0, 1.0]
-
-
-def test_what_is_not_said_is_coffee(scene: SceneDescription) -> None:
-    filled = bound(scene, level=[0, 1], milk=0.25)
-    assert len(filled.start) == 1
-    values = filled.values(filled.start)
-    assert [float(values[name]) for name in INGREDIENTS] == pytest.approx([0.0, 0.25, 0.75])
-    assert filled.describe(filled.start)["contents.coffee"]["value"] == pytest.approx(0.75)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"water": 0.5, "milk": 0.3, "coffee": 0.3},
-        {"water": 0.5, "milk": 0.3, "coffee": 0.1},
-        {"water": 0.8, "milk": [0.3, 0.5]},
-        {"water": [0.0, 0.2], "milk": 0.2, "coffee": [0.1, 0.3]},
-    ],
-)
-def test_proportions_that_cannot_add_up_are_refused(settings: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="expected proportions of water, milk and coffee that add up to 1, got water"):
-        ContentsControl(level=[0, 1], **settings)
-
-
-def test_other_bad_settings_are_explained(scene: SceneDescription) -> None:
-    with pytest.raises(InputError, match=r"contents\.level: expected a number from 0 to 1"):
-        ContentsControl(level=[0, 1.2])
-    with pytest.raises(InputError, match=r"contents\.milk: expected a number or a range"):
-        ContentsControl(milk={"choices": [0, 0.5]})
-    with pytest.raises(InputError, match=r"expected a vessel, open at the top .*, got 'banana'"):
-        ContentsControl().prepare(load_description("banana"))
-    upside_down = replace(
-        scene.object, name="hat", mesh=replace(scene.object.mesh, vertices=-scene.object.mesh.vertices)
-    )
-    with pytest.raises(InputError, match=r"expected a vessel.*, got 'hat'"):
-        ContentsControl().prepare(replace(scene, object=upside_down))
-
-
-# ---- colours --------------------------------------------------------------------------------------------------------
-
-
-def test_liquids_have_their_colours() -> None:
-    vessel = torch.tensor([0.5, 0.1, 0.1])
-    water, milk, coffee = (mix_liquid_color(torch.eye(3)[number], vessel) for number in range(3))
-    assert float(coffee.max()) < 0.06 and float(coffee[0]) > 1.5 * float(coffee[2])
-    assert float(milk.min()) > 0.65
-    assert bool((water < vessel).all()) and bool((water > 0.8 * vessel).all())
-    latte = mix_liquid_color(torch.tensor([0.0, 0.5, 0.5]), vessel)
-    assert bool((latte > coffee).all() & (latte < milk).all()) and float(latte[0]) > 1.5 * float(latte[2])
-
-
-@pytest.mark.parametrize("corner", range(8))
-def test_the_colour_has_finite_derivatives_everywhere(corner: int) -> None:
-    shares = torch.tensor([float(corner >> bit & 1) for bit in range(3)], requires_grad=True)
-    mix_liquid_color(shares, torch.tensor([0.0, 0.5, 1.0])).sum().backward()
-    assert shares.grad is not None and bool(torch.isfinite(shares.grad).all())
 
 
 # ---- rendered -------------------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls import Space, make_control
-from advsearch.errors import AdvsearchError, FileFormatError, InputError
+from advsearch.controls import make_control
+from advsearch.errors import FileFormatError, InputError
 
 SIZE = 16
 
@@ -47,15 +47,6 @@ def test_each_looks_as_the_scene_in_it(maps: tuple[str, str]) -> None:
     np.testing.assert_allclose(shown(advsearch.load_scene("mug"), fixed), chosen, atol=2e-5)
 
 
-def test_beside_a_bundled_one_the_table_stays_and_is_said(maps: tuple[str, str]) -> None:
-    scene = advsearch.load_scene("mug", environment="noon")
-    renderer = scene.renderer({"environment": {"which": ["own", *maps]}}, resolution=SIZE, denoise="none")
-    assert isinstance(renderer.space, Space) and renderer.space.scene is not None
-    assert renderer.space.describe(torch.tensor([0.5]))["environment.which"]["value"] == maps[0]
-    np.testing.assert_allclose(renderer(renderer.start, 0, 16), shown(scene, "pose"), atol=2e-5)
-    assert "red.exr, blue.hdr: the object stands on the scene's table" in renderer.space.scene.notes[-1]
-
-
 def test_a_file_that_changed_is_read_again(maps: tuple[str, str], tmp_path: Path) -> None:
     path = tmp_path / "room.exr"
     found = []
@@ -69,9 +60,7 @@ def test_a_file_that_changed_is_read_again(maps: tuple[str, str], tmp_path: Path
 @pytest.mark.parametrize(
     ("names", "kind", "reason"),
     [
-        (["missing.hdr", "noon"], FileFormatError, "missing.hdr: no such environment file"),
-        (["noon", "room.png"], FileFormatError, r"expected an environment file ending in .hdr or .exr, got '.png'"),
-        (["noon", "nooon"], AdvsearchError, "unknown environment.which 'nooon'"),
+        (["missing.hdr", "noon"], FileFormatError, "missing.hdr"),
         (["a.hdr", "a.hdr"], InputError, "got a.hdr twice"),
         ([3, "a.hdr"], InputError, "expected one of own"),
     ],
@@ -79,37 +68,3 @@ def test_a_file_that_changed_is_read_again(maps: tuple[str, str], tmp_path: Path
 def test_what_cannot_be_is_refused(names: list[object], kind: type[Exception], reason: str) -> None:
     with pytest.raises(kind, match=reason):
         make_control("environment", {"which": names}).prepare(advsearch.load_scene("mug").description)
-
-
-def test_another_file_than_the_scene_was_asked_to_have_is_refused(maps: tuple[str, str]) -> None:
-    scene = advsearch.load_scene("mug", environment=maps[0])
-    with pytest.raises(InputError, match="contradict each other"):
-        scene.renderer({"environment": {"which": [maps[1], "noon"]}}, resolution=SIZE)
-
-
-@pytest.mark.medium
-def test_they_are_an_axis_of_a_sweep(maps: tuple[str, str]) -> None:
-    found = advsearch.sweep(
-        "mug", "reference", {"environment.which": [*maps, "noon"]}, resolution=SIZE, spp=1, trials=6, verify_spp=4
-    )
-    assert [row["environment.which"] for row in found.to_pandas().to_dict("records")] == [*maps, "noon"]
-
-
-@pytest.mark.medium
-def test_they_are_drawn_for_every_picture(maps: tuple[str, str]) -> None:
-    found = advsearch.attack(
-        advsearch.load_scene("mug"),
-        "reference",
-        controls={"texture": {"resolution": 4}},
-        over={"environment": {"which": [*maps, "studio"]}},
-        resolution=SIZE,
-        steps=1,
-        trials=6,
-        draws=2,
-        verify_spp=4,
-        spp=1,
-        baseline=False,
-        denoise="none",
-    )
-    assert found.summary.over == ["environment"]
-    assert "table" in " ".join(found.summary.warnings)

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.light import DEFAULT_POWER, LightControl, compute_metered_irradiance
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
@@ -84,25 +83,6 @@ def test_it_starts_dark_unless_its_power_is_not_searched(scene: SceneDescription
 
 @pytest.mark.medium
 @pytest.mark.parametrize("type", ["area", "point"])
-def test_a_dark_lamp_changes_nothing_even_in_view(scene: SceneDescription, type: str) -> None:
-    lamp = LightControl(type=type, x=[-1, 1], y=0.0, z=0.9, power=0)
-    plain = MitsubaScene(scene, (SIDE, SIDE)).render_radiance({}, 0, 256)
-    assert float(rendered(lamp, scene, [0.9], 256).mean()) == pytest.approx(float(plain.mean()), rel=0.01)
-
-
-@pytest.mark.parametrize("type", ["area", "point"])
-@pytest.mark.parametrize("place", [(0.0, 0.0, 0.4), (0.0, 0.0, 0.0), (1.9, 1.6, 1.5)])
-def test_lamps_in_impossible_places_make_finite_pictures(
-    scene: SceneDescription, type: str, place: tuple[float, float, float]
-) -> None:
-    x, y, z = place
-    lamp = LightControl(type=type, x=[x, x + 0.1], y=y, z=z, power=1000)
-    seen = rendered(lamp, scene, [0.0], 16)
-    assert bool(torch.isfinite(seen).all())
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("type", ["area", "point"])
 def test_the_adjoint_of_power_and_colour_agrees_with_differences(scene: SceneDescription, type: str) -> None:
     control = LightControl(type=type, x=0.8, y=-0.8, z=2, power=[0, 10], red=[0.5, 1])
     prepared = control.prepare(scene)
@@ -123,37 +103,3 @@ def test_the_adjoint_of_power_and_colour_agrees_with_differences(scene: SceneDes
             for way in (1.0, -1.0)
         )
         assert float(u.grad[coordinate]) == pytest.approx((above - below) / 0.2, rel=ROUNDING)
-
-
-def test_places_and_size_are_left_to_differences() -> None:
-    by_name = {one.name: one.estimators for one in LightControl.parameters}
-    assert by_name["x"] == by_name["z"] == by_name["size"] == ("differences",)
-    assert by_name["power"][0] == by_name["blue"][0] == "adjoint"
-
-
-def test_two_lamps_stand_side_by_side(scene: SceneDescription) -> None:
-    key, fill = LightControl("key"), LightControl("fill", type="point")
-    prepared = fill.prepare(key.prepare(scene))
-    names = set(key.bind(prepared).inputs(key.bind(prepared).start)) | set(
-        fill.bind(prepared).inputs(fill.bind(prepared).start)
-    )
-    assert names == {"key.ball", "key.radiance", "fill.position", "fill.intensity"}
-    assert names <= MitsubaScene(prepared, (8, 8)).input_names
-    with pytest.raises(InputError, match="`controls` key: the scene has something of that name"):
-        LightControl("key").prepare(prepared)
-
-
-def test_what_makes_no_sense_is_refused() -> None:
-    with pytest.raises(InputError, match=r"light\.type: expected one of area, point, got 'disk'"):
-        LightControl(type="disk")
-    with pytest.raises(InputError, match=r"light\.size: expected none for a point light"):
-        LightControl(type="point", size=[0.1, 0.2])
-    with pytest.raises(InputError, match=r"light\.power: expected a number from 0 to 1000"):
-        LightControl(power=-1)
-    with pytest.raises(UnknownNameError, match="unknown setting of control light 'colour'"):
-        LightControl(colour="red")
-
-
-def test_a_point_has_no_size_to_search(scene: SceneDescription) -> None:
-    assert "light.size" not in LightControl(type="point").bind(scene).describe(torch.full((7,), 0.5))
-    assert "light.size" in LightControl().bind(scene).describe(torch.full((8,), 0.5))

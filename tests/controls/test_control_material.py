@@ -18,7 +18,6 @@ from advsearch.controls.material import (
     make_covering,
     make_tile,
 )
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
@@ -27,7 +26,6 @@ from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, translate_mesh, tr
 from advsearch.scene.mitsuba_backend.variant import mi
 from advsearch.scene.parts import PluginNumber, PluginNumbers
 from advsearch.scene.raster import rasterize_charts
-from advsearch.scene.settings import CHANNELS
 
 BASE_COLOR = "object.base_color"
 
@@ -53,21 +51,6 @@ def test_a_tile_continues_across_its_edges(name: str) -> None:
         steps = np.abs(np.diff(texels, axis=axis)).mean(axis=(1 - axis, 2))
         wrap = np.abs(np.take(texels, 0, axis) - np.take(texels, -1, axis)).mean()
         assert wrap <= max(2.0 * float(steps.mean()), 1.2 * float(steps.max())), (name, axis)
-
-
-def test_a_tile_with_a_seam_would_be_noticed() -> None:
-    texels = make_tile("zebra")[: TILE_SIDE - 37].swapaxes(0, 1)
-    steps = np.abs(np.diff(texels, axis=1)).mean(axis=(0, 2))
-    wrap = np.abs(texels[:, 0] - texels[:, -1]).mean()
-    assert wrap > max(2.0 * float(steps.mean()), 1.2 * float(steps.max()))
-
-
-def test_patterns_differ_from_each_other() -> None:
-    colours = {name: make_tile(name).mean(axis=(0, 1)) for name in PATTERNS}
-    contrasts = {name: make_tile(name).std() for name in PATTERNS}
-    assert len({tuple(np.round(one, 2)) for one in colours.values()}) == len(PATTERNS)
-    assert all(value > 0.01 for name, value in contrasts.items() if name != "plain")
-    assert colours["grass"][1] > 1.2 * colours["grass"][0] and colours["brick"][0] > 1.5 * colours["brick"][2]
 
 
 def test_a_pattern_has_one_scale_on_the_object_whatever_its_charts(scene: SceneDescription) -> None:
@@ -102,11 +85,6 @@ def test_the_start_is_the_objects_own_surface(scene: SceneDescription) -> None:
     torch.testing.assert_close(inputs[BASE_COLOR], srgb_to_linear(torch.from_numpy(scene.object.base_color)))
 
 
-def test_only_what_varies_is_set(scene: SceneDescription) -> None:
-    bound = MaterialControl(roughness=[0, 1]).bind(scene)
-    assert set(bound.inputs(bound.start)) == {"object.roughness"} and bound.refines == frozenset()
-
-
 def test_a_tint_multiplies_reflectance_and_lies_over_a_searched_texture(scene: SceneDescription) -> None:
     bound = MaterialControl(red=0.5, green=[0, 1], blue=1.0).bind(scene)
     before = torch.rand(8, 8, 3)
@@ -126,31 +104,6 @@ def test_a_named_material_brings_its_numbers_and_given_ones_win(scene: SceneDesc
     assert float(own["object.roughness"]) == float(steel["object.roughness"]) == pytest.approx(0.77)
     assert not torch.equal(own[BASE_COLOR].mean(), steel[BASE_COLOR].mean())
     assert bound.describe(torch.tensor([0.75]))["material.which"] == {"value": "steel", "unit": "name"}
-
-
-def test_a_fixed_material_is_where_the_search_starts(scene: SceneDescription) -> None:
-    bound = MaterialControl(which="wood").bind(scene)
-    values = bound.values(bound.start)
-    assert float(values["roughness"]) == pytest.approx(PATTERNS["wood"].material.roughness)
-    plain = MaterialControl(which="plain", red=0.2, green=[0, 1], blue=0.9).bind(scene)
-    color = plain.inputs(torch.tensor([0.4]))[BASE_COLOR]
-    torch.testing.assert_close(color[5, 5], srgb_to_linear(torch.tensor([0.2, 0.4, 0.9])))
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_extremes_have_finite_derivatives(scene: SceneDescription, share: float) -> None:
-    bound = searched(*SURFACE_PARAMETERS, *CHANNELS).bind(scene)
-    u = torch.full((7,), share, requires_grad=True)
-    torch.stack([one.sum() for one in bound.inputs(u).values()]).sum().backward()
-    assert u.grad is not None and bool(torch.isfinite(u.grad).all())
-    assert float(u.grad[:4].abs().min()) == 1.0  # moved into the range that is rendered, yet with a slope
-
-
-def test_bad_settings_are_explained() -> None:
-    with pytest.raises(UnknownNameError, match=r"unknown material.which 'wod'. Did you mean 'wood'"):
-        MaterialControl(which="wod")
-    with pytest.raises(InputError, match=r"material\.roughness: expected a number from 0 to 1"):
-        MaterialControl(roughness=[0, 1.5])
 
 
 def test_every_way_into_a_number_has_the_same_guard(scene: SceneDescription) -> None:
@@ -186,21 +139,6 @@ def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:
 # ---- rendered -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["roughness", "metallic", "specular", "clearcoat"])
-def test_extremes_render_finite_with_finite_gradients(name: str) -> None:
-    """Also on an object that has no clear coat of its own."""
-    render = advsearch.load_scene("book").renderer([searched(name)], resolution=32)
-    pictures = []
-    for value in (0.0, 1.0):
-        u = torch.tensor([value], requires_grad=True)
-        image = render(u, seed=0, spp=16)
-        (gradient,) = torch.autograd.grad(image.sum(), u)
-        assert bool(torch.isfinite(image).all()) and bool(torch.isfinite(gradient).all())
-        pictures.append(image.detach())
-    assert render.non_finite == 0
-    assert float((pictures[0] - pictures[1]).abs().max()) > 0.02
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("name", "value"),
@@ -223,10 +161,3 @@ def test_the_adjoint_agrees_with_differences(name: str, value: float) -> None:
         ends = [sum(float((render(u + h, s, 1024) * weight).sum()) for s in range(2)) / 2.0 for h in (0.06, -0.06)]
     expected = (ends[0] - ends[1]) / 0.12
     assert float(torch.stack(samples).mean()) == pytest.approx(expected, rel=AGREEMENT)
-
-
-def test_a_material_does_not_depend_on_who_asks_first(scene: SceneDescription) -> None:
-    moved = replace(scene, object=replace(scene.object, name="other"))
-    first = MaterialControl(which=["own", "marble"]).bind(scene).inputs(torch.tensor([0.9]))[BASE_COLOR]
-    second = MaterialControl(which=["own", "marble"]).bind(moved).inputs(torch.tensor([0.9]))[BASE_COLOR]
-    assert torch.equal(first, second)

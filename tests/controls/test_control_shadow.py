@@ -33,14 +33,6 @@ def space_of(renderer: Renderer) -> Space:
 
 
 @pytest.mark.medium
-def test_there_is_none_at_the_start() -> None:
-    renderer = renderer_of()
-    without = advsearch.load_scene("mug", environment="noon").renderer(["lens"], resolution=SIDE)
-    ours, theirs = (one.radiance(one.start, seed=1, spp=64) for one in (renderer, without))
-    assert float((ours - theirs).abs().mean()) < 1e-3 * float(theirs.mean())
-
-
-@pytest.mark.medium
 def test_it_takes_light_away_and_the_camera_sees_no_card() -> None:
     renderer = renderer_of(size=[0, 1])
     low, high = (renderer.radiance(torch.tensor([u]), seed=1, spp=256) for u in (0.0, 0.6))

@@ -49,16 +49,6 @@ def test_it_has_all_its_lumens_and_half_of_them_within_its_width() -> None:
 
 
 @pytest.mark.medium
-def test_it_only_adds_light_and_there_is_none_at_the_start() -> None:
-    renderer = renderer_of()
-    assert [group.parameter for group in renderer.plan.groups] == list(NUMBERS)
-    dark, lit = raw(renderer, renderer.start), raw(renderer, THERE)
-    assert bool((lit >= dark - 1e-6).all()) and float((lit - dark).mean()) > 0.01
-    told = spot_of(renderer).describe(renderer.start)
-    assert told["spot.lux"]["value"] == 0.0 and spot_of(renderer).adjusted_defaults == ()
-
-
-@pytest.mark.medium
 def test_the_adjoint_is_the_difference() -> None:
     renderer = renderer_of()
     assert {group.estimator for group in renderer.plan.groups} == {"adjoint"}

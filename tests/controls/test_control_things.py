@@ -10,9 +10,8 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls import Space, compose, make_control, make_space
+from advsearch.controls import Space, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.sweep.axes import add_grid_axes, parse_axes
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import compute_footprint, is_overlapping
@@ -42,7 +41,7 @@ def test_a_thing_that_moves_stays_out_of_houses_and_posts() -> None:
         taken = compute_footprint(mesh @ pose[:3, :3].T + pose[:3, 3])
         assert not any(is_overlapping(solid.footprint, taken) for solid in solids)
     post = load_description("car", "avenue", things="person@-15,-3.05")
-    with pytest.raises(InputError, match="person stands in something else; put it elsewhere"):
+    with pytest.raises(InputError, match="person stands in"):
         space_of(post, {"x": [-1.0, 1.0]})
 
 
@@ -134,7 +133,7 @@ def test_the_object_and_other_things_may_be_moved_by_other_controls(scene: Scene
         u = torch.rand(len(space.start), generator=torch.Generator().manual_seed(seed))
         prints = {name: compute_footprint(vertices(space, u, name)) for name in ("object", "chair", "stop-sign")}
         assert not any(is_overlapping(prints["stop-sign"], prints[other]) for other in ("object", "chair"))
-    with pytest.raises(InputError, match=r"two controls set chair.to_world, pose:chair and things"):
+    with pytest.raises(InputError, match=r"chair\.to_world"):
         space_of(scene, **{"pose:chair": {"y": [0.0, 1.0]}}).inputs(torch.full((10,), 0.5))
 
 
@@ -147,14 +146,6 @@ def test_nothing_stands_where_the_camera_is() -> None:
     space = space_of(scene, {"y": [-5.0, 0.0]})
     placed = compute_footprint(vertices(space, torch.tensor([0.0]), "car"))
     assert placed.outline[:, 0].min() > 11.0 and np.abs(placed.outline[:, 1].mean()) < 0.2
-
-
-@pytest.mark.medium
-def test_on_a_pavement_it_stands_as_high_as_that() -> None:
-    scene = load_description("car", "avenue", things="person@6,-1")
-    space = space_of(scene, {"y": [-3.0, 0.0]})
-    low = [vertices(space, torch.tensor([share]), "person")[:, 2].min() for share in (1.0, 0.0)]
-    assert low == pytest.approx([0.0, 0.12], abs=CLOSE)
 
 
 @pytest.mark.medium
@@ -179,45 +170,12 @@ def test_what_is_away_is_neither_seen_nor_in_the_way_and_throws_no_shadow() -> N
     assert x[0] > 4.2 and x[1] == 4.0
 
 
-def test_a_setting_is_for_all_things_or_for_one(scene: SceneDescription) -> None:
-    space = space_of(scene, {"x": [0.0, 1.0], "chair.x": [3.0, 4.0], "car.x": 0.5})
-    assert [group.name for group in space.groups] == ["things.chair.x", "things.stop-sign.x"]
-    said = space.describe(torch.tensor([0.5, 0.5]))
-    assert (said["things.chair.x"]["value"], said["things.stop-sign.x"]["value"]) == (3.5, 0.5)
-    assert said["things.car.at_x"]["value"] == pytest.approx(-5.5)
-    one = compose([make_control("things.chair.heading")], scene)
-    assert [group.name for group in one.groups] == ["things.chair.heading"]
-    assert one.inputs(one.start).keys() == {"chair.to_world"}
-
-
-def test_a_grid_may_be_of_one_thing(scene: SceneDescription) -> None:
-    axes = parse_axes({"things.chair.heading": "0:315:8", "things.stop-sign.presence": ["there", "away"]}, ())
-    assert [(axis.name, len(axis.values)) for axis in axes] == [
-        ("things.chair.heading", 8),
-        ("things.stop-sign.presence", 2),
-    ]
-    space = make_space(add_grid_axes((), axes, scene), scene)
-    assert [group.name for group in space.groups] == ["things.chair.heading", "things.stop-sign.presence"]
-    with pytest.raises(UnknownNameError, match=r"parameter of control things .chair.hight"):
-        parse_axes({"things.chair.hight": "0:1:2"}, ())
-
-
 def test_what_cannot_be_is_refused(scene: SceneDescription) -> None:
-    with pytest.raises(InputError, match="nothing stands beside the object; add `things`"):
+    with pytest.raises(InputError, match="`things`"):
         space_of(load_description("car"))
     with pytest.raises(UnknownNameError, match="chiar"):
         space_of(scene, {"chiar.x": [0, 1]})
     with pytest.raises(UnknownNameError, match="hight"):
         make_control("things", {"chair.hight": [0, 1]})
-    with pytest.raises(InputError, match="chair stands in something else; put it elsewhere"):
+    with pytest.raises(InputError, match="chair stands in"):
         space_of(load_description("car", things="chair@1,0,size=1"))
-
-
-def test_beside_a_small_thing_the_search_stays_near() -> None:
-    for name, things, reach in (("mug", "bottle@0.3,0.1", 0.11), ("car", "chair@6,0,size=1", 2.0)):
-        scene = load_description(name, things=things)
-        space = make_space([make_control("things")], scene)
-        u = space.start.clone()
-        u[0] = 1.0
-        there = space.describe(u)[f"things.{things.partition('@')[0]}.x"]["value"]
-        assert there == pytest.approx(min(2.0, scene.metres)) and there == pytest.approx(reach, rel=0.05)

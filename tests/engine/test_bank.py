@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,10 @@ from advsearch.attacks.domain import Block, Domain
 from advsearch.engine import acceptance, bank
 from advsearch.engine.bank import Bank, sample_condition
 from advsearch.engine.problem import compute_condition_weights
-from advsearch.errors import ClusterError
 from advsearch.questions.attack.result import AttackResult
-from advsearch.questions.attack.run import attack_once
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.predictor import Refusal
 from advsearch.scene.surface import renderer as surface_renderer
-from stand_ins import Impatient, rows, shared
+from stand_ins import Impatient, rows
 
 SMALL: dict[str, Any] = {
     "resolution": 48,
@@ -81,41 +77,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AttackResult]
 
 
 @pytest.mark.medium
-def test_a_search_says_what_its_bank_was(whole: tuple[Path, AttackResult]) -> None:
-    """Six conditions, and another one every second evaluation of the first half: three until the comparison at 6, and
-    one after it. That at 12 comes when it grows no more."""
-    _, found = whole
-    told, renders = found.summary.transport, found.summary.renders
-    assert told is not None and told.used and told.conditions is not None and told.error is not None
-    assert (told.conditions.made, told.conditions.dropped, told.conditions.grown) == (10, 0, 2)
-    assert told.entries and told.bytes and told.seconds and told.conditions.gap is not None
-    assert renders["products"] == 18 * 2 and renders["gradient"] == 0
-
-
-@pytest.mark.medium
 @pytest.mark.usefixtures("growing")
 def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, AttackResult], tmp_path: Path) -> None:
     stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(14), **SMALL)
     assert stopped.summary.ending == "interrupted"
     advsearch.attack("mug", run=tmp_path / "parts", resume=True, **SMALL)
     assert rows(tmp_path / "parts") == rows(whole[0])
-
-
-@pytest.mark.medium
-@pytest.mark.slow
-@pytest.mark.usefixtures("growing")
-def test_workers_make_the_matrices_and_the_rows_stay(
-    whole: tuple[Path, AttackResult], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Nine before the first comparison, and the trials; one that is lost ends the run."""
-    run, alone = whole
-    ready = shared(monkeypatch, {"object": "mug", **SMALL})
-    result = attack_once(AttackConfig(**SMALL, object="mug", workers=2, run=str(tmp_path / "shared")))
-    assert rows(tmp_path / "shared") == rows(run) and torch.equal(result.adversarial, alone.adversarial)
-    assert len(ready.given) >= 9 + 2 * 6
-    shared(monkeypatch, {"object": "mug", **SMALL}, lost=(2,))
-    with pytest.raises(ClusterError, match=r"light of a condition: it died; .advsearch resume"):
-        attack_once(AttackConfig(**SMALL, object="mug", workers=2, run=str(tmp_path / "lost")))
 
 
 @pytest.mark.medium
@@ -184,20 +151,3 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
     assert float(weights.mean()) == pytest.approx(1.0) and int(weights.argmax()) == int(values.argmin())
     mean = sum(weight * one for weight, one in zip(weights, gradients, strict=True) if one is not None) / len(each)
     torch.testing.assert_close(made._evaluate_under(made._conditions, u, True).gradient, mean, rtol=1e-3, atol=1e-7)
-
-
-def test_conditions_that_are_all_alike_count_the_same() -> None:
-    for values in (torch.tensor([2.0, 2.0]), torch.tensor([3.0]), torch.tensor([math.inf, 1.0])):
-        assert compute_condition_weights(values).tolist() == [1.0] * len(values)
-
-
-@pytest.mark.medium
-@pytest.mark.usefixtures("growing")
-def test_a_bank_that_teaches_enough_stops_growing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where unseen conditions are no better for the model, there are no more after the first comparison."""
-    monkeypatch.setattr(bank, "MIN_STANDARD_ERRORS", 1e9)
-    for limit in ("MAX_MARGIN_BIAS", "MIN_ALLOWED_LEVELS"):  # predictions are good enough
-        monkeypatch.setattr(acceptance, limit, 1e9)
-    told = advsearch.attack("mug", **SMALL).summary.transport
-    assert told is not None and told.conditions is not None
-    assert (told.conditions.made, told.conditions.grown) == (9, 0)

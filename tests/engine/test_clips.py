@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,7 +15,6 @@ from advsearch import seeds
 from advsearch.controls import compose
 from advsearch.controls.path import PathControl
 from advsearch.engine.loading import make_renderer
-from advsearch.errors import FileFormatError, InputError
 from advsearch.models import ModelWarning
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.scene.description import load_description
@@ -87,27 +85,6 @@ def test_a_clip_is_classified_as_by_the_network_itself(kind: str) -> None:
 
 
 @pytest.mark.medium
-def test_a_folder_with_a_processor_is_read_by_measurement(tmp_path: Path) -> None:
-    given, processor = network("VideoMAE"), transformers.VideoMAEImageProcessor
-    try:
-        theirs = processor(
-            size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE}, image_mean=[0.4, 0.5, 0.6],
-            image_std=[0.2, 0.25, 0.3],
-        )  # fmt: skip
-    except ImportError as error:
-        pytest.skip(f"its processor takes what is not here: {error}")
-    given.save_pretrained(tmp_path / "net")
-    theirs.save_pretrained(tmp_path / "net")
-    model = advsearch.load_model(f"hf:{tmp_path / 'net'}")
-    levels = np.random.default_rng(0).integers(0, 256, (FRAMES, SIDE, SIDE, 3), np.uint8)
-    with torch.no_grad():
-        asked = given(**theirs([*levels], return_tensors="pt")).logits
-        seen = torch.from_numpy(np.concatenate(levels, axis=1)).float() / 255.0
-        (own,) = replace(model, cameras=FRAMES)(seen)
-    assert float((own[0] - asked).abs().max()) < 1e-4
-
-
-@pytest.mark.medium
 def test_each_picture_of_a_clip_is_that_of_its_time(tmp_path: Path) -> None:
     """The first bit for bit, the others with noise of their own, as in stills at these times."""
     scene = advsearch.load_scene("mug", camera=clip(tmp_path)).description
@@ -138,17 +115,3 @@ def test_an_attack_on_a_video_classifier_is_carried_out(tmp_path: Path) -> None:
     )  # fmt: skip
     assert found.summary.ending in ("found", "not verified", "budget spent", "already wrong")
     assert tuple(found.clean.shape) == (SIDE, FRAMES * SIDE, 3)
-
-
-@pytest.mark.medium
-def test_clips_of_nothing_that_moves_and_with_times_that_are_none_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nothing knows a time"):
-        advsearch.load_scene("mug", camera=clip(tmp_path)).renderer("light", resolution=16)
-    moving = {"path": {"path": "orbit", "shutter": 0.1}}
-    with pytest.raises(InputError, match="motion blur"):
-        advsearch.load_scene("mug", camera=clip(tmp_path)).renderer(moving, resolution=16)
-    for later in ("-1", "61", ".nan", "[1]"):
-        with pytest.raises(FileFormatError, match="later"):
-            advsearch.load_scene("mug", camera=clip(tmp_path, f"cameras: [{{}}, {{later: {later}}}]"))
-    with pytest.raises(FileFormatError, match="first camera"):
-        advsearch.load_scene("mug", camera=clip(tmp_path, "cameras: [{later: 1}, {}]"))

@@ -15,15 +15,12 @@ from test_sweep_workers import Disorder, rows, summary
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.cli.output import format_result as text_of
 from advsearch.engine.journal import make_worker_call
-from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.explain.rows import read_predictions
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.carry_out import load_job
-from advsearch.questions.sweep.display import make_sweep_claims, rate_text
-from advsearch.questions.sweep.drives import Drives, compute_distance_bounds, find_longest_run, summarize_drives
+from advsearch.questions.sweep.drives import summarize_drives
 from advsearch.questions.sweep.job import SceneLoader
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
@@ -31,8 +28,6 @@ from advsearch.questions.sweep.stored import StoredSweep
 from advsearch.questions.sweep.summary import DriveRates
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.tables import read_sweep
-from advsearch.statistics.clustered import rate_interval
-from advsearch.statistics.intervals import clopper_pearson
 
 SMALL: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "batch": 4}
 
@@ -79,10 +74,8 @@ DRIVE: dict[str, Any] = {"controls": {"path": {"seconds": 4.0, "reach": 5.0}}, "
     ("frames", "right", "gap", "flicker", "first"),
     [
         ("00110", 0.4, 2.0, 0.5, 3.0),
-        ("11111", 1.0, 0.0, 0.0, 5.0),
         ("00000", 0.0, 5.0, 0.0, None),
         ("10001", 0.4, 3.0, 0.5, 5.0),
-        ("01010", 0.4, 1.0, 1.0, 4.0),
     ],
 )
 def test_rates_of_one_drive_are_those_worked_out_by_hand(
@@ -113,60 +106,6 @@ def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_sam
         Sweep(job, run, NullProgress(), executor).execute()
         away = {row.values["path.time"]["value"]: row.values["path.distance"]["value"] for row in run.store.rows()}
     assert away == pytest.approx({0.0: 14.0, 1.0: 11.0, 2.0: 8.0, 3.0: 5.0, 4.0: 2.0}, abs=1e-4)
-
-
-@pytest.mark.medium
-def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(swept_scene, "make_renderer", Timed)
-    path = tmp_path / "run"
-    (said,), result = clocked("11111" + "00011" + "10111" + "11110", **DRIVE, grid={"pose.yaw": "0:360:4"}, run=path)
-    assert said.drives == 4 and said.right.mean == pytest.approx((5 + 2 + 4 + 4) / 20) and said.right.worst == 0.4
-    assert said.longest_gap.worst == 3.0 and said.longest_gap.mean == pytest.approx((0 + 3 + 1 + 1) / 4)
-    with Image.open(path / "images" / "drive.webp") as kept:
-        assert getattr(kept, "n_frames", 1) == 5
-    with Image.open(path / "images" / "drive.png") as kept:
-        strip = np.asarray(kept)
-    assert strip.shape == (160, 5 * 160, 3) and [int(strip[80, 80 + 160 * k, 0]) for k in range(5)] == [
-        50,
-        60,
-        70,
-        80,
-        90,
-    ]
-    shares = ([5, 2, 4, 4], [5] * 4)
-    assert result.summary.interval == pytest.approx(rate_interval(*shares)), "over drives, not over 20 frames"
-    assert result.summary.units == 4 and rate_text(result.summary).endswith(", over drives")
-    times = [row for row in result.summary.axes if row.axis == "path.time"]
-    assert times[0].interval == clopper_pearson(times[0].correct, 4), "at one time each drive has one frame"
-    (yaw, *_) = [row for row in result.summary.axes if row.axis == "pose.yaw"]
-    assert yaw.interval is None and yaw.accuracy == 1.0, "one drive of five frames"
-    assert "4 drives can show little" in " ".join(result.summary.warnings)
-    assert len(set(read_sweep(path)["unit"])) == 4
-    (claim, *_) = make_sweep_claims(result.summary)
-    assert "frames of 4 drives" in claim.statement and "sampler" not in claim.statement
-    text = text_of(result.summary)
-    assert "4 drives of 5 frames in 4 s, clock" in text and "75 %" in text and "40 %" in text and "drive.webp" in text
-    assert "Whole drives" in (path / "report.html").read_text()
-
-
-@pytest.mark.medium
-def test_two_models_are_compared_and_explained_by_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One is right in the last frames of each drive, the other in the first: as often, and row by row far apart."""
-    monkeypatch.setattr(swept_scene, "make_renderer", Timed)
-    models = [
-        advsearch.load_model(Clock(right * 12), labels=("mug", "vase"), input_size=16, name=name)
-        for right, name in (("11100", "early"), ("11000", "late"))
-    ]
-    path, drive = tmp_path / "run", {**DRIVE, "grid": {"pose.yaw": "0:330:12"}}
-    table = advsearch.sweep("mug", models, run=path, **SMALL, **drive)
-    assert table.summary.configurations == 120 and [one.drives for one in table.summary.drives or ()] == [12, 12]
-    assert table.summary.interval == pytest.approx(rate_interval([5] * 12, [10] * 12)), "both saw the same drives"
-    (pair,) = advsearch.compare(path, pictures=0, run=tmp_path / "compared").pairs
-    assert pair.units == 12 and (pair.first_only, pair.second_only) == (12, 0)
-    assert pair.p > 0.05 and pair.interval[0] < 0.0, "12 pairs of 60, one of each drive, are no proof"
-    told = advsearch.explain(path, confirm=0, pairs=0, clusters=0, run=tmp_path / "explained")
-    assert told.units == 12 and told.interval == pytest.approx(table.summary.interval)
-    assert "few show little" in told.warnings[0]
 
 
 @pytest.mark.medium
@@ -212,18 +151,6 @@ def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: P
     assert kept[0] == kept[1]
 
 
-def test_an_interval_is_that_of_a_mean_between_its_ends_and_has_a_width() -> None:
-    assert summarize_drives(np.array([0.75]), worst=min).interval is None, "one drive says nothing of others"
-    values = np.random.default_rng(0).uniform(2.0, 5.0, 400)
-    many = summarize_drives(values, max, (0.0, 8.0))
-    assert many.interval is not None and many.worst == values.max()
-    normal = 1.96 * values.std() / 20.0
-    low, high = many.interval
-    assert low < values.mean() - normal and values.mean() + normal < high and high - low < 4.0 * 2.0 * normal
-    same = summarize_drives(np.full(9, 0.5), worst=min).interval
-    assert same is not None and same[0] < 0.4 and same[1] > 0.6, "nine drives that are alike are nine drives"
-
-
 @pytest.mark.parametrize("drives", [3, 5, 10, 30])
 @pytest.mark.parametrize("kind", ["any share", "right all the way or seldom", "all or none"])
 def test_intervals_over_drives_cover_the_mean_of_few_drives(drives: int, kind: str) -> None:
@@ -236,29 +163,6 @@ def test_intervals_over_drives_cover_the_mean_of_few_drives(drives: int, kind: s
     }[kind]
     got = [summarize_drives(one, worst=min).interval for one in values]
     assert sum(one is not None and one[0] <= truth <= one[1] for one in got) >= 112  # under 95 % by chance: 1 in 40
-
-
-def test_the_mean_distance_at_first_sight_takes_its_range_from_the_plan_or_has_no_interval(tmp_path: Path) -> None:
-    """Nine drives of ten go along a near path; the far one may not be among those that were drawn."""
-    far = tmp_path / "far.csv"
-    far.write_text("time,x,y,z\n0,60,0,0\n4,30,0,0\n")
-    config = SweepConfig(
-        object="mug", size=1.0, controls={"path": {"reach": 4.0}}, path=f"approach,{far}", samples=2, fps=1.0,
-        set_={"camera.elevation": 0.0, "camera.distance": 1.0}, resolution=16, spp=1, trials=0,
-    )  # fmt: skip
-    job = load_job(config)
-    (axis,) = (one for one in job.axes if one.is_time)
-    ends = compute_distance_bounds(job, axis)
-    assert ends == pytest.approx((1.0, 60.0), abs=1e-3)
-    rng, covered, runs = np.random.default_rng(0), 0, 200
-    for _ in range(runs):
-        first = rng.choice([4.0, 60.0], 5, p=[0.9, 0.1])
-        interval = summarize_drives(first, min, ends).interval
-        assert interval is not None
-        covered += interval[0] <= 9.6 <= interval[1]
-    assert covered >= 0.94 * runs
-    assert summarize_drives(np.array([4.0, 5.0, 6.0]), min, None).interval is None, "of no known range there is none"
-    assert Drives._distance_bounds is None, "never from the sample"
 
 
 REPEATED: dict[str, Any] = {**DRIVE, "samples": 6}
@@ -277,25 +181,10 @@ def test_repeats_of_one_drive_that_differ_in_noise_are_one_drive(
     swept = result.summary
     assert (swept.units, swept.accuracy, swept.interval) == (1, pytest.approx(0.4), None)
     assert "all 6 repeats are of one drive and differ in noise alone" in " ".join(swept.warnings)
-    assert "1 drive of 5 frames in 4 s, 6 times each with other noise" in text_of(swept)
     assert set(read_sweep(paths[0])["unit"]) == {0}
     compared = advsearch.compare(f"{paths[0]},{paths[1]}", pictures=0, run=tmp_path / "compared")
     (pair,) = compared.pairs
     assert (pair.units, pair.unit, pair.p) == (1, "drive", 1.0) and pair.interval[0] < -0.5 and pair.interval[1] > 0.5
-    assert "nothing is shown of others" in " ".join(compared.warnings)
-
-
-def test_repeats_of_points_of_a_grid_that_differ_in_noise_are_as_many_points(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(swept_scene, "make_renderer", Timed)
-    (said,), result = clocked("11111" + "00011" + "10111" + "11110", **REPEATED, grid={"pose.yaw": "0:360:4"})
-    assert (said.drives, said.repeats, result.summary.units) == (4, 6, 4)
-    assert said.right.mean == pytest.approx(0.75) and said.right.interval == pytest.approx(
-        rate_interval([5, 2, 4, 4], [5] * 4)
-    )
-    assert result.summary.interval == pytest.approx(said.right.interval)
-    assert "Intervals are over 4 drives" in " ".join(result.summary.warnings)
 
 
 def swept_parts(folder: Path, *settings: dict[str, Any]) -> list[StoredSweep]:
@@ -318,32 +207,6 @@ def test_pictures_of_a_longer_sweep_of_the_same_seed_are_not_counted_twice(tmp_p
     changed = replace(short, config=short.config.model_copy(update={"label": "cup"}))
     mixed = read_predictions([changed, long])
     assert (len(mixed), mixed["unit"].nunique()) == (15, 9), "other settings: other predictions of the same draws"
-
-
-def test_samples_without_draws_and_grids_that_overlap_are_units_by_their_values(tmp_path: Path) -> None:
-    grids = ({"pose.yaw": [0, 90, 180]}, {"pose.yaw": [90, 180, 270, 45]})
-    moving: dict[str, Any] = {**DRIVE, "fps": 0.5, "samples": 4}
-    parts = swept_parts(tmp_path, *({**moving, "grid": grid, "seed": seed} for seed, grid in enumerate(grids)))
-    rows = read_predictions(parts)
-    assert len(rows) == 3 * 28 and rows["unit"].nunique() == 5
-    assert rows.groupby("pose.yaw")["unit"].nunique().tolist() == [1] * 5
-
-
-def test_the_longest_run() -> None:
-    assert [find_longest_run(np.array(one, bool)) for one in ([], [0], [1], [1, 1, 0, 1], [0, 1, 0, 1, 1])] == [
-        0,
-        0,
-        1,
-        2,
-        2,
-    ]
-
-
-def test_no_frames_no_drives_and_settings_that_need_a_path() -> None:
-    assert advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, **SMALL).summary.drives is None
-    assert advsearch.sweep("mug", grid={"path.time": [3]}, **SMALL).summary.drives is None
-    with pytest.raises(InputError, match="path: the control texture does not move on a path; add `over=path`, or use"):
-        advsearch.attack("mug", controls="texture", path="orbit")
 
 
 @pytest.mark.medium
@@ -374,12 +237,6 @@ def test_an_attack_over_a_path_keeps_its_adversarial_scene_along_the_drive(tmp_p
             assert kept.size == (8 * 160, 160)
     pictures = [(path / "images" / f"{name}.png").read_bytes() for name in ("drive", "drive-clean")]
     assert pictures[0] != pictures[1]
-    page = (path / "report.html").read_text()
-    assert "Along the drive" in page and "right in 24 of 24 frames of the clean scene" in page
-    assert (
-        advsearch.attack("mug", model, controls="texture", denoise="none", **{**size, "draws": None}).summary.drive
-        is None
-    )
 
 
 class Dark(nn.Module):
@@ -388,38 +245,3 @@ class Dark(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         score = 3.0 * (2.0 - images.mean(dim=(1, 2, 3)))
         return torch.stack([score, -score], dim=1)
-
-
-class Along(FakeRenderer):
-    """A picture whose grey level is the frame, five more on `orbit`."""
-
-    def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
-        values = self.space.describe(u)
-        further = 5 if values["path.way"]["value"] == "orbit" else 0
-        return torch.full((*self.size, 3), (round(float(str(values["path.time"]["value"]))) + further) / 25.5)
-
-
-@pytest.mark.medium
-def test_drives_on_several_paths_have_numbers_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Right in two of five frames of `approach` and in all of `orbit`, whose distance is always one."""
-    monkeypatch.setattr(swept_scene, "make_renderer", Along)
-    given = {**DRIVE, "path": "approach,orbit", "set": {"camera.elevation": 0.0, "camera.distance": 1.0}}
-    (said,), result = clocked("00110" + "11111", **given, run=tmp_path / "run")
-    approach, orbit = said.each
-    assert (said.drives, approach.path, orbit.path) == (2, "approach", "orbit")
-    assert (approach.right, approach.first_seen, approach.longest_gap, approach.flicker) == pytest.approx(
-        (0.4, 3.0, 2.0, 0.5)
-    )
-    assert (orbit.right, orbit.first_seen, orbit.longest_gap, orbit.flicker) == pytest.approx((1.0, 1.0, 0.0, 0.0))
-    assert said.right.mean == pytest.approx(0.7) and said.right.worst == pytest.approx(0.4)
-    assert "path.way" in (text := text_of(result.summary)) and "2 of 5" in text
-
-
-@pytest.mark.medium
-def test_drawn_paths_are_the_same_with_the_same_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(swept_scene, "make_renderer", Along)
-    given = {**DRIVE, "path": "approach,orbit", "samples": 12, "sampler": "random"}
-    first, again, other = (
-        [drive.path for drive in clocked("0" * 10, **given, seed=seed)[0][0].each] for seed in (1, 1, 2)
-    )
-    assert len(first) == 12 and set(first) == {"approach", "orbit"} and first == again != other

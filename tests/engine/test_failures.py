@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult
 from advsearch.attacks.candidates import FailureRate, Failures, FoundFailure
-from advsearch.attacks.verification import OVER_CONDITIONS, TRIAL_LOOKS, Rule
-from advsearch.cli.output import format_result as text_of
+from advsearch.attacks.verification import TRIAL_LOOKS, Rule
 from advsearch.engine.journal import Journal, ParallelEvaluator
-from advsearch.engine.record import RunState
 from advsearch.engine.verifier import Verifier
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.display import failures_text, make_failures_part
 from advsearch.questions.attack.outcome import describe_failures
 from advsearch.questions.attack.stages import MAX_TRIED_FAILURES, verify_failures
 from advsearch.questions.attack.summary import DifferentFailures
-from samples import attack, make_run, written_page
 from stand_ins import StandInProblem
 
 NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))
@@ -92,12 +87,6 @@ def test_no_more_are_tried_than_is_said_and_the_rest_is_a_claim() -> None:
     assert make_failures_part(told).rows[-1][2] == "not tried"
 
 
-def test_over_conditions_none_is_tried_and_that_is_said() -> None:
-    told = described(checked(failures(0.9), rule=OVER_CONDITIONS))
-    assert told.tried == 0 and told.listed[0].verified is None
-    assert failures_text(told).endswith("none of these was tried with fresh renders")
-
-
 def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
     share = FailureRate(0.034, (0.021, 0.08), 22.5, 500)
     known = replace(failures(0.9), over=(), n_failures=70, n_visited=500, n_cells=None, failure_rate=share)
@@ -112,23 +101,3 @@ def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
         make_failures_part(described(checked(Failures((replace(failure(0.9), ranges={}),), (), 1, 9, None)))).rows[0][0]
         == "anywhere"
     )
-
-
-def test_ranges_are_in_units_and_a_choice_has_its_option() -> None:
-    (one,) = described(checked(failures(0.9))).listed
-    assert one.ranges == {"u.0": pytest.approx((76.5, 85.5)), "kind": "brass"}
-    assert make_failures_part(described(checked(failures(0.9)))).rows[0][0] == "u.0 76.5 to 85.5 degrees, kind brass"
-
-
-def test_a_policy_that_looks_for_one_failure_has_none_of_it() -> None:
-    assert describe_failures(Coin(domain=NAMED), RunState()) is None  # type: ignore[arg-type]
-    assert "failures" not in attack().to_dict()
-
-
-def test_the_page_and_the_table_have_them(tmp_path: Path) -> None:
-    known = described(checked(failures(0.9, 0.45)))
-    summary = attack(failures=known.to_dict())
-    page = written_page(make_run(tmp_path / "run", summary)).read_text(encoding="utf-8")
-    assert "Different failures" in page and "1 of the 2 that were tried hold" in page
-    assert "u.0 76.5 to 85.5 degrees, kind brass" in text_of(summary)
-    assert "30 of 100 cells over u.0 and kind (50 were seen)" in text_of(summary)

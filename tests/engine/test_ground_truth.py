@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -11,7 +10,6 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.errors import InputError, UnknownNameError
 
 
 @pytest.mark.medium
@@ -50,29 +48,3 @@ def test_an_attack_keeps_ground_truth_of_the_clean_scene_and_of_its_adversarial_
         for key, value in expected.items():
             assert np.array_equal(layers[key], value.numpy()), key
         assert layers["mask.Y"].sum() > 50
-
-
-@pytest.mark.medium
-def test_overwriting_a_run_removes_its_ground_truth(tmp_path: Path) -> None:
-    def swept(**more: Any) -> None:
-        advsearch.sweep(
-            "mug", grid={"pose.yaw": [0, 90]}, trials=0, run=tmp_path / "run", resolution=8, spp=1, denoise="none",
-            **more,
-        )  # fmt: skip
-
-    swept(aov="mask")
-    assert (tmp_path / "run" / "aov").exists()
-    swept(overwrite=True)
-    assert not (tmp_path / "run" / "aov").exists()
-
-
-def test_ground_truth_without_a_run_or_of_another_name_is_refused() -> None:
-    with pytest.raises(InputError, match=r"aov.*run"):
-        advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, aov="mask")
-    with pytest.raises(InputError, match=r"aov.*run"):
-        advsearch.attack("mug", aov="mask")
-    with pytest.raises(UnknownNameError, match=r"unknown aov 'masks'. Did you mean 'mask'"):
-        advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, aov="masks", run="never")
-    with pytest.raises(UnknownNameError, match=r"unknown aov 'masks'. Did you mean 'mask'"):
-        advsearch.attack("mug", controls="pose", aov="masks", run="never")
-    assert not Path("runs/never").exists()

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.tasks.base import Facts, Sight
 from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.together import make_each_thing_task
@@ -56,22 +55,6 @@ def test_rows_have_the_truth_of_each_thing_and_tasks_judge_what_is_asked(judge: 
         assert things["object"]["right"] is things["stop-sign"]["right"] is True
         assert payload["worst"] in things and payload["mean_margin"] > 0.0
     assert all(row.correct for row in rows)
-
-
-@pytest.mark.medium
-def test_names_of_what_is_judged_are_checked_before_anything_is_rendered() -> None:
-    for judge, error, said in (
-        ("stop-sine", UnknownNameError, "Did you mean 'stop-sign'"),
-        ("all", InputError, "expected things beside the object for 'all'"),
-    ):
-        asked = {**ASKED, "things": None} if judge == "all" else ASKED
-        with pytest.raises(error, match=said):
-            advsearch.sweep("car", model(), grid={"pose.x": [0.0, 0.05]}, judge=judge, **asked)
-    with pytest.raises(InputError, match="all is for detection and segmentation and depth, got task classification"):
-        advsearch.sweep(
-            "car", advsearch.load_model("reference"), grid={"pose.x": [0.0, 0.05]}, judge="all", label="mug",
-            **{**ASKED, "task": "classification"},
-        )  # fmt: skip
 
 
 def test_all_things_have_to_be_right() -> None:

@@ -8,13 +8,11 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from advsearch import seeds
 from advsearch.controls import compose
 from advsearch.controls.path import PathControl
 from advsearch.engine.loading import make_controls, make_renderer
-from advsearch.errors import InputError
 from advsearch.scene.description import load_description
 from advsearch.scene.formation import Moment, divide_exposure
 from advsearch.scene.renderer import Renderer
@@ -69,18 +67,6 @@ def test_motion_blur_is_the_mean_of_64_stills(stills: Callable[[float, int, int]
     assert float((levels(stills(0.9, 64, 5), blurred) - mean).abs().max()) > 20 * LEVELS
 
 
-@pytest.mark.slow
-def test_motion_blur_is_the_mean_of_many_stills(stills: Callable[[float, int, int], Tensor]) -> None:
-    blurred = renderer([PathControl(**DRIVE, shutter=0.15)])
-    seen = blurred(blurred.start, 1, 6144)
-    times = 0.9 + 0.15 * ((torch.arange(64) + 0.5) / 64 - 0.5)
-    mean = levels(torch.stack([stills(float(one), 128, 100 + k) for k, one in enumerate(times)]).mean(dim=0), blurred)
-    sharp = (levels(stills(0.9, 1024, 5), blurred) - mean).abs() > 3 * LEVELS  # where a still is far from it
-    off = (seen - mean).abs()
-    assert float(sharp.float().mean()) > 0.01 and float(off[sharp].mean()) < LEVELS
-    assert float(off.mean()) < LEVELS / 2 and float(off.flatten().quantile(0.95)) < LEVELS
-
-
 @pytest.mark.medium
 def test_rows_that_are_read_one_after_the_other_are_those_of_as_many_stills(
     stills: Callable[[float, int, int], Tensor],
@@ -99,31 +85,6 @@ def test_rows_that_are_read_one_after_the_other_are_those_of_as_many_stills(
     assert float((levels(stills(0.9, 64, 5), rolled) - levels(rows, rolled)).abs().max()) > 20 * LEVELS
 
 
-def test_rows_that_are_read_from_the_bottom_are_those_of_a_picture_upside_down() -> None:
-    down, up = (compose([PathControl(**DRIVE, rolling=seconds)], load_description("mug")) for seconds in (0.1, -0.1))
-    assert down.exposure == (0.0, 0.1) and up.exposure == (0.0, -0.1)
-    assert float(DRIVE.get("shutter", 0.0)) == 0.0
-    offsets, rows, samples = divide_exposure(0.0, 0.1, 12, 5)
-    other_offsets, other_rows, other_samples = divide_exposure(0.0, -0.1, 12, 5)
-    torch.testing.assert_close(other_offsets, offsets)
-    torch.testing.assert_close(other_rows, rows.flip(1))
-    assert samples == other_samples and float(other_rows[0].argmax()) > float(other_rows[-1].argmax())
-    first, last = (renderer([PathControl(**DRIVE, rolling=seconds)]).moments for seconds in (0.1, -0.1))
-    assert len(first) == len(last)
-    for one, other in zip(first, last, strict=True):
-        torch.testing.assert_close(other.row_fractions, one.row_fractions.flip(0))
-
-
-@pytest.mark.slow
-def test_fewer_moments_than_rows_are_close_to_it(stills: Callable[[float, int, int], Tensor]) -> None:
-    rolled = renderer([PathControl(**DRIVE, rolling=0.1)])
-    times = [0.9 + 0.1 * ((row + 0.5) / SIDE - 0.5) for row in range(SIDE)]
-    rows = torch.stack([stills(time, 64, 100 + row)[row] for row, time in enumerate(times)])
-    off = rolled(rolled.start, 1, 64) - levels(rows, rolled)
-    blocks = avg_pool2d(off.movedim(2, 0), 4)  # without most of the noise
-    assert float(blocks.abs().mean()) < LEVELS
-
-
 @pytest.mark.medium
 def test_a_derivative_of_a_texture_is_that_of_the_mean() -> None:
     moving = renderer([PathControl(**DRIVE, shutter=0.05), *make_controls({"texture": {}})])
@@ -133,9 +94,3 @@ def test_a_derivative_of_a_texture_is_that_of_the_mean() -> None:
     with torch.no_grad():
         above, below = ((weight * moving.radiance(u + step, 1, 64)).sum() for step in (0.02, -0.02))
     assert float(0.04 * gradient.double().sum()) == pytest.approx(float(above - below), rel=0.02)
-
-
-@pytest.mark.parametrize("given", [{"shutter": 0.0}, {"rolling": -61.0}, {"shutter": 61.0}, {"shutter": "long"}])
-def test_times_that_no_shutter_has_are_refused(given: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=r"expected a number (over 0 and up|from -60) to 60"):
-        PathControl(**given)

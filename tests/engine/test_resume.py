@@ -20,16 +20,14 @@ import torch
 
 from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
 from advsearch.engine.journal import Journal, ParallelEvaluator
-from advsearch.errors import FileFormatError, InputError, RunExistsError
+from advsearch.errors import InputError, RunExistsError
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check.result import CheckConfig
-from advsearch.questions.stability.result import StabilityConfig
 from advsearch.runs import files
 from advsearch.runs.directory import RunDirectory, read_python_only
 from advsearch.runs.listing import can_resume
 from advsearch.runs.store import CachedEvaluation, Row, Store
-from advsearch.settings import Config, PythonOnly
+from advsearch.settings import PythonOnly
 from conftest import ROOT
 from covering import only
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
@@ -146,9 +144,7 @@ def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> Non
         (again,) = Journal(run, ParallelEvaluator(problem)).evaluate_all([query])
         assert again.objective == found.objective
         for other in (replace(query, u=torch.full((6,), 0.4)), replace(query, seed=2)):
-            with pytest.raises(
-                InputError, match="cannot resume: evaluation 0 of the search is not the one that was stored"
-            ):
+            with pytest.raises(InputError, match="cannot resume"):
                 list(Journal(run, ParallelEvaluator(problem)).evaluate_all([other]))
 
 
@@ -181,31 +177,8 @@ def test_a_run_goes_on_elsewhere_on_other_threads_and_with_files_that_were_moved
     moved = configuration(model=str(tmp_path / "new" / "net.pt2"), threads=1, run="other", overwrite=True)
     with RunDirectory.resume(tmp_path / "run", moved):
         pass
-    with pytest.raises(InputError, match=r"began with: model \(was net\.pt2\); restore it"):
+    with pytest.raises(InputError, match="began with"):
         RunDirectory.resume(tmp_path / "run", configuration(model="other.pt2"))
-
-
-@pytest.mark.parametrize("config", [CheckConfig(object="mug"), StabilityConfig()])
-def test_a_sitting_may_be_longer_than_the_one_before(tmp_path: Path, config: Config) -> None:
-    with RunDirectory.create(tmp_path / "run", config=config.model_copy(update={"seconds": 5.0})):
-        pass
-    for seconds in (9.0, None):
-        with RunDirectory.resume(tmp_path / "run", config.model_copy(update={"seconds": seconds})):
-            pass
-    with RunDirectory.create(tmp_path / "search", config=configuration(seconds=5.0)):
-        pass
-    with pytest.raises(InputError, match=r"seconds \(was 5\.0\)"):  # how long it searches decides the answer
-        RunDirectory.resume(tmp_path / "search", configuration(seconds=9.0))
-
-
-@pytest.mark.parametrize(("note", "got"), [(None, "none"), ("[1,", ".*damaged"), ("[1]", "list")])
-def test_a_run_without_its_settings_does_not_go_on(tmp_path: Path, note: str | None, got: str) -> None:
-    with RunDirectory.create(tmp_path / "run") as run:
-        run.append_rows(Row(kind="search", step=0))
-        if note is not None:
-            run.store.write_note("settings", note)
-    with pytest.raises(FileFormatError, match=f"results.sqlite: expected .*, got {got}"):
-        RunDirectory.resume(tmp_path / "run", configuration())
 
 
 def test_what_a_search_was_told_comes_back_bit_for_bit_until_the_run_is_done(tmp_path: Path) -> None:
@@ -277,16 +250,6 @@ def test_the_random_searchs_configuration_is_taken_where_it_is_the_worse_one(pol
     random = findings.baseline.best_u
     assert torch.equal(findings.search.best_u, random) == beaten
     assert torch.equal(findings.verification.u, problem.domain.project(random)) == beaten
-
-
-def test_a_kill_while_the_results_were_made_leaves_a_folder_that_a_run_can_take(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    for name in (".part-7-results.sqlite", ".part-7-results.sqlite-wal", ".lock"):
-        (folder / name).touch()
-    with RunDirectory.create(folder, config=configuration()):
-        pass
-    assert (folder / "run.yaml").is_file()
 
 
 def test_a_run_that_was_killed_before_it_had_results_goes_on(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.runs.store import NAME, Store
 from advsearch.scene.geometry import camera_to_world, compute_center, object_to_world
@@ -183,31 +182,3 @@ def test_a_gradient_keeps_no_more_of_sixteen_cameras_than_of_four() -> None:
     torch.testing.assert_close(many[:, : 4 * side], few[:, : 4 * side], atol=1e-9, rtol=1e-4)
     assert bool((many.abs().amax(dim=(0, 2)) > 0).all()) and most == 4
     assert more <= 16 * side * side * 3 * 4 < less, (less, more)
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("layout", ["NKCHW", "NKHWC"])
-def test_a_program_that_takes_all_pictures_at_once_is_loaded_from_its_file(tmp_path: Path, layout: str) -> None:
-    class Last(nn.Module):
-        """Scores by the last of three pictures, (N, 3, 3, 16, 16) or (N, 3, 16, 16, 3)."""
-
-        def forward(self, pictures: Tensor) -> Tensor:
-            last = pictures[:, 2] if layout == "NKCHW" else pictures[:, 2].permute(0, 3, 1, 2)
-            return last.mean(dim=(2, 3))[:, :2]
-
-    shape = (2, 3, 3, 16, 16) if layout == "NKCHW" else (2, 3, 16, 16, 3)
-    batch = torch.export.Dim("batch", min=1, max=8)
-    program = torch.export.export(Last(), (torch.rand(shape),), dynamic_shapes=({0: batch},))
-    torch.export.save(program, tmp_path / "three.pt2")
-    model = load_model(str(tmp_path / "three.pt2"), labels=["mug", "dog"])
-    assert model.input_size == (16, 16) and model.batch_limits == (3, 24)
-    picture = torch.rand(2, 16, 48, 3)
-    found = replace(model, cameras=3)(picture)
-    for one, seen in zip(found, picture, strict=True):
-        for output in one:
-            torch.testing.assert_close(output[0], seen[:, 32:].mean(dim=(0, 1))[:2])
-    words: dict[str, Any] = {"task": "rig", "controls": "light", "resolution": 16, "steps": 2}
-    with pytest.raises(InputError, match="takes 3 pictures at once, and 2 are taken"):
-        advsearch.attack("mug", model, camera=rig(tmp_path, PAIR), **words)
-    with pytest.raises(InputError, match="takes 3 pictures at once, and 1 is taken"):
-        advsearch.attack("mug", model, **{**words, "task": "classification"})

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.questions.sweep import surface
 from advsearch.questions.sweep.summary import SurfaceTable, SweepSummary
@@ -41,23 +40,6 @@ class Startled(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         score = 40.0 * blue(images)
         return torch.stack([-score, score], dim=1)
-
-
-class Detecting(nn.Module):
-    """Finds a mug in the middle of the picture, but where it sees blue."""
-
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        score = torch.sigmoid(-40.0 * blue(images))
-        boxes = images.new_tensor([[[0.15, 0.15, 0.85, 0.85]]]).expand(len(images), -1, -1)
-        return boxes, torch.stack([score, torch.zeros_like(score)], dim=1)[:, None]
-
-
-class Segmenting(nn.Module):
-    """Says "mug" of every pixel, but where it sees blue."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        score = (-40.0 * blue(images))[:, None, None].expand(-1, *images.shape[2:])
-        return torch.stack([score, -score], dim=1)
 
 
 class Never(nn.Module):
@@ -135,19 +117,6 @@ def test_a_patch_that_goes_with_failures_lights_up_and_no_other_model_s(tmp_path
     assert list(found["objects"]) == ["mug"] and list(found["models"]) == ["Startled", "Never"]
     assert found["pictures_0"].tolist() == [20, 20] and found["failures_0"][1] == 0
     assert (found["wrong_0"] <= found["seen_0"]).all() and found["map_0"].shape == (5504, 3, 2)
-    assert (run / "images" / "surface.png").read_bytes().startswith(b"\x89PNG")
-    page = (run / "report.html").read_text()
-    assert "The surface that was seen" in page and "go with wrong predictions" in page
-    assert "none of" in page and "told from chance" in page
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("task", "module"), [("detection", Detecting()), ("segmentation", Segmenting())])
-def test_tasks_beside_classification_have_such_a_map(tmp_path: Path, task: str, module: nn.Module) -> None:
-    asked = {"detection": {"name": "detection", "iou": 0.2}}.get(task, task)
-    summary = swept(tmp_path / "run", module, task=asked)
-    assert summary.task == task and summary.surface is not None
-    is_the_patch(summary.surface.tables[0], tmp_path / "run")
 
 
 @pytest.mark.medium
@@ -166,7 +135,6 @@ def test_a_stopped_sweep_and_one_that_is_asked_afterwards_have_the_same_map(
         assert main([*asked, str(parts), "--surface", "--json"]) == 130
     assert "surface" not in json.loads(capsys.readouterr().out)
     assert main(["resume", str(parts), "--quiet"]) == 0
-    assert "What is seen of the surface when the model is wrong:" in capsys.readouterr().out
     assert main([*asked, str(later)]) == 0
     with store.Store(later / store.NAME, read_only=True) as results:
         before = [(row.seed, row.margin) for row in results.rows()]
@@ -178,8 +146,3 @@ def test_a_stopped_sweep_and_one_that_is_asked_afterwards_have_the_same_map(
     assert [one["part"] for one in found["tables"]] == ["cell", "face"] and found["tables"][0]["seen"] > 500
     assert json.loads((parts / "summary.json").read_text())["surface"] == found
     assert (parts / "artifacts" / "surface.npz").read_bytes() == (later / "artifacts" / "surface.npz").read_bytes()
-
-
-def test_without_a_run_there_is_no_place_for_the_map() -> None:
-    with pytest.raises(InputError, match=r"surface.*run"):
-        advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, surface=True)

@@ -8,16 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from torch import Tensor
 
 import advsearch
-from advsearch.attacks import make_policy
-from advsearch.attacks.evaluation import Query
 from advsearch.engine import acceptance, surface_light
-from advsearch.engine.acceptance import ComparedView, Deviation
+from advsearch.engine.acceptance import Deviation
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.questions.attack.carry_out import load_parts, make_problem_with_warnings
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
@@ -71,16 +66,6 @@ def off(monkeypatch: pytest.MonkeyPatch, *levels: float) -> None:
         return self.deviations[-1]
 
     monkeypatch.setattr(SurfaceLight, "_compare", found)
-
-
-@pytest.mark.medium
-def test_a_search_says_that_light_on_surfaces_predicted_it(whole: tuple[Path, AttackResult]) -> None:
-    """All of its pictures, under three lights; a comparison before it, and two within, of two pictures each."""
-    told, renders = whole[1].summary.transport, whole[1].summary.renders
-    assert told is not None and told.conditions is not None and told.error is not None
-    assert (told.way, told.reason, told.renewed, told.conditions.made) == ("surface light", None, 0, 3)
-    assert told.bytes and told.entries and 0.0 < told.error.levels < 50.0
-    assert (renders["products"], renders["gradient"]) == (18 * 2, 0)
 
 
 @pytest.mark.medium
@@ -146,79 +131,3 @@ def test_a_search_for_a_viewpoint_goes_on_with_the_same_rows(
     assert stopped.summary.ending == "interrupted"
     attack_once(config, resumed=folder)
     assert ready.given and rows(folder) == rows(viewpoints[0])
-
-
-@pytest.mark.medium
-def test_a_viewpoint_is_rendered_once_predictions_are_too_far_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After two comparisons in a row: nothing is to be found anew. The random search is rendered, too."""
-    off(monkeypatch, 1.0, 9.0, 9.0)
-    summary = advsearch.attack("mug", **CAMERA).summary
-    assert summary.transport is not None and summary.transport.renewed == 0
-    assert "from evaluation 12 on" in str(summary.transport.reason)
-    assert (summary.renders["products"], summary.renders["baseline"]) == (12, 48)
-
-
-@pytest.mark.parametrize(
-    ("settings", "reason"),
-    [
-        ({"policy": "pgd"}, "pgd takes derivatives"),
-        ({"steps": 31}, "pays from 32"),
-        ({"controls": ["camera", "pose"]}, "object.vertices"),
-        ({"estimators": {"camera": "differences"}}, "forced"),
-    ],
-)
-def test_a_search_for_a_viewpoint_that_renders_says_why(settings: dict[str, Any], reason: str) -> None:
-    """In words; nothing is measured."""
-    parts = load_parts(AttackConfig(object="mug", **{**CAMERA, **settings}))
-    problem, _ = make_problem_with_warnings(parts)
-    against = surface_light.find_surface_light_refusal(
-        problem, problem.steps, make_policy(str(settings.get("policy", "auto"))), True
-    )
-    assert reason in str(against)
-
-
-@pytest.mark.medium
-def test_a_texture_and_its_viewpoint_are_searched_together() -> None:
-    """The derivative of the texture is predicted, too; the camera is found without one."""
-    summary = advsearch.attack("mug", **CAMERA | {"controls": {"texture": {"resolution": 8}, "camera": {}}}).summary
-    assert summary.transport is not None and summary.transport.way == "surface light"
-    assert (summary.renders["products"], summary.renders["gradient"]) == (80, 0)
-
-
-def test_a_camera_that_was_drawn_is_no_progress_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the search has moved is the texture: before it that is nothing, whatever the camera."""
-    controls = {"texture": {"resolution": 8}, "camera": {}}
-    problem, _ = make_problem_with_warnings(load_parts(AttackConfig(object="mug", **CAMERA | {"controls": controls})))
-    before: list[Tensor | None] = []
-
-    def view_of(*given: Any) -> ComparedView:
-        before.append(given[-1])
-        return ComparedView(8.0, 9.0, 0.0, 3)
-
-    monkeypatch.setattr("advsearch.engine.problem.compare_with_traced", view_of)
-    light = SurfaceLight(problem, 40)
-    light.prepare()
-    assert before == [None] * acceptance.N_FIRST_VIEWS
-    light._compare(problem.domain.sample(torch.Generator().manual_seed(0), 1)[0], 6)
-    assert len(before) == 2 * acceptance.N_FIRST_VIEWS and all(
-        one is not None for one in before[acceptance.N_FIRST_VIEWS :]
-    )
-
-
-@pytest.mark.medium
-def test_a_random_search_looks_through_the_same_cameras_again() -> None:
-    """Every fourth time, where a search that learns sees new ones and other exposures each time."""
-    problem, _ = make_problem_with_warnings(load_parts(AttackConfig(object="mug", **SMALL)))
-    light, u = SurfaceLight(problem, 18), problem.domain.start
-
-    def objective(kind: str, number: int) -> float:
-        return light.evaluate(Query(u, number, kind, number, gradient=False, phase="search")).objective
-
-    light.prepare()
-    assert objective("baseline", 1) == objective("baseline", 5) != objective("baseline", 2)
-    assert len({objective("search", number) for number in (1, 5, 9)}) == 3
-    exposures = [group.coordinates for group in problem.space.groups if group.name == "environment.exposure"]
-    seen = {
-        float(one[exposures[0].start - len(u)]) for n in range(9) for one in light._choose_conditions("search", n, 2)
-    }
-    assert len(seen) == 18 and len(light.renderer.stored_lights) <= 4

@@ -14,7 +14,6 @@ import advsearch
 from advsearch.attacks.domain import ProductIndex
 from advsearch.cluster import BatchResult, WorkerStats
 from advsearch.engine import acceptance
-from advsearch.engine.acceptance import Deviation
 from advsearch.engine.journal import make_worker_call
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import predicting
@@ -24,14 +23,11 @@ from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.predicting import Groups
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results import LinearTransport
 from advsearch.scene.surface import arrangement, texels
 from advsearch.scene.surface.renderer import SurfaceRenderer
 from stand_ins import rows
 
 SMALL: dict[str, Any] = {"resolution": 24, "trials": 0, "batch": 4}
-GRID: dict[str, Any] = {"pose.yaw": [0, 90], "camera.azimuth": "0:360:4", "camera.sizes": [2, 3]}
-KITCHEN_TOO: dict[str, Any] = {"environment.which": ["studio", "kitchen"], "camera.azimuth": "0:360:4"}
 
 
 @pytest.fixture(autouse=True)
@@ -83,26 +79,6 @@ def test_pictures_are_those_that_are_rendered() -> None:
     assert float(apart.diagonal().mean()) < 9.0
 
 
-@pytest.mark.medium
-def test_rows_say_how_they_came_and_each_pose_has_light_of_its_own(coarse: list[SurfaceRenderer]) -> None:
-    found = swept(grid=GRID)
-    told, renders = found.summary.transport, found.summary.renders
-    assert told is not None and told.error is not None and told.bytes
-    assert (told.used, told.way, told.reason) == (True, "surface light", None)
-    assert renders == {"sweep": 2 * 2 * 3, "verification": 0, "products": 16} and len(coarse) == 2
-    assert {(row.seed, row.spp) for row in found.rows()} == {(None, 4)}
-    assert [row.renders for row in found.rows()] == [6, *[0] * 7] * 2
-
-
-@pytest.mark.medium
-def test_environments_have_one_arrangement(coarse: list[SurfaceRenderer]) -> None:
-    """Whichever varies faster; pictures are the same."""
-    first, second = swept(grid=KITCHEN_TOO), swept(grid=dict(reversed(KITCHEN_TOO.items())))
-    assert len(coarse) == 2 and first.summary.renders["products"] == second.summary.renders["products"] == 8
-    margins = [row.margin for row in second.rows()]
-    assert [row.margin for row in first.rows()] == pytest.approx([*margins[::2], *margins[1::2]], rel=1e-4)
-
-
 class Two:
     """Two workers, which carry out batches in any order, each with scenes of its own."""
 
@@ -141,54 +117,3 @@ def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(
     with RunDirectory.resume(tmp_path / "parts") as run:
         again = Sweep(job, run, NullProgress(), Two(job)).execute().summary
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole") and again.renders == whole.renders
-
-
-@pytest.mark.medium
-def test_drives_are_predicted_whatever_is_drawn_for_each(coarse: list[SurfaceRenderer]) -> None:
-    """Light turns from drive to drive; what is done to finished pictures comes on top."""
-    drive: dict[str, Any] = {"path": "approach", "fps": 0.5, "samples": 2}
-    found = swept(controls={"environment": {"rotation": [0, 360]}, "sensor": {}}, **drive)
-    drives = found.summary.drives
-    assert drives is not None and (drives[0].drives, drives[0].frames) == (2, 6) and len(coarse) == 1
-    assert found.summary.renders["products"] == 12 and found.summary.renders["sweep"] == 2 * 2 * 3
-
-
-@pytest.mark.medium
-def test_a_group_whose_pictures_are_too_far_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    levels = iter([9.0, 1.0])
-    monkeypatch.setattr(predicting, "compare_views", lambda view: Deviation(next(levels), 0.0, 2.0, n_traced=6))
-    found = swept(grid=GRID)
-    told = found.summary.transport
-    assert told is not None and "1 of 2 groups were rendered" in str(told.reason)
-    assert [row.seed is None for row in found.rows()] == [False] * 8 + [True] * 8
-    assert [row.renders for row in found.rows()][:9] == [7, *[1] * 7, 6]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    ("more", "reason"),
-    [
-        ({"specialise": False}, "nothing is left out"),
-        ({"denoise": "none"}, "noise is part of the picture without the denoiser"),
-        (
-            {"controls": {"camera": {"aperture": 0.1}}, "samples": 1},
-            "haze, a lens with an aperture",
-        ),
-        ({"controls": "haze", "samples": 1}, "more in the scene than the object, its ground and an environment"),
-        ({"grid": {"pose.yaw": [0, 90]}}, None),
-    ],
-)
-def test_why_a_sweep_is_rendered(more: dict[str, Any], reason: str | None) -> None:
-    told = swept(**{"grid": {"camera.azimuth": [0, 90]}, **more}).summary.transport
-    assert (told is None) == (reason is None)
-    if told is not None:
-        assert not told.used and str(reason) in str(told.reason)
-
-
-@pytest.mark.medium
-def test_few_pictures_do_not_pay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predicting, "MIN_SAVING_FACTOR", 2.0)
-    told = swept(grid=GRID, resolution=128).summary.transport
-    assert told == LinearTransport(
-        used=False, reason="light on surfaces pays where 106 pictures differ in the camera alone; here 8 do"
-    )

@@ -11,13 +11,10 @@ from typing import Any
 import pytest
 from test_sweep import FakeRenderer
 
-import advsearch
 from advsearch.cli.main import main
-from advsearch.cli.output import format_result as text_of
 from advsearch.cluster import BatchFunction, BatchResult, WorkerStats
 from advsearch.engine.journal import make_worker_call
 from advsearch.engine.record import LOST_LABEL
-from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.carry_out import load_job
@@ -25,9 +22,7 @@ from advsearch.questions.sweep.job import SceneLoader
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results import SharedWork
 from advsearch.runs.store import NAME, Store
-from samples import sweep as swept
 
 SMALL = {"object": "mug", "grid": {"pose.yaw": "0:360:3", "camera.elevation": [5, 35]}, "environment": "studio,noon"}
 CONFIG = SweepConfig(**SMALL, batch=2, resolution=16, spp=1, trials=0)
@@ -98,13 +93,6 @@ def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_p
 
 
 @pytest.mark.medium
-def test_what_comes_in_any_order_is_counted_as_in_order(tmp_path: Path) -> None:
-    with RunDirectory.create(tmp_path / "alone") as run:
-        alone = Sweep(load_job(CONFIG), run, NullProgress()).execute()
-    assert summary(shared(tmp_path / "shared", seed=3)) == summary(alone)
-
-
-@pytest.mark.medium
 def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path: Path) -> None:
     result = shared(tmp_path / "run", lose=7)
     (lost,) = [row for row in result.rows() if row.label == LOST_LABEL]
@@ -133,20 +121,6 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
     assert [row.machine for row in result.rows()] == ["ab12"] * 4 + [None] * 8
     told = "not alike, so that their last bits may differ; beside the one that kept the run: processor another, LLVM 19"
     assert any(told in text for text in result.summary.warnings)
-    with RunDirectory.resume(tmp_path / "run") as run:
-        assert any(told in text for text in Sweep(job, run, NullProgress()).execute().summary.warnings)
-
-
-def test_what_is_shown_says_where_the_time_went() -> None:
-    facts = WorkerStats(most=2, lost=1, refused=1, retried=3, batches=9, busy=9.0, loading=6.0, alive=10.0)
-    text = text_of(swept().model_copy(update={"shared": SharedWork.of_facts(facts, {})}))
-    assert "2 at most, busy 90 % of 10" in text and "1 lost, 1 refused, 3 given out again" in text
-    assert "workers" not in text_of(swept())
-
-
-def test_what_is_loaded_already_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="workers: other processes load objects, models"):
-        advsearch.sweep("mug", advsearch.load_model("reference"), {"pose.yaw": [0, 90]}, workers=2)
 
 
 @pytest.mark.medium

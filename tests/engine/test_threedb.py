@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import json
 import runpy
-from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from advsearch.cli.exporters.threedb import write_threedb
 from advsearch.cli.main import main
-from advsearch.errors import FileFormatError, InputError
-from advsearch.progress import Progress
+from advsearch.errors import FileFormatError
 from advsearch.questions.sweep.result import import_threedb
-from advsearch.runs.exporters import EXPORTERS, Exported, Exporter
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.thumbnails import find_thumbnails
 from stored_sweeps import make_sweep
@@ -64,30 +59,6 @@ def test_a_sweep_is_written_as_its_dashboard_reads_it(tmp_path: Path, capsys: py
     assert "not empty" in capsys.readouterr().err
 
 
-def test_an_exporter_of_a_package_takes_no_name_of_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is there by its own name, and neither a table nor what a file's ending stands for becomes its."""
-
-    class Greedy(Exporter):
-        writes = "a text file"
-        suffix = "glb"
-
-        def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
-            out.write_text("greedy")
-            return Exported({}, "done")
-
-    for name in ("csv", "greedy"):
-        exporter = type("Named", (Greedy,), {"name": name})
-        monkeypatch.setitem(EXPORTERS._installed, name, SimpleNamespace(value="x:X", load=lambda one=exporter: one))
-    run = str(make_sweep(tmp_path / "run", keep="wrong"))
-    table, asked, mesh, own = (tmp_path / name for name in ("rows.csv", "rows.txt", "mug.glb", "own.txt"))
-    assert main(["export", run, "--out", str(table)]) == 0
-    assert main(["export", run, "--format", "csv", "--out", str(asked)]) == 0
-    assert table.read_text() == asked.read_text() != "greedy"
-    assert main(["export", run, "--out", str(mesh)]) == 2 and not mesh.exists()  # as glTF, which a sweep has not
-    assert main(["export", run, "--format", "greedy", "--out", str(own)]) == 0
-    assert own.read_text() == "greedy"
-
-
 def test_3dbs_own_dashboard_opens_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its program, up to where it would listen."""
     pytest.importorskip("threedboard", reason="no threedboard here: pip install threedboard")
@@ -101,7 +72,6 @@ def test_3dbs_own_dashboard_opens_what_is_written(tmp_path: Path, monkeypatch: p
     told = client.get("/log.json").get_json()
     rows = [dict(zip(told["parameters"], row, strict=True)) for row in told["data"]]
     assert [row["is_correct"] for row in rows] == [row.correct for row in rows_of(run)]
-    assert "render_args.pose.yaw" in told["parameters"]
     wrong = next(row for row in rows if not row["is_correct"])
     assert told["class_map"][wrong["prediction"][0]] == "cup"
     with client.get(f"/images/{wrong['id']}") as picture:
@@ -122,25 +92,12 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     assert "Right in 18 of 24" in (again / "report.html").read_text().replace("&nbsp;", " ")
 
 
-def test_a_folder_of_3db_becomes_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write(tmp_path / "in", LINE, {**LINE, "id": "b", "is_correct": "False", "prediction": [0, 1]})
-    assert main(["import-3db", str(folder), "--run", str(tmp_path / "run"), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    assert (summary["configurations"], summary["correct"], summary["answers"]) == (2, 1, {"cup": 1})
-    first, second = rows_of(tmp_path / "run")
-    assert (first.label, first.correct, second.label, second.correct) == ("mug", True, "cup", False)
-    assert first.values["OrientationControl.rotation_x"]["value"] == 0.5
-    assert first.values["on"]["value"] == "True"
-
-
 @pytest.mark.parametrize(
     ("line", "message"),
     [
         ("no json", "line 1"),
         ("[1, 2]", "render_args"),
-        ({"id": 1}, "render_args"),
         ("[" * 5000, "nested"),
-        ('{"render_args": {}, "loss": ' + "1" * 100_000 + "}", "line 1"),
     ],
 )
 def test_a_damaged_log_is_named(tmp_path: Path, line: Any, message: str) -> None:
@@ -165,16 +122,3 @@ def test_a_large_picture_is_refused(tmp_path: Path) -> None:
     Image.new("1", (20_000, 20_000)).save(folder / "images" / "a-1_rgb.png")
     with pytest.raises(FileFormatError, match="pixels"):
         import_threedb(folder, tmp_path / "run")
-
-
-def test_a_missing_or_empty_log_is_named(tmp_path: Path) -> None:
-    (tmp_path / "in").mkdir()
-    with pytest.raises(FileFormatError, match=r"details\.log"):
-        import_threedb(tmp_path / "in", tmp_path / "run")
-    with pytest.raises(FileFormatError, match="empty"):
-        import_threedb(write(tmp_path / "none"), tmp_path / "run")
-
-
-def test_a_run_without_rows_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="rows of a sweep"):
-        write_threedb(list[Row], tmp_path / "out", lambda _: None)

@@ -93,23 +93,6 @@ def test_maps_are_the_librarys(tmp_path: Path, family: str, kind: str) -> None:
     assert float((at_size - asked).abs().max()) < 1e-4 * max(1.0, float(asked.abs().max()))
 
 
-@pytest.mark.medium
-def test_the_border_of_zoedepth_is_the_librarys(tmp_path: Path) -> None:
-    """Its post-processing needs torchvision, so what it does is done here: bring to the size with a border, and cut."""
-    model = load_model(published(tmp_path, "ZoeDepth"), task="depth")
-    prepared = transformers.AutoImageProcessor.from_pretrained(tmp_path)
-    given = prepared(images=np.asarray(PICTURE.mul(255).round(), np.uint8), return_tensors="pt")
-    network = transformers.AutoModelForDepthEstimation.from_pretrained(tmp_path).eval()
-    with torch.no_grad():
-        found = network(**given).predicted_depth
-    border = int(np.sqrt(SIDE / 2) * 3)
-    whole = torch.nn.functional.interpolate(found[None], size=SIDE + 2 * border, mode="bicubic")[0, 0]
-    asked = whole[border:-border, border:-border]
-    ours = model(PICTURE)[0]
-    assert list(ours) == [METRIC] and float(asked.std()) > 1e-4
-    assert float((ours[METRIC] - asked).abs().max()) < 1e-4
-
-
 def test_the_gradient_of_a_network_agrees_with_differences(tmp_path: Path) -> None:
     model: Any = load_model(published(tmp_path, "DepthAnything"), task="depth")
     mask = torch.zeros(SIDE, SIDE).bool()

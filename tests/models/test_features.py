@@ -10,14 +10,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-import conftest
 from advsearch.attacks.objectives import get_objective
-from advsearch.errors import InputError
-from advsearch.models import Model, ModelWarning, Preprocessing, load_model
+from advsearch.models import Model, Preprocessing, load_model
 from advsearch.models.features import Features, features_of
 
-DATA = conftest.DATA / "models"
-MOBILENET = DATA / "mobilenet_v2_imagenet.pt2"
 SIZE = 12
 
 
@@ -82,71 +78,6 @@ def test_maps_before_a_convolution_are_averaged() -> None:
     assert torch.allclose(features(images()), by_hand(network, 2).mean(dim=(2, 3)), atol=1e-6)
 
 
-def test_tokens_before_a_linear_layer_are_averaged() -> None:
-    class Tokens(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.head = nn.Linear(3, 4)
-
-        def forward(self, x: Tensor) -> Tensor:
-            found: Tensor = self.head(x.flatten(2).movedim(1, 2)).mean(dim=1)
-            return found
-
-    features = features_of(load(Tokens()))
-    assert features.source == "the input of head (Linear), 3 numbers"
-    assert torch.allclose(features(images()), images().mean(dim=(1, 2)), atol=1e-6)
-
-
-def test_the_last_layer_is_the_last_to_run_and_not_the_last_to_be_declared() -> None:
-    class Backwards(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.head, self.body, self.unused = nn.Linear(5, 4), nn.Linear(3, 5), nn.Linear(9, 4)
-
-        def forward(self, x: Tensor) -> Tensor:
-            found: Tensor = self.head(input=self.body(x.mean(dim=(2, 3))).tanh())
-            return found
-
-    assert features_of(load(Backwards())).source == "the input of head (Linear), 5 numbers"
-
-
-def test_a_head_that_is_no_layer_gives_the_output_of_the_last_layer() -> None:
-    class Prototypes(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.body, self.prototypes = nn.Linear(3, 5), nn.Parameter(torch.randn(5, 4))
-
-        def forward(self, x: Tensor) -> Tensor:
-            found: Tensor = self.body(x.mean(dim=(2, 3))) @ self.prototypes
-            return found
-
-    network = Prototypes()
-    features = features_of(load(network))
-    assert features.source == "the output of body (Linear), 5 numbers"
-    assert torch.allclose(features(images()), network.body(images().mean(dim=(1, 2))).detach(), atol=1e-6)
-
-
-def test_a_traced_graph_of_modules_is_read_like_a_module() -> None:
-    network = sequential()
-    features = features_of(load(torch.fx.symbolic_trace(network)))
-    assert features.source == "the input of 6 (Linear), 7 numbers"
-    assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
-
-
-def test_reading_leaves_no_hook_behind_even_after_an_error() -> None:
-    model = load(sequential())
-    features = features_of(model)
-    features(images())
-    with pytest.raises(RuntimeError):
-        features.read(torch.zeros(1, 2, SIZE, SIZE))
-    assert isinstance(model.module, nn.Module)
-    assert not any(layer._forward_hooks for layer in model.module.modules())
-
-
-def test_the_bundled_model_has_the_features_before_its_head() -> None:
-    assert features_of(load_model("reference")).source == "the input of head (Linear), 192 numbers"
-
-
 # ---- programs -------------------------------------------------------------------------------------------------------
 
 
@@ -160,32 +91,6 @@ def test_an_exported_program_gives_what_its_module_gave(tmp_path: Path, lower: C
     assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize("lower", [lambda p: p, lambda p: p.run_decompositions()], ids=["conv2d", "convolution"])
-@pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_an_exported_convolution_at_the_end(tmp_path: Path, lower: Callable[[Any], Any]) -> None:
-    network = nn.Sequential(nn.Conv2d(3, 6, 3), nn.SiLU(), nn.Conv2d(6, 4, 1), nn.AdaptiveAvgPool2d(1), nn.Flatten())
-    features = features_of(load_model(exported(network.eval(), tmp_path, lower)))
-    assert torch.allclose(features(images()), by_hand(network, 2).mean(dim=(2, 3)), atol=1e-6)
-
-
-@pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_an_exported_program_of_a_fixed_batch_is_padded_and_cut(tmp_path: Path) -> None:
-    network, path = sequential(), tmp_path / "fixed.pt2"
-    torch.export.save(torch.export.export(network, (torch.rand(2, 3, SIZE, SIZE),)), path)
-    features = features_of(load_model(path))
-    assert features(images(3)).shape == (3, 7)
-    assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
-
-
-@pytest.mark.medium
-@pytest.mark.skipif(not MOBILENET.is_file(), reason=f"real model {MOBILENET} is absent")
-@pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_a_real_program_has_its_1280_features() -> None:
-    features = features_of(load_model(MOBILENET))
-    assert (features.size, features.penultimate) == (1280, True)
-
-
 # ---- nothing to look into -------------------------------------------------------------------------------------------
 
 
@@ -196,34 +101,11 @@ def test_a_script_falls_back_to_centred_logits_and_says_so() -> None:
     check_fallback(features, network)
 
 
-def test_a_plain_function_falls_back_to_centred_logits_and_says_so() -> None:
-    network = sequential()
-    model = Model(lambda x: network(x), "a function", tuple("abcd"), Preprocessing((SIZE, SIZE)))
-    check_fallback(features_of(model), network)
-    assert "can be read in a function" in features_of(model).source
-
-
 def check_fallback(features: Features, network: nn.Sequential) -> None:
     logits = by_hand(network, len(network))
     assert torch.allclose(features(images()), logits - logits.mean(dim=1, keepdim=True), atol=1e-6)
     assert (features.size, features.penultimate) == (4, False)
     assert features.source.startswith("the logits, 4 numbers: no layer before them can be read in a ")
-
-
-def test_a_network_without_layers_falls_back() -> None:
-    class Bare(nn.Module):
-        def forward(self, x: Tensor) -> Tensor:
-            return x.mean(dim=(2, 3))
-
-    assert not features_of(load(Bare())).penultimate
-
-
-def test_the_fallback_of_probabilities_is_in_log_odds() -> None:
-    with pytest.warns(ModelWarning, match="probabilities"):
-        model = load(sequential(nn.Linear(7, 4), nn.Softmax(dim=1)))
-    opaque = Model(lambda x: model.module(x), "p", model.labels, model.preprocessing, probabilities=True)
-    logits = opaque(images())
-    assert torch.allclose(features_of(opaque)(images()), logits - logits.mean(dim=1, keepdim=True), atol=1e-6)
 
 
 # ---- all of them ----------------------------------------------------------------------------------------------------
@@ -252,9 +134,3 @@ def test_the_gradient_is_that_of_a_central_difference_and_batches_agree(kind: st
     with torch.no_grad():
         ends = [objective(torch.zeros(1, 4), leaf + step * direction, (0,)) for step in (1e-2, -1e-2)]
     assert float(ends[0] - ends[1]) / 2e-2 == pytest.approx(float(gradient.norm()), rel=1e-2)
-
-
-def test_what_is_no_image_is_refused() -> None:
-    features = features_of(load(sequential()))
-    with pytest.raises(InputError, match="images: expected a floating-point tensor"):
-        features(torch.zeros(3, SIZE, SIZE))

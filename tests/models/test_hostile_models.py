@@ -251,45 +251,13 @@ def test_nested_descriptions_are_refused(depth: int, exported: Path, tmp_path: P
         load_model(path)
 
 
-def test_a_compressed_archive_is_loaded(exported: Path, tmp_path: Path) -> None:
-    path = repacked(exported, tmp_path / "packed.pt2", {}, zipfile.ZIP_DEFLATED)
-    images = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
-    assert torch.equal(load_model(path)(images), load_model(exported)(images))
-
-
-class Strided(nn.Module):
-    """Sizes that depend on the picture's, without gradients for a part."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        with torch.no_grad():
-            small = nn.functional.interpolate(x[:, :, ::2], scale_factor=0.5, mode="bilinear")
-        return {"logits": small.mean((2, 3)) + x.mean((2, 3))}["logits"]
-
-
-@pytest.mark.medium
-def test_sizes_that_depend_on_each_other_are_loaded(tmp_path: Path) -> None:
-    batch, side = torch.export.Dim("batch", min=1, max=8), torch.export.Dim("side", min=4, max=32)
-    sizes = ({0: batch, 2: 2 * side, 3: 2 * side},)
-    program = torch.export.export(Strided().eval(), (torch.rand(2, 3, 16, 16),), dynamic_shapes=sizes)
-    torch.export.save(program, tmp_path / "strided.pt2")
-    model = load_model(tmp_path / "strided.pt2", input_size=20)
-    images = torch.rand((3, 20, 20, 3), generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(model(images), Strided()(images.permute(0, 3, 1, 2)))
-    assert model.batch_limits == (1, 8)
-
-
 @pytest.mark.parametrize(
     "text",
     [
-        "s0",
         "2*s77 + 1",
         "(s0 - 1)//32 + 1",
-        "Symbol('s77', positive=True, integer=True)",
-        "Add(Mul(Integer(2), Symbol('s0', integer=True)), Integer(-1))",
         "FloorDiv(Add(Symbol('s0', integer=True), Integer(-1)), Integer(32))",
-        "Pow(Symbol('s0', positive=True, integer=True), Integer(2))",
         "Mul(Rational(1, 2), Symbol('s0'))",
-        "Eq(Symbol('u0', integer=True), Integer(3))",
         "Max(Integer(1), Min(Symbol('s1'), Integer(64)))",
         "Mul(Float('0.5', precision=53), ToFloat(Symbol('s0')))",
         "And(StrictLessThan(Integer(1), Symbol('s0')), true)",
@@ -305,31 +273,17 @@ def test_expressions_of_sizes_that_are_read(text: str) -> None:
         "__import__('os').system('true')",
         "s0.__class__",
         "(lambda: 1)()",
-        "[s0 for s0 in (1,)]",
-        "S('1')",
         "sympify('1')",
-        "Symbol(__import__('os'))",
         "Symbol('s0', **{'a': True})",
         "Symbol('s0', positive=__import__('os').system('true'), positive=True)",
-        "Float('1', precision=10**9, precision=53)",
-        "Symbol('os.system')",
         "Float('1e999999999')",
         "Float('1', precision=10**9)",
-        "factorial(10**9)",
         "9**9**9",
-        "((2**64)**64)**64",
         "Pow(Pow(Integer(2), Integer(64)), Integer(64))",
-        "LShift(Integer(1), Symbol('s0'))",
         "1" * 50,
         "-" * 30_000 + "1",
-        "-" * 15_000 + "1",
         "(" * 300 + "1" + ")" * 300,
-        "f'{s0}'",
-        "'text'",
         "s0; s1",
-        "s0 := 1",
-        "",
-        "E",
         "x" * 5000,
         "Max(" + ", ".join(f"s{i}" for i in range(100)) + ")",
     ],
@@ -411,16 +365,6 @@ class NeverEndsLoading(Scripted):
         self.weight, self.path, self.note, self.training = state[0], "", "", state[1]  # type: ignore
 
 
-class Restores(Scripted):
-    @torch.jit.export
-    def __getstate__(self) -> tuple[Tensor, bool]:
-        return (self.weight, self.training)
-
-    @torch.jit.export
-    def __setstate__(self, state: tuple[Tensor, bool]) -> None:
-        self.weight, self.path, self.note, self.training = state[0], "", "", state[1]  # type: ignore
-
-
 class SumsForYears(nn.Module):
     """Without a loop: a tensor of one number, as large as can be."""
 
@@ -431,12 +375,6 @@ class SumsForYears(nn.Module):
 @pytest.fixture(scope="module")
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scripted(Scripted(), tmp_path_factory.mktemp("models") / "net.pt")
-
-
-def test_plain_torchscript_answers_as_before(script: Path, tmp_path: Path) -> None:
-    images = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
-    expected = Scripted()(images.permute(0, 3, 1, 2))
-    torch.testing.assert_close(load_model(script, input_size=8)(images), expected)
 
 
 @pytest.mark.parametrize("kind", [Saves, MapsAFile, SavesWhileLoading, Prints])
@@ -483,13 +421,6 @@ def test_a_model_without_an_end_ends_with_one_sentence(
     said = [line for line in done.stderr.splitlines() if line.startswith("advsearch: error")]
     assert done.returncode == 2 and len(said) == 1, done.stderr
     assert "no answer within 1 seconds; if you trust it, ADVSEARCH_LIMITS=10 in the environment" in said[0]
-
-
-@pytest.mark.medium
-def test_torchscript_that_runs_a_part_of_itself_while_it_loads_is_loaded(tmp_path: Path) -> None:
-    images = torch.rand((1, 8, 8, 3), generator=torch.Generator().manual_seed(0))
-    expected = Scripted()(images.permute(0, 3, 1, 2))
-    torch.testing.assert_close(load_model(scripted(Restores(), tmp_path / "net.pt"), input_size=8)(images), expected)
 
 
 @pytest.mark.parametrize("text", ["getattr(torch, '\\163ave')", "x = '\\033[2J'", "torch.classes.other.X()"])

@@ -10,10 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from advsearch.config import SceneConfig
-from advsearch.errors import InputError, ModelError
+from advsearch.errors import InputError
 from advsearch.models import ModelWarning, load_model
-from advsearch.models.model import list_tensors
 from advsearch.tasks.detection import Detection
 from fuzz import onnx_files
 
@@ -31,14 +29,6 @@ class Sized(nn.Module):
         part = torch.tensor([0.0, 0.0, 0.5, 1.0])
         boxes = torch.cat([orig_target_sizes, orig_target_sizes], dim=1)[:, None] * part
         return torch.zeros_like(scores).long(), boxes, scores
-
-
-class Masked(nn.Module):
-    """A detector whose second input is no size."""
-
-    def forward(self, images: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        labels, boxes, scores = Sized()(images, mask)
-        return labels, boxes, scores
 
 
 def example() -> tuple[Tensor, Tensor]:
@@ -112,15 +102,6 @@ def test_a_detector_gets_the_width_and_the_height_of_its_pictures(tmp_path: Path
     assert model.differentiable == (form != "onnx")
 
 
-def test_another_second_input_is_refused_by_its_name(tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime", minversion="1.24")
-    message = "expected one input.* second input 'scale_factor' is not known: .* named 'orig_target_sizes'"
-    with pytest.raises(ModelError, match=message):
-        load_model(sized_onnx(tmp_path, "scale_factor"), task=Detection())
-    with pytest.raises(ModelError, match=r"wants images and mask beside|wants mask beside|takes more than pictures"):
-        load_model(Masked(), input_size=(HEIGHT, WIDTH), task=Detection())
-
-
 class Bright(nn.Module):
     """A classifier by the brightness of pictures from 0 to 255, (N, H, W, 3) in uint8 or (N, 3, H, W) in float32."""
 
@@ -162,10 +143,8 @@ def test_a_network_of_whole_numbers_gets_these(tmp_path: Path, form: str) -> Non
     # 0.5 is 127.5, which rounds to 128
     torch.testing.assert_close(model(GREY), torch.tensor([[-0.5, 0.5]]))
     assert model.preprocessing.layout == "NHWC" and not model.differentiable
-    with pytest.raises(InputError, match=r"value_range: .* takes whole numbers from 0 to 255"):
+    with pytest.raises(InputError, match="value_range"):
         load_model(path, value_range=(0.0, 1.0))
-    with pytest.raises(InputError, match=r"mean: .* takes whole numbers from 0 to 255"):
-        load_model(path, mean="imagenet")
 
 
 def test_a_network_of_colors_up_to_255_is_told() -> None:
@@ -173,53 +152,3 @@ def test_a_network_of_colors_up_to_255_is_told() -> None:
         load_model(Bright(), input_size=8)
     model = load_model(Bright(), input_size=8, value_range="0,255")  # and no warning
     torch.testing.assert_close(model(torch.ones(1, 8, 8, 3)), torch.tensor([[-127.5, 127.5]]))
-
-
-def test_the_range_is_a_setting_of_every_command() -> None:
-    class Looked(SceneConfig):
-        command = "looked"
-
-    assert Looked(object="mug", value_range="0,255").value_range == (0.0, 255.0)
-    assert Looked(object="mug", value_range=[-1, 1]).value_range == (-1.0, 1.0)
-    for wrong in ("255,0", "255", "0,1,2", "black,white"):
-        with pytest.raises(InputError, match="value_range: expected LOW,HIGH with LOW below HIGH"):
-            Looked(object="mug", value_range=wrong)
-
-
-class OneToOne(nn.Module):
-    """A detector whose only head is fed with what is detached, as those of YOLOv10 and YOLO26 are."""
-
-    def __init__(self, function: str) -> None:
-        super().__init__()
-        self.function = function
-        torch.manual_seed(0)
-        self.body = nn.Conv2d(3, 6, 8, 8)
-        nn.init.normal_(self.body.weight, std=0.1)
-
-    def forward(self, images: Tensor) -> Tensor:
-        features = self.body(images)
-        if self.function == "detach":
-            features = features.detach()
-        elif self.function == "detach_":
-            features.detach_()
-        elif self.function == "torch.detach":
-            features = torch.detach(features)
-        rows = features.sigmoid().flatten(2).mT
-        corner = 10.0 * rows[..., :2]
-        return torch.cat([corner, corner + 1.0 + 10.0 * rows[..., 2:4], rows[..., 4:5], 0.0 * rows[..., 5:]], -1)
-
-
-@pytest.mark.parametrize("function", ["detach", "detach_", "torch.detach"])
-def test_a_head_without_gradient_gets_that_of_its_outputs(function: str) -> None:
-    picture = torch.rand((1, 32, 32, 3), generator=torch.Generator().manual_seed(1))
-    slopes = []
-    for one in (function, ""):
-        leaf = picture.clone().requires_grad_()
-        model = load_model(OneToOne(one), input_size=32, labels=["mug"], task=Detection())
-        assert model.differentiable and model.attached == bool(one)
-        total = sum(tensor.sum() for tensor in list_tensors(model(leaf)) if tensor.requires_grad)
-        assert isinstance(total, Tensor)
-        (slope,) = torch.autograd.grad(total, leaf)
-        slopes.append(slope)
-    assert bool(slopes[0].any())
-    torch.testing.assert_close(slopes[0], slopes[1])

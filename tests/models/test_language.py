@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,15 +13,9 @@ import torch
 from torch import Tensor
 
 import advsearch
-from advsearch.cli.main import main
-from advsearch.errors import AdvsearchError, InputError, ModelError
-from advsearch.models import Model, ModelWarning, load_model
-from advsearch.models.zoo import language
+from advsearch.errors import ModelError
+from advsearch.models import Model, load_model
 from advsearch.models.zoo import transformers as own
-from advsearch.runs.files import read_png
-from advsearch.runs.store import Store
-from advsearch.tasks.answers import FreeAnswer
-from small_models import SMALL_ATTACK
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -207,77 +200,6 @@ def test_a_prompt_that_is_read_both_ways_does_not_see_the_name(tmp_path: Path) -
         assert float(shown(model)[0, number]) == pytest.approx(asked, abs=1e-4)
 
 
-@pytest.mark.skipif(TORCHVISION, reason="torchvision is there")
-def test_torchvision_is_asked_for_where_it_lacks(tmp_path: Path) -> None:
-    loud(transformers.Qwen2_5_VLForConditionalGeneration(qwen_config())).save_pretrained(tmp_path)
-    transformers.Qwen2VLImageProcessor().save_pretrained(tmp_path)
-    tokenizer().save_pretrained(tmp_path)
-    with pytest.raises(ModelError, match=r"of such networks need torchvision .*pip install 'advsearch\[torchvision"):
-        load_model(f"hf:{tmp_path}", labels=NAMES)
-
-
-def test_weights_stay_as_they_are_stored(tmp_path: Path) -> None:
-    model = load_model(published(tmp_path, llava(), torch.bfloat16), labels=NAMES, prompt=QUESTION)
-    assert model.dtype == torch.bfloat16
-    asked = theirs(tmp_path, levels(model))
-    assert float((shown(model)[0] - asked).abs().max()) < 0.05 * float(asked.abs().max())
-
-
-def test_what_a_large_network_takes_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = published(tmp_path, llava())
-    monkeypatch.setattr(language, "MIN_LARGE_WEIGHTS", 1000)
-    with pytest.warns(ModelWarning, match=r"has 1\.\d+e-05 billion weights, 4\.\d+e-05 GB, and took \S+ s to answer"):
-        load_model(spec, labels=NAMES)
-
-
-def test_without_a_prompt_it_is_asked_what_this_is(tmp_path: Path) -> None:
-    model = load_model(published(tmp_path, llava()), labels=NAMES)
-    asked = theirs(tmp_path, levels(model), "What is this? Answer with its name only.")
-    assert float((shown(model)[0] - asked).abs().max()) < 1e-4
-
-
-def test_a_network_from_python_brings_its_processor(tmp_path: Path) -> None:
-    published(tmp_path, llava())
-    network = transformers.LlavaForConditionalGeneration.from_pretrained(tmp_path)
-    model = load_model(network, labels=NAMES, prompt=QUESTION)
-    assert float((shown(model)[0] - theirs(tmp_path, levels(model))).abs().max()) < 1e-4
-
-
-def test_a_name_that_begins_another_is_said(tmp_path: Path) -> None:
-    spec = published(tmp_path, llava())
-    with pytest.warns(ModelWarning, match=r"reads 'tea' \(#0\) as the beginning of 'tea cup' \(#2\)"):
-        load_model(spec, labels=["tea", "mug", "tea cup"])
-
-
-WRONG: dict[str, tuple[dict[str, Any], type[AdvsearchError], str]] = {
-    "no names": ({}, InputError, "labels: expected two names at least, .* got none; with `task=answer` it"),
-    "one name": ({"labels": ["mug"]}, InputError, "labels: expected two names at least, .* got 'mug'"),
-    "another task": ({"task": "depth"}, ModelError, "cannot do task depth; use `task=classification` or `task=answer`"),
-    "names of an answer": ({"labels": NAMES, "task": "answer"}, InputError, "task answer has no classes; leave them"),
-    "two questions": ({"labels": NAMES, "prompt": "a | b"}, InputError, "prompt: expected one question .* got 2"),
-    "too long": ({"labels": NAMES, "prompt": "the " * 64}, InputError, "to have at most 64 tokens for model .* got 7"),
-}
-
-
-@pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_uses_are_refused(tmp_path: Path, wrong: str) -> None:
-    given, error, text = WRONG[wrong]
-    with pytest.raises(error, match=text):
-        advsearch.load_model(published(tmp_path, llava()), **given)
-
-
-def test_captioners_are_refused(tmp_path: Path) -> None:
-    reads = {"vocab_size": 48, "max_position_embeddings": 32, "encoder_hidden_size": 16, **SIZES}
-    seen = {"image_size": 16, "patch_size": 8, **SIZES}
-    network = transformers.BlipForConditionalGeneration(
-        transformers.BlipConfig(vision_config=seen, text_config={**reads, "bos_token_id": 2, "sep_token_id": 3})
-    )
-    prepared = transformers.BlipImageProcessor(size={"height": 16, "width": 16})
-    spec = published(tmp_path, (network, transformers.BlipProcessor(prepared, tokenizer())))
-    with pytest.raises(ModelError, match=r"BlipForConditionalGeneration, which .* keeps no keys and values of what it"):
-        load_model(spec, labels=NAMES)
-
-
 def test_weights_larger_than_the_memory_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = published(tmp_path / "net", llava())
     told = tmp_path / "meminfo"
@@ -285,23 +207,6 @@ def test_weights_larger_than_the_memory_are_refused(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(own, "MEMORY_FILE", told)
     with pytest.raises(ModelError, match=r"its weights take 5.*e-05 GB, and 1.23e-05 GB of memory are free"):
         load_model(spec, labels=NAMES)
-
-
-@pytest.mark.medium
-def test_it_is_attacked_by_name(tmp_path: Path) -> None:
-    result = advsearch.attack(
-        "mug",
-        published(tmp_path / "llava", llava()),
-        labels=list(NAMES),
-        prompt=QUESTION,
-        label=",".join(NAMES[:4]),
-        policy="pgd",
-        **SMALL_ATTACK,
-        run=tmp_path / "run",
-    )
-    rows = list(result.rows("verification"))
-    assert len(rows) == 6 and all(row.label in NAMES for row in rows)
-    assert f"prompt: {QUESTION}" in (tmp_path / "run" / "run.yaml").read_text()
 
 
 def spoken(folder: Path, picture: Any, count: int) -> str:
@@ -328,43 +233,3 @@ def test_a_free_answer_is_the_librarys(tmp_path: Path, family: str) -> None:
     (said,) = model(torch.from_numpy(levels(model)).float() / 255.0)
     assert said["text"] == spoken(tmp_path, levels(model), 6) != ""
     assert said["logits"].shape[1:] == (READS["vocab_size"],) and said["begins"]("mug") == [KNOWN["mug"]]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(("word", "right"), [("coffee", False), ("tea", True)])
-def test_the_margin_of_a_free_answer_has_the_gradient_of_differences(tmp_path: Path, word: str, right: bool) -> None:
-    model = advsearch.load_model(published(tmp_path, llava()), task="answer", prompt=QUESTION)
-    image = torch.linspace(0.3, 0.7, 16 * 16 * 3).reshape(16, 16, 3).requires_grad_()
-    task = FreeAnswer()
-    margin = task.loss(model(image), (word,))
-    assert (float(margin.detach()) <= 0.0) is right
-    (gradient,) = torch.autograd.grad(margin.sum(), image)
-    way = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
-    with torch.no_grad():
-        ends = [model(image + size * way) for size in (5e-4, -5e-4)]
-    assert ends[0][0]["text"] == ends[1][0]["text"], "the margin jumps where another text is said"
-    seen = float(task.loss(ends[0], (word,)) - task.loss(ends[1], (word,))) / 1e-3
-    assert seen == pytest.approx(float((gradient * way).sum()), rel=0.02)
-
-
-@pytest.mark.medium
-def test_its_free_answer_is_attacked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    spec, run = published(tmp_path / "llava", llava()), tmp_path / "run"
-    asked = ["--task", "answer={tokens: 3}", "--prompt", QUESTION, "--label", ",".join(WORDS[:-1])]
-    few = ["--control", "light", "--policy", "random", "--steps", "2", "--trials", "6", "--resolution", "16"]
-    quick = ["--spp", "2", "--verify-spp", "2", "--denoise", "none", "--measure", "no"]
-    assert main(["attack", "--object", "mug", "--model", spec, *asked, *few, *quick, "--run", str(run)]) < 2
-    with Store(run / "results.sqlite", read_only=True) as store:
-        rows = list(store.rows("verification"))
-    assert len(rows) == 6
-    kept = [read_png(run / "images" / f"verification-{number:02d}.png") for number in range(4)]
-    told = [spoken(tmp_path / "llava", np.rint(one * 255).astype(np.uint8), 3) for one in kept]
-    assert [row.label for row in rows[:4]] == [text or "(nothing)" for text in told] and any(told)
-
-
-@pytest.mark.medium
-def test_an_answer_that_goes_on_otherwise_is_no_masked_gradient(tmp_path: Path) -> None:
-    """After a small step it may say another word, and then all logits after it are others."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", ModelWarning)
-        assert advsearch.load_model(published(tmp_path, llava()), task="answer").differentiable

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torch import nn
 
 from advsearch import load_model
-from advsearch.models import ModelWarning
 from advsearch.tasks.segmentation import Segmentation, SegmentationTruth
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
@@ -130,11 +128,3 @@ def test_the_gradient_agrees_with_differences(tmp_path: Path) -> None:
     with torch.no_grad():
         seen = float(value(at + 1e-3 * way) - value(at - 1e-3 * way)) / 2e-3
     assert seen == pytest.approx(float((slope * way).sum()), rel=1e-2)
-
-
-@ROUNDED
-def test_what_the_scores_are_is_said(tmp_path: Path) -> None:
-    spec = published(tmp_path, "Eomt")
-    with pytest.warns(ModelWarning, match="a score of each class, summed over its masks, which is no logit"):
-        model = load_model(spec, task="segmentation")
-    assert isinstance(model.module, nn.Module) and model.differentiable

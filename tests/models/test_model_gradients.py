@@ -52,46 +52,6 @@ def test_batch_norm_before_a_transformer_has_its_gradient(kind: str, tmp_path: P
     assert _told(model) == pytest.approx(_seen(model), rel=0.01)
 
 
-class Cut(nn.Module):
-    """A gate on scores that is detached, as queries are, or only looked at."""
-
-    def __init__(self, how: str) -> None:
-        super().__init__()
-        torch.manual_seed(0)
-        self.scores, self.gate, self.how = nn.Linear(3 * SIDE * SIDE, 4), nn.Linear(3 * SIDE * SIDE, 4), how
-
-    def forward(self, images: Tensor) -> Tensor:
-        pixels = images.flatten(1)
-        if self.how == "rounded":
-            pixels = pixels + (torch.round(pixels * 4000.0) / 4000.0 - pixels).detach()
-        gate = torch.tanh(self.gate(pixels))
-        detached = gate.detach()
-        if self.how == "numpy":
-            cut: Tensor = self.scores(pixels) * 1e-3 + torch.from_numpy(detached.numpy().copy())
-            return cut
-        if self.how in ("unused", "rounded"):
-            detached = gate
-        scores: Tensor = self.scores(pixels) * detached
-        return scores
-
-
-@pytest.mark.parametrize(("how", "attached"), [("queries", True), ("unused", False), ("rounded", False)])
-def test_what_a_network_detaches_is_put_back_where_differences_say_so(how: str, attached: bool) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", ModelWarning)
-        model = load_model(Cut(how), input_size=SIDE)
-    assert model.attached is attached
-    assert _told(model) == pytest.approx(_seen(model), rel=0.3 if how == "rounded" else 0.05)
-
-
-def test_what_must_be_detached_is_left_so() -> None:
-    """Its gradient is that of the network as it is: numpy takes nothing that has one."""
-    with pytest.warns(ModelWarning, match="It detaches a part of what it computes"):
-        model = load_model(Cut("numpy"), input_size=SIDE)
-    assert model.differentiable and not model.attached
-    assert _told(model) != pytest.approx(_seen(model), rel=0.05)
-
-
 @pytest.mark.medium
 def test_rt_detr_has_its_gradient() -> None:
     """It chooses queries by the scores of its encoder, which come from a batch norm and a transformer, and detaches

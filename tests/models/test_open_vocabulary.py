@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch import load_model
-from advsearch.errors import AdvsearchError, InputError, ModelError
-from advsearch.models import Model, ModelWarning
+from advsearch.models import Model
 from advsearch.tasks import Detection
 from small_models import SMALL_ATTACK
 
@@ -145,38 +144,6 @@ def test_a_grounded_one_says_what_its_library_says(tmp_path: Path, family: str) 
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("family", OWLS)
-def test_prompts_are_averaged(tmp_path: Path, family: str) -> None:
-    spec, prompts = published(tmp_path, family), ["a photo of a {}", "this is the {}"]
-    network = transformers.AutoModelForZeroShotObjectDetection.from_pretrained(tmp_path).eval()
-    picture, image = picture_of(SIDES[family], tmp_path)
-    rows = []
-    for prompt in prompts:
-        _, (_, answer) = theirs(tmp_path, picture, [prompt.format(name) for name in NAMES])
-        rows.append(answer.text_embeds[0])
-    mean = nn.functional.normalize(torch.stack(rows).mean(dim=0), dim=-1)
-    features = answer.image_embeds.flatten(1, 2)
-    with torch.no_grad():
-        asked = network.class_predictor(features, mean[None], None)[0].sigmoid()[0]
-    for given in (prompts, " | ".join(prompts)):
-        _, scores = both(load_model(spec, labels=NAMES, prompt=given, task="detection"), image)
-        assert float((scores - asked).abs().max()) < 1e-4
-    _, alone = both(load_model(spec, labels=NAMES, task="detection"), image)
-    assert float((alone - asked).abs().max()) > 1e-3, "one prompt says something else"
-
-
-@pytest.mark.medium
-def test_a_prompt_goes_round_each_name_of_one_text(tmp_path: Path) -> None:
-    spec = published(tmp_path, "GroundingDino")
-    picture, image = picture_of(SIDES["GroundingDino"], tmp_path)
-    _, scores = both(load_model(spec, labels=NAMES[:2], prompt="the {}", task="detection"), image)
-    _, (given, answer) = theirs(tmp_path, picture, ["the mug", "the coffee cup"])
-    each = answer.logits[0].sigmoid()
-    assert len(given["input_ids"][0]) == 9
-    assert float((scores - torch.stack([each[:, 1:3].amax(1), each[:, 4:7].amax(1)], dim=1)).abs().max()) < 1e-4
-
-
-@pytest.mark.medium
 @pytest.mark.parametrize("family", [*OWLS, *GROUNDED])
 def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> None:
     """Of scores and boxes; Grounding DINO is kept from cutting its queries off from the picture."""
@@ -198,56 +165,6 @@ def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> Non
     assert float(seen) == pytest.approx(float((gradient * way).sum()), rel=0.01)
 
 
-def test_a_network_from_python_brings_its_tokenizer(tmp_path: Path) -> None:
-    published(tmp_path, "Owlv2")
-    network = transformers.Owlv2ForObjectDetection.from_pretrained(tmp_path).train()
-    _, image = picture_of(16, tmp_path)
-    ours = both(load_model(network, labels=["mug"], task="detection"), image)
-    theirs = both(load_model(f"hf:{tmp_path}", labels=["mug"], task="detection"), image)
-    assert float((ours[1] - theirs[1]).abs().max()) < 1e-5 and ours[1].shape == (16, 1)
-    assert network.owlv2.text_model is not None and network.training, "the caller's network is left as it is"
-
-
-DETECTS: dict[str, Any] = {"labels": NAMES, "task": "detection"}
-WRONG: dict[str, tuple[str, dict[str, Any], type[AdvsearchError], str]] = {
-    "no names": ("Owlv2", {"task": "detection"}, InputError, "finds what it is told to and has no classes of its own"),
-    "a classifier": ("Owlv2", {}, ModelError, "cannot do task classification; use `task=detection`"),
-    "a segmenter": (
-        "OwlViT",
-        {"labels": NAMES, "task": "segmentation"},
-        ModelError,
-        "finds what it is told to and cannot do task segmentation; use `task=detection`",
-    ),
-    "no place": ("Owlv2", {**DETECTS, "prompt": "a photo"}, InputError, "prompt: expected a text with {} where the"),
-    "too long": ("OwlViT", {**DETECTS, "prompt": "a {}" + " a" * 14}, InputError, "at most 16 tokens, got 18: 'a mug"),
-    "several prompts": (
-        "GroundingDino",
-        {**DETECTS, "prompt": "a {} | the {}"},
-        InputError,
-        "reads all names in one text, in which several prompts can't be averaged; give one, or none",
-    ),
-    "full stops": (
-        "GroundingDino",
-        {**DETECTS, "labels": ["mug", "cup. bowl"]},
-        InputError,
-        "in which these 2 are 3; leave . and [?] out of names and prompt",
-    ),
-    "too many": (
-        "MMGroundingDino",
-        {**DETECTS, "labels": [f"bowl {'the ' * number}" for number in range(1, 7)]},
-        InputError,
-        "reads a text of at most 24 tokens, and the names take 35; give fewer",
-    ),
-}
-
-
-@pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_uses_are_refused(tmp_path: Path, wrong: str) -> None:
-    family, given, error, text = WRONG[wrong]
-    with pytest.raises(error, match=text):
-        load_model(published(tmp_path, family), **given)
-
-
 def test_what_its_boxes_are_is_known(tmp_path: Path) -> None:
     """They are not guessed from what they look like: here they are smaller than a pixel, and wrong."""
     model = load_model(published(tmp_path, "Owlv2"), labels=NAMES, task="detection")
@@ -255,11 +172,6 @@ def test_what_its_boxes_are_is_known(tmp_path: Path) -> None:
     tiny: Any = [{"boxes": torch.tensor([[0.2, 0.2, 0.4, 0.9]]), "scores": torch.tensor([[0.9, 0.1, 0.1]])}]
     assert not task.calibrates and task.after_calibration(tiny, None).inferred_unit == "pixels"
     assert Detection(boxes="xywh").on(model).calibrates, "what is said counts, and is compared"
-
-
-def test_names_that_are_the_same_text_are_said(tmp_path: Path) -> None:
-    with pytest.warns(ModelWarning, match=r"reads 'mug' \(#0\) and 'Mug' \(#1\) as the same text"):
-        load_model(published(tmp_path, "Owlv2"), labels=["mug", "Mug"], task="detection")
 
 
 @pytest.mark.medium

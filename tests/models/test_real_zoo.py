@@ -101,19 +101,6 @@ def test_a_detector_finds_what_it_finds_by_itself(torchvision: Any, tmp_path: Pa
     assert float((ours["boxes"] - theirs["boxes"]).abs().max()) < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("r3d_18", "is made for videos"),
-        ("raft_small", "compares two pictures of a video"),
-        ("quantized_resnet18", "is quantised: .* name torchvision:resnet18, which it was made of"),
-    ],
-)
-def test_what_is_beside_is_named(torchvision: Any, name: str, text: str) -> None:
-    with pytest.raises(ModelError, match=f"model torchvision:{name}: {text}"):
-        load_model(f"torchvision:{name}")
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # timm
 
@@ -138,63 +125,5 @@ def test_a_network_of_timm_is_fed_as_timm_says(timm: Any, tmp_path: Path) -> Non
         load_model(timm.create_model("test_vit", num_classes=0))
 
 
-NAMES = ["mug", "bowl", "vase"]
-
-
-def test_a_repository_of_timm_goes_to_timm(timm: Any, tmp_path: Path) -> None:
-    pytest.importorskip("transformers")
-    network = stirred(timm.create_model("test_vit", num_classes=3))
-    timm.models.save_for_hf(network, tmp_path, model_config={"label_names": NAMES}, safe_serialization=True)
-    model = load_model(f"hf:{tmp_path}")
-    assert model.labels == tuple(NAMES)
-    assert_same(model(PICTURE), theirs(timm, network))
-
-
-def test_a_network_of_timm_inside_one_of_transformers(timm: Any, tmp_path: Path) -> None:
-    transformers = pytest.importorskip("transformers")
-    told = timm.create_model("test_vit").pretrained_cfg | {"mean": (0.1,) * 3, "std": (0.3,) * 3}
-    config = transformers.TimmWrapperConfig(
-        architecture="test_vit", num_labels=3, pretrained_cfg=told, id2label=dict(enumerate(NAMES))
-    )
-    network = transformers.TimmWrapperForImageClassification(config)
-    stirred(network).save_pretrained(tmp_path)
-    normal = ((PICTURE - 0.1) / 0.3).permute(2, 0, 1)[None]
-    for model in (load_model(network), load_model(f"hf:{tmp_path}")):
-        assert model.labels == tuple(NAMES) and model.input_size == (160, 160)
-        with torch.no_grad():
-            assert_same(model(PICTURE), network(pixel_values=normal).logits)
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # processors of transformers that work with torchvision
-
-
-def test_a_processor_of_torchvision_is_called(
-    torchvision: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    transformers = pytest.importorskip("transformers")
-
-    class Bends(transformers.ViTImageProcessor):  # type: ignore[misc,name-defined]
-        """Resizes and rescales as others do, and bends values and mixes channels where these are normalised."""
-
-        def rescale_and_normalize(self, images: Tensor, *settings: Any, **more: Any) -> Tensor:
-            done = super().rescale_and_normalize(images, *settings, **more)
-            return torch.tanh(done + 0.3 * done.flip(1))
-
-    prepared = Bends(size={"height": 16, "width": 16}, image_mean=[0.5] * 3, image_std=[0.25] * 3)
-    config = transformers.ViTConfig(
-        hidden_size=8, num_hidden_layers=1, num_attention_heads=2, intermediate_size=8, image_size=16, patch_size=8,
-        id2label=dict(enumerate(NAMES)),
-    )  # fmt: skip
-    network = stirred(transformers.ViTForImageClassification(config))
-    network.save_pretrained(tmp_path)
-    prepared.save_pretrained(tmp_path)
-    monkeypatch.setattr(transformers.AutoImageProcessor, "from_pretrained", lambda *_, **__: prepared)
-    model = load_model(f"hf:{tmp_path}")
-    assert model.preprocessing.processor is not None and model.input_size == (16, 16)
-    small = LEVELS[:16, :16]
-    library = transformers.pipeline("image-classification", model=network, image_processor=prepared)
-    scores = {one["label"]: one["score"] for one in library(Image.fromarray(small))}
-    ours = dict(zip(NAMES, model(torch.from_numpy(small) / 255.0)[0].softmax(dim=0).tolist(), strict=True))
-    assert ours == pytest.approx(scores, abs=1e-4)
-    assert_gradient(model)

@@ -82,16 +82,6 @@ def test_a_network_that_switches_gradients_off_as_it_runs_does_so_for_itself() -
     assert torch.is_grad_enabled() and model.differentiable
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
-def test_networks_in_other_types_are_warned_of_by_nothing(dtype: torch.dtype) -> None:
-    net = nn.Sequential(nn.Conv2d(3, 8, 5, 4), nn.ReLU(), nn.AdaptiveAvgPool2d(2), nn.Flatten(), nn.Linear(32, 4))
-    with torch.no_grad():
-        for one in net.parameters():
-            one.copy_(torch.linspace(-1.0, 1.0, one.numel()).sin().reshape(one.shape))
-    model = load_model(net.to(dtype), input_size=32)
-    assert model.dtype == dtype and model.differentiable and model(torch.zeros(2, 32, 32, 3)).dtype == torch.float32
-
-
 @pytest.mark.medium
 def test_a_scene_is_rendered_and_searched_whatever_is_turned() -> None:
     TURNED["all"].apply()

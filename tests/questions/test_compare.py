@@ -1,4 +1,4 @@
-"""`compare` on stored sweeps, without a renderer, and once from the command line to the pictures."""
+"""`compare` on stored sweeps, without a renderer."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
 from advsearch.experiment import RunContext
 from advsearch.options import Value
-from advsearch.questions.compare import CompareConfig
 from advsearch.questions.compare.result import ComparedPair, CompareResult
-from advsearch.questions.report.evidence import collect_claims
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
@@ -46,11 +44,6 @@ def good(elevation: float, luck: float) -> bool:
 def low(elevation: float, luck: float) -> bool:
     """The same, but for pictures from high above."""
     return luck < 0.9 and elevation < 65.0
-
-
-def bad(elevation: float, luck: float) -> bool:
-    """Right where the good one is wrong, and in few others."""
-    return luck > 0.8
 
 
 def stored(
@@ -132,16 +125,6 @@ def test_one_sweep_of_two_models_is_counted_pair_by_pair(tmp_path: Path) -> None
     assert [part.first_only for part in pair.parts] == [0, 0, 0, lost]
     kept = read_result(tmp_path / "compared")
     assert isinstance(kept, CompareResult) and kept.pairs == result.pairs
-    (claim,) = collect_claims(kept)
-    assert claim.kind == "measured" and f"{lost} and low alone in 0" in claim.statement
-
-
-def test_of_more_than_two_each_is_compared_with_the_first(tmp_path: Path) -> None:
-    result, first = compared(stored(tmp_path / "three", {"good": good, "low": low, "bad": bad}))
-    assert [(pair.first, pair.second) for pair in result.pairs] == [("good", "low"), ("good", "bad")]
-    second = result.pairs[1]
-    assert second.second_only > 0 and second.first_only > second.second_only and second.neither == 0
-    assert sum(part.pairs for part in second.parts) == PICTURES and first.right[0] == second.right[0]
 
 
 @pytest.mark.parametrize(
@@ -177,28 +160,6 @@ def test_a_sweep_with_an_adversarial_scene_is_compared_without_it_and_beside_oth
     assert [pair.first_only > 0 for pair in result.pairs] == [True, True] and result.pairs[0].second_only == 0
 
 
-@pytest.mark.medium
-def test_pictures_that_sweeps_kept_are_shown_and_nothing_is_rendered(tmp_path: Path) -> None:
-    two = [stored(tmp_path / name, {"net": net}, keep=True, object=name) for name, net in (("mug", good), ("cup", bad))]
-    result, pair = compared(*two, pictures=2)
-    assert [one.right for one in pair.shown] == ["mug", "mug", "cup", "cup"] and result.renders == 0
-    assert all(len(one.pictures) == 2 for one in pair.shown)
-    for one in pair.shown:
-        assert one.answers == (("mug", "bowl") if one.right == "mug" else ("bowl", "mug"))
-        kept = [(tmp_path / "compared" / name).read_bytes() for name in one.pictures]
-        assert kept == [thumbnails.thumbnail_path(run, one.number).read_bytes() for run in two]
-    page = (tmp_path / "compared" / "report.html").read_text("utf-8")
-    assert page.count("<img") == 8 and "mug: mug (right)" in page and "<script" not in page.split("<main")[1]
-
-
-def test_what_cannot_be_shown_is_said(tmp_path: Path) -> None:
-    result, pair = compared(stored(tmp_path / "both", {"no_such.pt2": good, "low": low}), pictures=1)
-    assert [one.pictures for one in pair.shown] == [[]] and "Pictures of both are not shown" in " ".join(
-        result.warnings
-    )
-    assert "no_such.pt2: mug (right); low: bowl" in (tmp_path / "compared" / "report.html").read_text("utf-8")
-
-
 # ---- what it refuses ------------------------------------------------------------------------------------------------
 
 
@@ -221,31 +182,6 @@ def test_sweeps_that_are_no_pairs_are_refused(tmp_path: Path) -> None:
         with pytest.raises(error, match=said):
             advsearch.compare(runs, run=tmp_path / "no")
         assert not (tmp_path / "no").exists()
-    with pytest.raises(InputError, match=r"unknown run 'none'"):
-        advsearch.compare(["none"])
-
-
-def test_sweeps_with_other_numbers_of_pictures_or_other_values_are_refused(tmp_path: Path) -> None:
-    one = stored(tmp_path / "one", {"net": good}, samples=9, pictures=9)
-    with pytest.raises(InputError, match="as many pictures, got 9 and 10 in"):
-        compared(one, stored(tmp_path / "two", {"net": low}, samples=9, pictures=10))
-    other = stored(tmp_path / "three", {"net": low}, samples=9, pictures=9, lowest=6.0)
-    with pytest.raises(InputError, match="with other values of"):
-        compared(one, other)
-
-
-@pytest.mark.parametrize(
-    ("asked", "said"),
-    [
-        ({"compared": "a", "object": "mug"}, "compared: expected at least two models, got a"),
-        ({"compared": "a,b", "samples": 3}, "samples: says how models are shown pictures, and no `object` is named"),
-        ({"compared": "a,b", "controls": "pose"}, "controls: says how models"),
-        ({"compared": "a,a"}, "compared: a is given twice"),
-    ],
-)
-def test_settings_that_say_nothing_are_refused(asked: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        CompareConfig(**asked)
 
 
 # ---- the numbers ----------------------------------------------------------------------------------------------------
@@ -274,27 +210,6 @@ def test_p_value_and_interval_err_no_more_often_than_they_say(shares: Sequence[f
 # ---- as it is typed -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.medium
-def test_models_are_shown_the_same_pictures_from_the_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = ["compare", "small_models:easy", "small_models:hard", "--object", "mug", "--control", "camera"]
-    line += ["--samples", "12", "--resolution", "16", "--spp", "2", "--denoise", "none", "--keep-pictures", "none"]
-    assert main([*line, "--run", str(tmp_path / "run"), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    (pair,) = said["pairs"]
-    swept = read_result(tmp_path / "run" / "parts" / "sweep")
-    assert [side["configurations"] for side in said["sides"]] == [12, 12]
-    assert sum(side["correct"] for side in said["sides"]) == swept.correct  # type: ignore[attr-defined]
-    assert pair["first_only"] + pair["second_only"] > 0 and pair["worse"] is None
-    assert said["renders"] == 12 + len(pair["shown"]) and pair["shown"]  # none was kept
-    for one in pair["shown"]:
-        assert all((tmp_path / "run" / name).is_file() for name in one["pictures"]) and len(one["pictures"]) == 1
-    assert main(["show", str(tmp_path / "run")]) == 0
-    text = capsys.readouterr().out
-    assert "of the same 12 pictures" in text and "Only hard gets right:" in text
-
-
 def test_a_comparison_that_was_stopped_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -314,16 +229,3 @@ def test_a_comparison_that_was_stopped_goes_on(
     assert main(["resume", str(tmp_path / "run"), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["ending"] == "done" and said["pairs"][0]["first_only"] > 0 and parts == ["a,b", "a,b"]
-
-
-@pytest.mark.medium
-def test_stored_runs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    one, two = stored(tmp_path / "one", {"net": good}), stored(tmp_path / "two", {"net": low}, object="bowl")
-    assert main(["compare", str(one), str(two), "--pictures", "0", "--run", str(tmp_path / "run")]) == 0
-    text = capsys.readouterr().out
-    assert "mug alone is right in" in text and "Where bowl is worse than mug: camera.elevation over 6" in text
-    assert main(["run", str(tmp_path / "run" / "run.yaml"), "--run", str(tmp_path / "again"), "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)
-    assert again["pairs"][0]["p"] == read_result(tmp_path / "run").pairs[0].p  # type: ignore[attr-defined]
-    assert main(["compare"]) == 2 and "expected the run of a sweep, or models" in capsys.readouterr().err
-    assert main(["compare", str(one), "--samples", "3"]) == 2 and "--object" in capsys.readouterr().err

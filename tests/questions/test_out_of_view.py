@@ -20,7 +20,7 @@ from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_suite
 from advsearch.trust.code import allow_code
-from advsearch.viewer.columns import UNKNOWN, pack_columns, read_columns
+from advsearch.viewer.columns import read_columns
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -49,30 +49,13 @@ def test_they_are_told_and_not_counted(tmp_path: Path) -> None:
     with np.load(tmp_path / "run" / "artifacts" / "surface.npz") as counts:
         assert counts["pictures_0"].tolist() == [2] and counts["failures_0"].tolist() == [2 - found.correct]
     assert found.interval == pytest.approx(clopper_pearson(found.correct, 2))
-    assert any("In 2 of 4 pictures nothing of the object is to be seen" in one for one in found.warnings)
     assert {one.value: one.total for one in count_conditions(found)} == {"0.3": 1, "0.5": 1, "0": 2}
     seen = find_detection_distance(found)
     assert seen is not None and len(seen.right_fractions) == 2
     rows = read_columns(tmp_path / "run")
     hidden = rows["label"] == "out of view"
     assert hidden.sum() == 2 and rows["correct"][hidden].eq(1).all()  # a row says what the task said
-    data = pack_columns(rows)
-    size = int.from_bytes(data[:4], "little")
-    (right,) = (one for one in json.loads(data[4 : 4 + size])["columns"] if one["name"] == "right")
-    begin = 4 + size + right["at"]
-    assert [one == UNKNOWN for one in data[begin : begin + 4]] == hidden.tolist()
     assert read_result(tmp_path / "run") == found
-
-
-@pytest.mark.medium
-def test_pairs_of_a_comparison_are_of_pictures_that_show_it(tmp_path: Path) -> None:
-    for name in ("one", "other"):
-        advsearch.sweep(
-            "mug", small_models.finds_cars(), {"pose.y": [0.0, 60.0]}, task="detection", label="car", spp=1,
-            denoise="none", trials=0, run=tmp_path / name, keep_pictures="none", environment="studio",
-        )  # fmt: skip
-    paired = advsearch.compare(f"{tmp_path / 'one'},{tmp_path / 'other'}", pictures=0, run=tmp_path / "both")
-    assert [side.configurations for side in paired.sides] == [1, 1]
 
 
 DETECTED: dict[str, Any] = {"task": "detection", "label": "car", "verify_spp": 1, "denoise": "none"}

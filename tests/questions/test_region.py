@@ -73,23 +73,3 @@ def test_a_region_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, Region
     assert region.run(config, progress=Stopping(9)).ending == "interrupted"
     result = region.run(config, resumed=tmp_path / "run")
     assert rows(tmp_path / "run") == rows(whole[0]) and result.renders == whole[1].renders
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    ("more", "reason"),
-    [
-        ({"specialise": False}, None),
-        ({"controls": "camera,pose", "vary": "camera.azimuth,pose.yaw"}, None),
-        ({}, "light on surfaces pays from 999 pictures on"),
-    ],
-)
-def test_what_is_rendered_says_why(
-    more: dict[str, Any], reason: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing is said where that was asked for, or where more moves than a camera."""
-    monkeypatch.setattr(predicting, "find_break_even", lambda *_: 999)
-    config = RegionConfig(**{**SMALL, "map": 0, "verify_spp": 2, **more}, run=str(tmp_path / "run"))
-    result = region.run(config)
-    assert "products" not in result.renders
-    assert (result.transport and result.transport.reason) == reason

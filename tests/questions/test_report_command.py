@@ -13,9 +13,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.recipe.result import RecipeConfig
-from advsearch.questions.report.evidence import QUICK
-from advsearch.runs.directory import PARTS, RunDirectory
+from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_png
 from advsearch.runs.summary import VERSIONS_NOTE, compute_file_digests
 from samples import attack, make_run
@@ -94,17 +92,3 @@ def test_a_run_does_not_go_on_with_another_version(tmp_path: Path) -> None:
         run.store.write_note(VERSIONS_NOTE, json.dumps({**first, "torch": "0.1"}))
     with pytest.raises(InputError, match=r"than the run began with: torch \(was 0\.1\); restore it, or start again"):
         RunDirectory.resume(tmp_path / "run", config)
-
-
-@pytest.mark.parametrize("quick", [True, False])
-def test_parts_of_a_quick_recipe_say_that_they_are_no_result(
-    quick: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recipe = tmp_path / "recipe"
-    with RunDirectory.create_for(RecipeConfig(recipe="pose-space", quick=quick, run=str(recipe))):
-        pass
-    make_run(recipe / PARTS / "0-mug", pictures=False, rows=False)
-    assert main(["report", str(recipe), "--evidence", "--out", str(tmp_path / "card"), "--json"]) == 0
-    (part,) = json.loads(capsys.readouterr().out)["runs"]
-    assert (QUICK in part["excluded"]) == quick
-    assert (QUICK in (tmp_path / "card" / "evidence.md").read_text()) == quick

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import fisher_exact
 
-from advsearch.errors import InputError
 from advsearch.questions.explain.clusters import find_clusters
-from advsearch.questions.explain.envelope import find_envelope
+from advsearch.questions.explain.envelope import find_envelope, list_factor_peels
 from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import (
     CountedRule,
@@ -19,7 +16,6 @@ from advsearch.rules import (
     estimate_interval,
     find_covered,
     find_rules,
-    import_library,
     split_in_halves,
 )
 from stored_sweeps import seen
@@ -89,12 +85,6 @@ def test_no_rule_is_told_where_there_is_none(seed: int) -> None:
     assert find_rules(*split_in_halves(planted("none", seed), seed), seed=seed).accepted == []
 
 
-def test_predictions_that_are_all_the_same_have_no_rule() -> None:
-    found = planted("none")
-    same = found.assign(correct=True)
-    assert find_rules(*split_in_halves(same, 0), seed=0).accepted == [] and find_importance(same) == []
-
-
 def around(law: str, seed: int, rows: int = 2000) -> pd.DataFrame:
     """Rows of a model that is wrong in some directions, some of them from afar."""
     generator = np.random.default_rng(seed)
@@ -123,17 +113,6 @@ def test_an_angle_that_goes_round_has_rules_through_0_and_of_both_ends(seed: int
     assert [one.factor for one in far] == ["camera.azimuth", "camera.distance"] and far[0].turn == 180.0
     assert far[1].low == pytest.approx(30, abs=6)
     assert find_rules(*split_in_halves(around("none", seed), seed), seed=seed).accepted == []
-
-
-def test_where_an_arc_holds() -> None:
-    end_on = RuleCondition("yaw", "degrees", 160.0, 20.0, turn=180.0)
-    angles = [0.0, 20.0, 21.0, 90.0, 160.0, 161.0, 180.0, 341.0, 359.0, -10.0, 370.0, 539.0]
-    table = seen({"yaw": angles}, np.ones(len(angles), dtype=bool))
-    assert end_on.holds(table).tolist() == [True, True, False, False, False, True, True, True, True, True, True, True]
-    assert end_on.arcs == ((160.0, 200.0), (340.0, 380.0))
-    front = RuleCondition("yaw", "degrees", 350.0, 10.0, turn=360.0)
-    assert [a for a, holds in zip(angles, front.holds(table), strict=True) if holds] == [0.0, 359.0, 370.0]
-    assert front.arcs == ((350.0, 370.0),) and front.row.turn == 360.0
 
 
 @pytest.mark.medium
@@ -167,20 +146,6 @@ def ruled(right: int, of: int, others: int, rest: int) -> CountedRule:
     right_under, right_beside = np.arange(of) < right, np.arange(rest) < others
     table = pd.DataFrame({"correct": np.concatenate([right_under, right_beside]), "unit": np.arange(of + rest)})
     return CountedRule((), table[:of], table[of:])
-
-
-@pytest.mark.parametrize(
-    ("right", "elsewhere", "rows"), [(0.28, 0.71, 80), (0.4, 0.7, 160), (0.5, 0.7, 320), (0.6, 0.7, 1350)]
-)
-def test_the_rows_that_the_page_names_tell_a_rule(right: float, elsewhere: float, rows: int) -> None:
-    """docs/explain.md, "How many rows it takes": under two fifths of the rows."""
-
-    def counted(rows: int) -> CountedRule:
-        under = round(0.4 * rows / 2)
-        others = rows // 2 - under
-        return ruled(round(right * under), under, round(elsewhere * others), others)
-
-    assert counted(rows).holds and not counted(round(0.6 * rows)).holds
 
 
 def test_what_decides_and_what_does_only_together() -> None:
@@ -232,13 +197,6 @@ def test_the_envelope_leaves_out_what_fails_and_little_else() -> None:
     assert find_envelope(*split_in_halves(planted("red"), 0), accuracy=0.99) is None
 
 
-def test_a_table_is_what_varies_and_all_rows_have() -> None:
-    values: dict[str, Any] = {"x": [1.0, 2.0], "same": [3.0, 3.0], "which": ["b", "a"], "own": [1.0, np.nan]}
-    table = seen(values, np.array([True, False]))
-    assert list(table.attrs["units"]) == ["x", "which"] and table["which"].cat.codes.tolist() == [1, 0]
-    assert table["correct"].tolist() == [True, False]
-
-
 def of_drives(seed: int, drives: int = 40, frames: int = 10, twice: bool = False) -> pd.DataFrame:
     """Frames of drives that are right in shares of their own, whatever the parameters; or pictures that two models see
     and answer alike."""
@@ -275,41 +233,6 @@ def test_a_law_over_drives_is_told_and_its_intervals_are_over_drives() -> None:
     assert find_importance(found)[0].interval[0] > 0.05
 
 
-def test_halves_are_of_whole_units_and_share_none() -> None:
-    one, other = (set(half["unit"]) for half in split_in_halves(of_drives(3, drives=9), 1))
-    assert (len(one), len(other)) == (4, 5) and not one & other
-    rows = planted("none", rows=11)
-    first, second = split_in_halves(rows, 3)
-    assert (len(first), len(second)) == (5, 6) and {*first.index, *second.index} == {*rows.index}
-
-
-@pytest.mark.parametrize(
-    ("condition", "text"),
-    [
-        (RuleCondition("yaw", "degrees", low=60.0), "yaw over 60 degrees"),
-        (RuleCondition("power", "1", high=0.5), "power at most 0.5"),
-        (RuleCondition("yaw", "degrees", 10.0, 20.0), "yaw over 10 and at most 20 degrees"),
-        (RuleCondition("colour", options=frozenset({"red", "blue"})), "colour blue or red"),
-        (RuleCondition("yaw", "degrees", 350.0, 10.0, turn=360.0), "yaw from 350 to 10 degrees"),
-        (
-            RuleCondition("yaw", "degrees", 160.0, 20.0, turn=180.0),
-            "yaw from 160 to 200 or from 340 to 20 degrees",
-        ),
-    ],
-)
-def test_conditions_in_words(condition: RuleCondition, text: str) -> None:
-    assert condition.row.text == text
-
-
-def test_a_library_that_is_missing_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> None:
-        raise ImportError(name)
-
-    monkeypatch.setattr("importlib.import_module", absent)
-    with pytest.raises(InputError, match=r"needs scikit-learn.*pip install 'advsearch\[explain\]'"):
-        import_library("sklearn.tree")
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("kinds", [2, 3])
 def test_planted_kinds_are_told_with_the_most_typical_first(kinds: int) -> None:
@@ -324,16 +247,14 @@ def test_planted_kinds_are_told_with_the_most_typical_first(kinds: int) -> None:
     assert [members[0] for members in found.members] == list(np.cumsum(sizes) - 1)
 
 
-@pytest.mark.medium
-def test_groups_of_a_cloud_are_not_called_apart() -> None:
-    told = [
-        find_clusters(np.random.default_rng(seed).standard_normal((60, 30)) + 1.0, seed).apart for seed in range(10)
-    ]
-    assert sum(told) <= 2
+def test_peels_of_values_that_rounding_would_leave() -> None:
+    values = 1000.0 + np.linspace(0.1, 0.9, 41)
+    lower, upper = list_factor_peels(RuleCondition("camera.distance", "m"), pd.Series(values))
+    assert lower.low == values.min()
+    assert upper.high == np.sort(values)[-2]
 
 
-def test_few_or_equal_failures_are_one_kind() -> None:
-    one = find_clusters(np.ones((1, 5)), 0)
-    assert one.members == ((0,),) and one.silhouette is None and not one.apart
-    assert [len(members) for members in find_clusters(np.ones((30, 5)), 0).members] == [30]
-    assert len(find_clusters(np.random.default_rng(0).standard_normal((7, 4)), 0).members) == 1
+def test_peels_take_a_twentieth_at_each_end() -> None:
+    values = np.linspace(0.0, 100.0, 101)
+    lower, upper = list_factor_peels(RuleCondition("camera.azimuth", "degrees"), pd.Series(values))
+    assert (lower.low, upper.high) == (5.0, 95.0)

@@ -13,7 +13,6 @@ from pydantic import Field, computed_field
 from advsearch.cli.output import format_result as check_text
 from advsearch.questions.attack.page import make_page as attack_page
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.report.views import collect_facts, make_default_view
 from advsearch.runs.results import Fields, Interval, JsonFloat, Result, as_fact
 from samples import attack
 
@@ -65,11 +64,3 @@ def test_a_field_that_is_declared_as_a_fact_is_in_terminal_page_and_json(tmp_pat
         assert re.search(rf"^  {name} +{text}$", check_text(new), re.M)
         assert re.search(rf"<th[^>]*>{name.capitalize()}</th><td[^>]*>{text}</td>", str(page))
     assert "picture bytes" not in check_text(old)
-
-
-def test_a_fact_is_shown_of_a_question_without_words_too() -> None:
-    class Counted(Result):
-        command: ClassVar[str] = "counted"
-        done: int = Field(description="how many", json_schema_extra=as_fact("{} of 9"))
-
-    assert collect_facts(Counted(done=3), make_default_view(Counted(done=3))) == {"done": "3 of 9"}

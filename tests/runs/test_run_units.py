@@ -33,13 +33,6 @@ def test_rows_of_a_unit_differ_in_frame_model_and_prediction_alone(frames: int, 
     assert (np.unique(whole.find_unit(steps), return_counts=True)[1] == whole.size).all() and whole.name == "drive"
 
 
-def test_without_frames_a_unit_is_a_picture() -> None:
-    assert (
-        Units((3, 2), None, 5).find_unit(np.arange(30)).tolist() == list(range(30)) and Units((1,), 0).name == "picture"
-    )
-    assert Units((3,), None, 1, models=2).find_unit(np.arange(6)).tolist() == [0, 0, 1, 1, 2, 2]
-
-
 @pytest.mark.parametrize("frames", [None, 1])
 def test_pictures_that_differ_in_noise_alone_are_one_unit(frames: int | None) -> None:
     units = Units((3, 5), frames, models=2, noise=4)

@@ -11,10 +11,8 @@ from typing import Any
 
 import pytest
 
-from advsearch.errors import InputError
 from advsearch.questions.attack import attack
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs import trackers
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Store
@@ -102,17 +100,6 @@ def test_wandb_is_told(tmp_path: Path, told: Told) -> None:
     ]
 
 
-def test_a_batch_of_a_sweep_is_told_by_its_means_and_the_accuracy_so_far(tmp_path: Path, told: Told) -> None:
-    config = SweepConfig(object="mug", run=str(tmp_path / "run"), grid={"pose.yaw": [0, 90]}, log="wandb")
-    with RunDirectory.open(config) as run:
-        run.append_rows(Row("sweep", 0, correct=True, margin=-3.0), Row("sweep", 1, correct=False, margin=1.0))
-        run.append_rows(Row("sweep", 2, correct=True), Row("sweep", 3, correct=True))
-    assert told[1:3] == [
-        ("log", {"sweep/margin": -1.0, "sweep/correct": 0.5, "sweep/accuracy": 0.5, "sweep/step": 1}),
-        ("log", {"sweep/correct": 1.0, "sweep/accuracy": 0.75, "sweep/step": 3}),
-    ]
-
-
 @pytest.mark.parametrize("when", ["start_run", "log_metrics", "end_run"])
 def test_a_tracker_that_fails_does_not_stop_a_run(
     tmp_path: Path, told: Told, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, when: str
@@ -137,16 +124,6 @@ def test_a_tracker_that_hangs_does_not_hold_a_run_up(
     run_of(tmp_path / "run", "mlflow")
     assert ("end_run",) not in told
     ended.set()
-
-
-@pytest.mark.parametrize("name", ["mlflow", "tensorboard", "wandb"])
-def test_one_that_is_not_installed_is_told_before_anything_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    monkeypatch.setitem(sys.modules, trackers.PACKAGES[name], None)
-    with pytest.raises(InputError, match=f"pip install {name}, or leave"):
-        run_of(tmp_path / "run", name)
-    assert not (tmp_path / "run").exists()
 
 
 def objectives(told: Told) -> list[tuple[str, int, float]]:

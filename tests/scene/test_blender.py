@@ -87,15 +87,15 @@ def test_without_blender_the_command_to_type_is_said(folder: Path, monkeypatch: 
     (folder / "blender").unlink()
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(FileFormatError, match=r"none is installed; .*pip install bpy.*ADVSEARCH_BLENDER=.*export glTF"):
+    with pytest.raises(FileFormatError, match="pip install bpy"):
         import_object(folder / "room.blend")
     monkeypatch.setenv(programs.BLENDER, "nowhere/blender")
-    with pytest.raises(FileFormatError, match="ADVSEARCH_BLENDER names nowhere/blender, which can't be run"):
+    with pytest.raises(FileFormatError, match="ADVSEARCH_BLENDER"):
         import_object(folder / "room.blend")
 
 
 def test_another_file_is_not_given_to_blender(folder: Path) -> None:
     (folder / "room.blend").write_bytes(b"%PDF-1.7")
-    with pytest.raises(FileFormatError, match="expected a Blender scene, got a PDF document"):
+    with pytest.raises(FileFormatError, match="a PDF document"):
         import_object(folder / "room.blend")
     assert not (folder / "seen.json").exists()

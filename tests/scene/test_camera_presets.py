@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from advsearch.controls.camera import ROAD_USER_HEIGHTS, CameraControl
-from advsearch.controls.path import PathControl
 from advsearch.engine.loading import Scene, load_scene, scene_to_settings
-from advsearch.errors import InputError
 from advsearch.scene.camera_entries import PRESETS
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world
@@ -75,13 +71,6 @@ def test_all_that_a_dashcam_is_searched_in_keeps_its_height_and_its_lane() -> No
         assert 60.0 <= float(inputs["camera.fov"]) <= 90.0
 
 
-def test_a_drive_of_a_dashcam_keeps_its_height() -> None:
-    scene = seen("car", "dashcam")
-    path = PathControl(path="approach").bind(scene)
-    for share in (0.0, 0.5, 1.0):
-        assert lens(scene, path.inputs(torch.tensor([share]))["camera.to_world"])[2] == pytest.approx(1.3, abs=1e-3)
-
-
 def test_a_vehicle_is_seen_from_the_heights_of_road_users() -> None:
     car, mug = (CameraControl().bind(load_description(name, "street")) for name in ("car", "mug"))
     assert "elevation" in {group.parameter for group in mug.groups}
@@ -96,20 +85,3 @@ def test_a_vehicle_is_seen_from_the_heights_of_road_users() -> None:
     np.testing.assert_allclose(start, camera_to_world(scene), atol=1e-5)
     free = CameraControl(elevation=[5.0, 60.0]).bind(scene)
     assert [group.parameter for group in free.groups] == ["elevation"]
-
-
-def test_a_height_and_an_elevation_contradict_each_other() -> None:
-    with pytest.raises(InputError, match=r"camera.elevation and camera.height say the same thing"):
-        load_description("car", setting_values={"camera.elevation": 10.0, "camera.height": 1.3})
-    with pytest.raises(InputError, match="elevation and height say the same thing"):
-        CameraControl(elevation=[0.0, 5.0], height=[1.0, 2.0]).prepare(load_description("car"))
-    with pytest.raises(InputError, match=r"`camera=dashcam` is 1.3 m high, and how large mug is is not known"):
-        replace(scene := load_description("mug"), object=replace(scene.object, metres=None)).with_camera("dashcam")
-
-
-def test_a_height_is_searched_at_any_distance() -> None:
-    scene = load_description("car", "street", setting_values={"camera.azimuth": 0.0})
-    bound = CameraControl(height=[0.8, 2.0], distance=[6.0, 60.0]).bind(scene)
-    for u, height in ((torch.tensor([0.0, 0.0]), 0.8), (torch.tensor([1.0, 1.0]), 2.0)):
-        assert lens(scene, bound.inputs(u)["camera.to_world"])[2] == pytest.approx(height, abs=1e-3)
-        assert bound.describe(u)["camera.height"] == {"value": pytest.approx(height), "unit": "metres"}

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from PIL import Image
 from trimesh.visual import TextureVisuals
@@ -18,8 +17,6 @@ from advsearch.scene.assembly import pose_mesh
 from advsearch.scene.description import OBJECT
 from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.mitsuba_backend.variant import import_mitsuba
-from advsearch.scene.mitsuba_backend.writing import write_scene
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -118,62 +115,3 @@ def test_gltf_out_has_the_same_cut_outs(mode: str, tmp_path: Path) -> None:
     again = import_object(tmp_path / "out.glb")
     assert part.opacity is not None and again.opacity is not None
     np.testing.assert_allclose(again.opacity, part.opacity, atol=0.003)
-
-
-def test_stock_mitsuba_renders_the_cut_outs_that_are_written(framed: Path, tmp_path: Path) -> None:
-    renderer = advsearch.load_scene(framed, settings=SEEN).renderer("pose", resolution=SIZE, denoise="none")
-    (tmp_path / "out").mkdir()
-    write_scene(renderer.scene, {}, tmp_path / "out" / "scene.xml", "")
-    mi = import_mitsuba()
-    theirs = torch.from_numpy(np.array(mi.render(mi.load_file(str(tmp_path / "out" / "scene.xml")), spp=256)))[..., :3]
-    ours = renderer.scene.render_radiance({}, 0, 256)
-    assert (theirs - ours).abs().mean() < 0.03 * ours.mean()
-
-
-@pytest.mark.parametrize(("mode", "share"), [("RGBA", 1.0), ("L", 0.5)])
-def test_a_material_file_says_opacity_by_a_number_and_a_picture(mode: str, share: float, tmp_path: Path) -> None:
-    """The picture's alpha, or its grey; another size than the colours' will do."""
-    texels = np.full((32, 32, 4), 255, np.uint8)
-    texels[..., 3] = np.uint8(window() * 255)
-    picture = Image.fromarray(texels) if mode == "RGBA" else Image.fromarray(texels[..., 3])
-    picture.save(tmp_path / "holes.png")
-    Image.new("RGB", (64, 64), (255, 0, 0)).save(tmp_path / "red.png")
-    corners = "v -1 0 0\nv 1 0 0\nv 1 2 0\nv -1 2 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
-    (tmp_path / "card.obj").write_text(f"mtllib card.mtl\n{corners}usemtl a\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n")
-    (tmp_path / "card.mtl").write_text(f"newmtl a\nKd 1 1 1\nd {share}\nmap_Kd red.png\nmap_d holes.png\n")
-    made = import_object(tmp_path / "card.obj", up="y")
-    assert made.opacity is not None and made.opacity.shape == (64, 64) and made.base_color.shape == (64, 64, 3)
-    assert made.opacity[32, 32] == 0.0 and made.opacity[4, 4] == pytest.approx(share)
-    assert not [text for text in made.warnings if "opac" in text]
-    (tmp_path / "holes.png").write_bytes(b"none")
-    broken = import_object(tmp_path / "card.obj", up="y")
-    assert "the opacity 'holes.png' cannot be read as a picture; it is opaque instead" in " ".join(broken.warnings)
-    assert (broken.opacity is None) == (share == 1.0)
-
-
-BOX = trimesh.creation.box((1.0, 1.0, 0.5))
-
-
-def boxes(path: Path, opacity: float) -> Path:
-    """A box with a wider one of glass around its middle; the glass has an opacity."""
-    lines, first = [f"mtllib {path.stem}.mtl"], 1
-    for name, size in (("paint", 1.0), ("glass", 1.5)):
-        lines += ["v {:g} {:g} {:g}".format(*(size * place)) for place in BOX.vertices] + [f"usemtl {name}"]
-        lines += ["f {} {} {}".format(*(face + first)) for face in BOX.faces]
-        first += len(BOX.vertices)
-    path.write_text("\n".join(lines) + "\n")
-    path.with_suffix(".mtl").write_text(f"newmtl paint\nKd 1 0 0\nnewmtl glass\nKd 0 0 1\nd {opacity:g}\n")
-    return path
-
-
-def test_parts_that_let_all_light_through_cost_nothing(tmp_path: Path) -> None:
-    """Windows with `d 0` are left out, and said; so no fast way is lost. With a little opacity they stay."""
-    clear, dim = (import_object(boxes(tmp_path / f"{share}.obj", share), up="z") for share in (0.0, 0.3))
-    assert clear.opacity is None and set(clear.mesh.materials) == {"paint"} and len(clear.mesh.faces) == len(BOX.faces)
-    np.testing.assert_allclose(np.ptp(clear.mesh.vertices, axis=0), [1.0, 1.0, 0.5], atol=1e-6)
-    assert "all light passes through 'glass' (opacity 0): left out" in " ".join(clear.warnings)
-    assert dim.opacity is not None and set(dim.mesh.materials) == {"paint", "glass"} and not dim.warnings[1:]
-    (tmp_path / "all.mtl").write_text("newmtl paint\nd 0\nnewmtl glass\nd 0\n")
-    (tmp_path / "all.obj").write_text((tmp_path / "0.0.obj").read_text().replace("0.0.mtl", "all.mtl"))
-    whole = import_object(tmp_path / "all.obj", up="z")
-    assert whole.opacity is None and "transparent all over; it is shown opaque" in " ".join(whole.warnings)

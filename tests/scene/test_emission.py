@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +15,6 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 import advsearch
-from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assembly import pose_mesh
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.color import srgb_to_linear
@@ -26,13 +22,13 @@ from advsearch.scene.description import OBJECT, SceneDescription, load_descripti
 from advsearch.scene.formation import ALL_OMISSIONS, compute_irradiance
 from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.mitsuba_backend.meshes import compute_sampling_weights
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.parts import PointLamp
 from advsearch.scene.transport.lights import BasisRenderer
 from advsearch.scene.transport.matrix import LinearRenderer
+from glb_files import change_material
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -62,22 +58,11 @@ def card(
     return trimesh.Trimesh(vertices, FACES, process=False, visual=TextureVisuals(uv=uv, material=material))
 
 
-def changed(data: bytes, material: int = 0, **entries: Any) -> bytes:
-    """A .glb file of which a material has other entries."""
-    length = struct.unpack_from("<I", data, 12)[0]
-    header = json.loads(data[20 : 20 + length])
-    header["materials"][material] |= entries
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-
-
 def written(folder: Path, made: Any, strength: float = 1.0, **entries: Any) -> Path:
     """A file of it whose first material emits light of some strength."""
     file = folder / "lamp.glb"
     extensions = {"KHR_materials_emissive_strength": {"emissiveStrength": strength}}
-    file.write_bytes(changed(made.export(file_type="glb"), extensions=extensions, **entries))
+    file.write_bytes(change_material(made.export(file_type="glb"), extensions=extensions, **entries))
     return file
 
 
@@ -194,64 +179,6 @@ def test_a_material_file_says_emission(lines: tuple[str, ...], wanted: list[floa
         assert asset.emission.shape == ((16, 16, 3) if "map_Ke lit.png" in lines else (1, 1, 3))
 
 
-@pytest.mark.parametrize("words", ["nan 1 1", "-1 0 0", "1 2", "bright", "1e999 0 0"])
-def test_what_is_no_colour_is_left_out_and_said(words: str, tmp_path: Path) -> None:
-    asset = in_a_material_file(tmp_path, f"Ke {words}")
-    assert asset.emission is None
-    assert asset.warnings == (f"card.obj: the emission '{words}' is no colour; it is left out",)
-    asset = in_a_material_file(tmp_path, "Ke 1 1 1", "map_Ke gone.png")
-    assert asset.emission is None
-    assert asset.warnings == ("card.obj: the texture 'gone.png' of the emission is missing; it is left out",)
-
-
-@pytest.mark.parametrize("strength", [b"NaN", b"-1", b'"1"', b"1e999"])
-def test_a_strength_that_is_none_is_refused(strength: bytes, tmp_path: Path) -> None:
-    file = written(tmp_path, card(), 12345678.0)
-    file.write_bytes(file.read_bytes().replace(b"12345678.0", strength.ljust(10)))
-    with pytest.raises(FileFormatError):
-        import_object(file)
-    file = written(tmp_path, card(), emissiveFactor=[-0.5, 0.0, 0.0])
-    with pytest.raises(FileFormatError, match="emissiveFactor"):
-        import_object(file)
-
-
-def test_what_is_too_bright_is_cut_and_said(tmp_path: Path) -> None:
-    asset = import_object(written(tmp_path, card(), 1e30, emissiveFactor=[1.0, 0.0, 0.5]))
-    assert asset.warnings == ("lamp.glb: emission brighter than 100000 is cut to that",)
-    np.testing.assert_allclose(asset.emission, [[[1e5, 0.0, 1e5]]])  # type: ignore[arg-type]
-
-
-def test_emission_by_other_coordinates_than_the_base_color_is_left_out_and_said(tmp_path: Path) -> None:
-    made = card(picture=stripes())
-    made.visual.material.baseColorTexture = Image.new("RGB", (4, 4), (200, 100, 50))
-    file = written(tmp_path, made, emissiveTexture={"index": 1, "texCoord": 1})
-    asset = import_object(file)
-    words = "lamp.glb: 1 emission texture with other coordinates than the base colour: left out, with the emission"
-    assert asset.emission is None and asset.warnings == (words,)
-
-
-def test_what_is_cut_out_emits_nothing(tmp_path: Path) -> None:
-    holes = np.full((16, 16, 4), 255, np.uint8)
-    holes[4:12, 4:12, 3] = 0
-    made = card()
-    made.visual.material.baseColorTexture = Image.fromarray(holes)
-    file = written(tmp_path, made, 2.0, alphaMode="MASK")
-    picture = radiance(file, 16)
-    assert not picture[SIZE // 2, SIZE // 2].any() and float(picture.max()) == pytest.approx(2.0, rel=1e-3)
-
-
-@pytest.mark.parametrize(("cutoff", "dark"), [(0.5, False), (1e30, True)])
-def test_a_part_that_is_cut_out_whole_is_dark_beside_another(cutoff: float, dark: bool, tmp_path: Path) -> None:
-    scene = room(None)
-    shines = [one.visual.material.emissiveFactor is not None for one in scene.geometry.values()]
-    file = tmp_path / "room.glb"
-    lamp = {"emissiveFactor": [1.0, 1.0, 1.0], "alphaMode": "MASK", "alphaCutoff": cutoff}
-    file.write_bytes(changed(scene.export(file_type="glb"), shines.index(True), **lamp))
-    described = load_description(str(file), setting_values=SEEN)
-    assert described.has_emission is not dark
-    MitsubaScene(described, (SIZE, SIZE))
-
-
 @pytest.mark.medium
 def test_a_moved_surface_lights_from_where_it_is(tmp_path: Path) -> None:
     """Whatever Mitsuba kept of the place where it was."""
@@ -336,20 +263,6 @@ def test_stock_mitsuba_renders_the_emission_that_is_written(picture: np.ndarray 
     assert float(ours.mean()) > 0.01 and (theirs - ours).abs().mean() < 0.03 * ours.mean()
 
 
-def test_a_plain_background_is_refused_in_words(tmp_path: Path) -> None:
-    loaded = advsearch.load_scene(written(tmp_path, card()), settings=SEEN)
-    with pytest.raises(InputError, match="Mitsuba hides surfaces that emit light"):
-        loaded.renderer("background", resolution=SIZE)
-
-
-def test_derivatives_of_poses_are_differences_and_of_textures_adjoints(tmp_path: Path) -> None:
-    made = advsearch.load_scene(written(tmp_path, card(grey=0.5)), settings=SEEN)
-    groups = made.renderer(["pose", "texture"], resolution=SIZE).plan.groups
-    assert all(group.valid and "material" not in group.valid for group in groups)
-    assert "adjoint" in next(group for group in groups if group.control == "texture").valid
-    assert math.isfinite(made.description.gain)
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("picture", [None, stripes()])
 def test_the_adjoint_of_a_texture_is_right_beside_emission(picture: np.ndarray | None, tmp_path: Path) -> None:
@@ -363,26 +276,3 @@ def test_the_adjoint_of_a_texture_is_right_beside_emission(picture: np.ndarray |
         up, down = (made.render_radiance({name: base + way * (base > 0.0)}, 3, 1024).sum() for way in (step, -step))
         gradient = made.render_adjoint({name: base}, ones, 7, 1024)[name][base > 0.0]
         assert float(gradient.sum()) == pytest.approx(float(up - down) / (2.0 * step), rel=0.03)
-
-
-@pytest.mark.medium
-def test_many_dim_surfaces_do_not_take_the_samples_of_the_environment(tmp_path: Path) -> None:
-    """Thirty of them: the picture hardly has more noise than without."""
-    scene = trimesh.Scene()
-    scene.add_geometry(card(picture=None, vertices=CORNERS * 0.01 + [0, 0, 2.0]), node_name="dot0")
-    wall = card(grey=0.8)
-    wall.visual.material.emissiveFactor = None
-    scene.add_geometry(wall, node_name="wall")
-    for number in range(1, 30):
-        dot = card(vertices=CORNERS * 0.01 + [0.1 * number, 0, 2.0])
-        dot.visual.material = scene.geometry["geometry_0"].visual.material
-        scene.add_geometry(dot, node_name=f"dot{number}")
-    described = load_description(f"{written(tmp_path, scene, 0.1)}#wall", "studio", setting_values=SEEN)
-    weights = compute_sampling_weights(described.meshes.values())
-    assert len(weights) == 30 and sum(weights.values()) == pytest.approx(1.0)
-
-    def noise(one: SceneDescription) -> float:
-        made = MitsubaScene(one, (SIZE, SIZE), max_depth=2)
-        return float(torch.stack([made.render_radiance({}, seed, 16) for seed in range(8)]).std(dim=0).mean())
-
-    assert noise(described) < 1.6 * noise(replace(described, parts=()))

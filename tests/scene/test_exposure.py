@@ -11,18 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls import EnvironmentControl, make_space
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.formation import (
-    CARD_DISPLAY_VALUE,
-    CARD_REFLECTANCE,
-    compute_irradiance,
-    compute_metered_gain,
-    compute_visible_normals,
-)
+from advsearch.scene.formation import CARD_DISPLAY_VALUE, CARD_REFLECTANCE, compute_irradiance, compute_visible_normals
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import resolve_settings
 from covering import once_each
@@ -62,10 +55,6 @@ def test_an_exposure_value_says_which_luminance_is_white(ev: float, stops: float
     white = 1.2 * 2.0**ev / 2.0**stops  # cd/m2
     assert scene.gain * white / scene.environment.candelas == pytest.approx(1.0)
     assert (ev, stops) != (14.0, 0.0) or white == pytest.approx(19661, abs=1)
-
-
-def test_a_black_environment_meters_to_one() -> None:
-    assert grey_ball(EnvironmentAsset("night", np.zeros((8, 16, 3), np.float32))).gain == 1.0
 
 
 @pytest.mark.parametrize(
@@ -130,45 +119,9 @@ def test_a_setting_a_fixed_value_and_a_point_of_a_grid_are_one_picture(
     torch.testing.assert_close(pictures[2], pictures[0], rtol=0.0, atol=2e-3)
 
 
-def test_a_fixed_focal_length_is_its_field_of_view() -> None:
-    fov = math.degrees(2.0 * math.atan(18.0 / 50.0))
-    renders = [
-        load_scene("hammer", settings={"camera.fov": fov}).renderer("camera", resolution=16),
-        load_scene("hammer").renderer({"camera": {"focal_length": 50.0}}, resolution=16),
-    ]
-    one, other = (render.space.inputs(render.start)["camera.to_world"] for render in renders)
-    torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
-
-
 def _at_second(renders: list[Renderer]) -> list[Tensor]:
     """The starts of two renderers, and of the third with the second option of its first coordinate."""
     return [renders[0].start, renders[1].start, torch.cat([torch.tensor([0.75]), renders[2].start[1:]])]
-
-
-def test_the_objects_colour_and_what_comes_after_metering_take_no_part() -> None:
-    scene = load_description("mug")
-    black = replace(scene, object=replace(scene.object, base_color=np.zeros((4, 4, 3), np.float32)))
-    assert black.gain == scene.gain
-    assert scene.with_values(camera__exposure=1.0).gain == pytest.approx(2.0 * scene.gain)
-
-
-def test_an_object_too_thin_to_be_seen_leaves_the_card_on_the_ground() -> None:
-    scene = grey_ball("noon")
-    needle = replace(scene.object.mesh, vertices=scene.object.mesh.vertices * np.array([1e-5, 1e-5, 1.0], np.float32))
-    scene = replace(scene, object=replace(scene.object, mesh=needle))
-    assert len(compute_visible_normals(scene)) == 0
-    up = float(compute_irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean())
-    assert compute_metered_gain(scene) == pytest.approx(CARD_DISPLAY_VALUE * math.pi / (CARD_REFLECTANCE * up))
-
-
-def test_another_environment_keeps_the_exposure_it_would_be_loaded_with() -> None:
-    scene = load_description("mug", "studio")
-    space = make_space([EnvironmentControl(which=["own", "noon"])], scene)
-    own, noon = (space.inputs(torch.tensor([u]))["environment.data"] * scene.gain for u in (0.25, 0.75))
-    loaded = load_description("mug", "noon")
-    assert scene.environment is not None and loaded.environment is not None
-    assert torch.equal(own, torch.from_numpy(scene.environment.radiance) * scene.gain)
-    torch.testing.assert_close(noon, torch.from_numpy(loaded.environment.radiance) * loaded.gain, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.medium

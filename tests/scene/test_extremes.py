@@ -13,7 +13,6 @@ import torch
 
 from advsearch import load_scene, threads
 from advsearch.engine.gradients import make_smooth_loss
-from advsearch.errors import InputError
 from advsearch.questions.stability.scene import make_renderer, render_image
 from advsearch.scene.assets import EnvironmentAsset
 
@@ -22,24 +21,15 @@ SIZE = 24
 EXTREME: dict[str, tuple[dict[str, Any], float]] = {
     "out of the frame": ({"pose": {"x": [4.0, 6.0]}}, 0.5),
     "swallowing the camera": ({"pose": {"scale": [20.0, 100.0]}}, 1.0),
-    "a hundredth of its size": ({"pose": {"scale": [0.01, 0.02]}}, 0.0),
-    "ten thousand sizes away": ({"pose": {"y": [9e3, 1e4]}}, 1.0),
     "below the ground": ({"pose": {"z": [-2.0, -0.5]}}, 0.3),
     "gimbal angles": ({"pose": {"pitch": [80.0, 90.0], "roll": [0.0, 90.0]}}, 1.0),
-    "upside down by its rotation vector": ({"pose": {"rotation": [-180.0, 180.0], "on_ground": "no"}}, 1.0),
-    "a field of view of 1 degree": ({"camera": {"fov": [1.0, 2.0]}}, 0.0),
     "a field of view of 170 degrees": ({"camera": {"fov": [160.0, 170.0]}}, 1.0),
     "a camera inside the object": ({"camera": {"distance": [0.05, 0.2]}}, 0.0),
-    "a camera below the ground": ({"camera": {"elevation": [-89.0, -60.0]}}, 0.0),
     "an aperture as large as the object": ({"camera": {"aperture": [0.5, 1.0], "focus": 0.01}}, 1.0),
-    "ten stops up": ({"camera": {"exposure": [9.0, 10.0]}}, 1.0),
-    "ten stops down": ({"environment": {"exposure": [-10.0, -9.0]}}, 0.0),
     "no light but harmonics": ({"environment": {"tint_red": [0.0, 0.1], "harmonics": [-1.0, 1.0]}}, 0.0),
     "a mirror": ({"material": {"roughness": [0.0, 0.1], "metallic": 1.0}}, 0.0),
     "a light inside the object": ({"light": {"x": [-0.1, 0.1], "y": 0.0, "z": 0.4, "power": 100.0}}, 0.5),
-    "a huge light": ({"light": {"size": [1.0, 5.0], "power": [0.0, 1000.0]}}, 1.0),
     "haze like milk": ({"haze": {"density": [0.5, 1.0]}}, 1.0),
-    "a sun at the horizon": ({"sky": {"elevation": [2.0, 5.0], "turbidity": 10.0}}, 0.0),
     "a thousandfold patch": ({"patch": {"size": [0.05, 0.6], "height": [0.0, 1.0]}}, 1.0),
 }
 
@@ -58,14 +48,6 @@ def test_extremes_are_finite(name: str) -> None:
     assert render.non_finite == 0
 
 
-@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
-def test_adjoints_of_poses_are_finite_at_any_scale(scale: float) -> None:
-    controls = {"pose": {"yaw": [0, 360], "scale": scale}}
-    render = load_scene("mug").renderer(controls, resolution=SIZE, denoise="none", estimators={"pose": "material"})
-    _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), render.start, 0, 2)
-    assert bool(torch.isfinite(gradient).all())
-
-
 def test_one_texel_of_a_hundred_thousand_is_finite() -> None:
     radiance = np.full((32, 64, 3), 0.3, np.float32)
     radiance[8, 20] = 1e5
@@ -77,30 +59,6 @@ def test_one_texel_of_a_hundred_thousand_is_finite() -> None:
         assert bool(torch.isfinite(render(u, seed=0, spp=2)).all())
     _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), u, 0, 2)
     assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
-
-
-@pytest.mark.parametrize(
-    ("controls", "message"),
-    [
-        ({"camera": {"fov": 171}}, "camera.fov: expected a number from 1 to 170"),
-        ({"camera": {"fov": [30, 40], "focal_length": 50}}, "fov and focal_length say the same thing"),
-        ({"camera": {"aperture": [0, 1], "shift_x": 0.1}}, "a shifted picture together with an aperture"),
-        ({"camera": {"elevation": [0, 90]}}, "camera.elevation: expected a number from -89 to 89"),
-        ({"pose": {"scale": [0.001, 1]}}, "pose.scale: expected a number from 0.01 to 100"),
-        ({"environment": {"which": ["kitchin"]}}, "unknown environment.which 'kitchin'. Did you mean 'kitchen'"),
-        ({"environment": {"epsilon": -1, "rotation": [0, 90]}}, "environment.epsilon: expected a number over 0"),
-        ({"light:": {}}, "expected a name of letters, digits, - and _ after the colon, got ''"),
-        ({"light:a b": {}}, "expected a name of letters, digits, - and _ after the colon, got 'a b'"),
-        ({"pose": {}, "second": {"kind": "pose"}}, "two controls set object.to_world, pose and second; leave"),
-        ({"sky": {}, "environment": {}}, "two controls set environment.data"),
-        ({"object": {"kind": "light"}}, "the scene has something of that name already"),
-    ],
-)
-def test_what_cannot_be_is_refused_in_one_sentence(controls: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message) as error:
-        render = load_scene("mug").renderer(controls, resolution=SIZE)
-        render(render.start, seed=0, spp=1)
-    assert "\n" not in str(error.value)
 
 
 # ---- numbers of threads ---------------------------------------------------------------------------------------------

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +13,7 @@ from test_gltf import SQUARE, File
 
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.importing.objects import import_object, read_parts
+from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.scenes import LUMENS, import_scene
 from advsearch.scene.parts import PointLamp
 
@@ -62,11 +59,6 @@ def test_a_camera_with_aspect_sees_all_that_its_own_picture_has(aspect: float, t
 
 def _at(scene: SceneDescription, aspect: float) -> SceneDescription:
     return replace(scene, aspect=aspect)
-
-
-def test_a_scale_of_a_camera_does_not_count(tmp_path: Path) -> None:
-    plain, scaled = with_camera(tmp_path, {}), with_camera(tmp_path, {}, scale=[2.0, 3.0, 0.5])
-    assert camera_to_world(scaled) == pytest.approx(camera_to_world(plain))
 
 
 @pytest.mark.parametrize(
@@ -198,8 +190,6 @@ def test_a_mesh_is_posed_as_a_rigid_one_that_its_joint_carries(tmp_path: Path) -
     [
         (lambda header: header["skins"][0].update(joints=[1]), "joints under 1"),
         (lambda header: header["skins"][0].update(joints=[1, 99]), "100 nodes"),
-        (lambda header: header["nodes"][0].update(skin=3), "4 skins"),
-        (lambda header: header["skins"][0].update(joints=[]), "skins"),
         (lambda header: header["skins"][0].update(inverseBindMatrices=0), "inverse bind matrices"),
         (lambda header: header["meshes"][0]["primitives"][0]["attributes"].pop("WEIGHTS_0"), "four weights"),
     ],
@@ -209,61 +199,3 @@ def test_a_skin_that_is_none_is_refused(change: Any, words: str, tmp_path: Path)
     change(file.header)
     with pytest.raises(FileFormatError, match=words):
         vertices(file, tmp_path)
-
-
-# ---- how it is packed -----------------------------------------------------------------------------------------------
-
-
-def test_a_header_padded_with_zeros_is_read(tmp_path: Path) -> None:
-    data = square().write(tmp_path).read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    text, rest = data[20 : 20 + length].rstrip(b" ") + bytes(4), data[20 + length :]
-    text += bytes(-len(text) % 4)
-    path = tmp_path / "nul.glb"
-    path.write_bytes(
-        struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-    )
-    assert len(import_object(path).mesh.faces) == 2
-
-
-def test_a_damaged_header_is_not_called_a_model_of_another_kind(tmp_path: Path) -> None:
-    data = square().write(tmp_path).read_bytes()
-    path = tmp_path / "damaged.glb"
-    path.write_bytes(data.replace(b'"meshes"', b'"meshes '))
-    with pytest.raises(FileFormatError, match="expected glTF with a JSON header, got something else"):
-        import_object(path)
-
-
-@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "ACME_mesh_packing"])
-@pytest.mark.parametrize("required", [True, False])
-def test_geometry_that_an_extension_holds_is_refused_by_its_name(name: str, required: bool, tmp_path: Path) -> None:
-    """Also where the file says only that it uses it."""
-    file = square()
-    made = file.header["meshes"][0]["primitives"][0]
-    made["extensions"] = {name: {"bufferView": 0, "attributes": {"POSITION": 0}}}
-    file.header["extensionsUsed"] = [name]
-    file.header["extensionsRequired"] = [name] if required else []
-    fallback = file.write(tmp_path)
-    if not required:
-        assert any(name in note for note in import_object(fallback).warnings)  # what is there without it is read
-    for accessor in file.header["accessors"]:
-        del accessor["bufferView"]
-    with pytest.raises(FileFormatError, match=f"needs {name}, which is not supported"):
-        import_object(file.write(tmp_path))
-
-
-def test_a_buffer_that_an_extension_fills_is_refused_by_its_name(tmp_path: Path) -> None:
-    path = square().write(tmp_path)
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    header = json.loads(data[20 : 20 + length])
-    header["buffers"].append({"byteLength": 4096, "extensions": {"EXT_meshopt_compression": {"fallback": True}}})
-    for view in header["bufferViews"]:
-        view |= {"buffer": 1, "extensions": {"EXT_meshopt_compression": {"buffer": 0, "mode": "ATTRIBUTES"}}}
-    text = json.dumps(header).encode()
-    text, rest = text + b" " * (-len(text) % 4), data[20 + length :]
-    path.write_bytes(
-        struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-    )
-    with pytest.raises(FileFormatError, match="needs EXT_meshopt_compression, which is not supported"):
-        import_object(path)

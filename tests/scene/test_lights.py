@@ -12,7 +12,6 @@ from torch import Tensor
 import advsearch
 from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
-from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
 from advsearch.scene.transport.lights import BasisMaps, BasisRenderer, find_lighting
@@ -54,7 +53,6 @@ def off(renderer: Renderer, predicted: BasisRenderer, u: Tensor) -> tuple[float,
     [
         (LAMP, {"light.power", "light.red", "environment.exposure"}, set()),
         ({"light": {"power": [0, 9], "size": [0.1, 0.2], "x": [0, 1]}}, {"light.power"}, {"light.size", "light.x"}),
-        ({"light": {"type": "point", "power": [0, 9]}}, {"light.power"}, set()),
         (
             {"environment": {"rotation": [0, 90], "tint_red": [0, 2]}},
             {"environment.tint_red"},
@@ -62,7 +60,6 @@ def off(renderer: Renderer, predicted: BasisRenderer, u: Tensor) -> tuple[float,
         ),
         ({"environment": {"harmonics": [-1, 1]}}, {"environment.harmonics"}, set()),
         ({"camera": {"exposure": [-1, 1], "fov": [30, 40]}}, {"camera.exposure"}, {"camera.fov"}),
-        ({"sky": {}}, set(), {"sky.azimuth", "sky.elevation", "sky.turbidity"}),
         ({"texture": {"resolution": 4}, "lens": {"dots": 1}}, {"lens.x", "lens.opacity"}, {"texture.texels"}),
     ],
 )
@@ -85,12 +82,6 @@ def test_a_sum_of_basis_pictures_is_the_traced_picture(
     found, noise = off(renderer, predicted, u)
     assert found < 1.6 * noise
     assert levels(predicted(u), predicted(renderer.start)) > 3.0 * noise
-
-
-def test_radiance_is_linear_in_power(predicted: BasisRenderer) -> None:
-    none, half, whole = (predicted.renderer.radiance(torch.tensor([0.5, power, 0.5])) for power in (0.0, 0.5, 1.0))
-    assert torch.allclose(whole - none, 2.0 * (half - none), atol=1e-5 * float(whole.max()))
-    assert predicted.n_traced_images == 2 and predicted.n_entries == 0
 
 
 def test_its_derivative_is_that_of_its_pictures(predicted: BasisRenderer) -> None:
@@ -144,26 +135,17 @@ def test_texture_and_light_are_predicted_together() -> None:
 
 
 @pytest.mark.parametrize(
-    ("controls", "options", "reason"),
+    ("controls", "options", "can_predict"),
     [
-        ({"light": {"power": [0, 12]}}, {}, None),
-        ({"camera": {"exposure": [-1, 1]}}, {}, None),
-        ({"light": {"power": [0, 12]}}, {"estimators": {"light": "adjoint"}}, "the estimator of light.power is forced"),
-        ({"light": {}}, {}, "light.x changes more than base colours and light"),
-        ({"light": {"power": [0, 12]}}, {"denoise": "none"}, "noise is part of the picture without the denoiser"),
+        ({"light": {"power": [0, 12]}}, {}, True),
+        ({"camera": {"exposure": [-1, 1]}}, {}, True),
+        ({"light": {"power": [0, 12]}}, {"estimators": {"light": "adjoint"}}, False),
+        ({"light": {}}, {}, False),
+        ({"light": {"power": [0, 12]}}, {"denoise": "none"}, False),
     ],
 )
-def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], reason: str | None) -> None:
-    refusal = lights.find_refusal(rendered_by(controls, **options))
-    assert (None if refusal is None else refusal.text) == reason
-
-
-def test_a_light_of_a_mitsuba_scene_is_in_no_basis_picture() -> None:
-    """It would be in the picture of each light, as often as the power of that one says."""
-    loaded = advsearch.load_scene("large-box", scene=import_mitsuba().cornell_box())
-    made = loaded.renderer({"light:spot": {"power": [0, 12]}}, resolution=8)
-    assert str(lights.find_refusal(made)) == "spot.power changes light, and the scene has other lights of its own"
-    assert not find_lighting(made).changed_inputs
+def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], can_predict: bool) -> None:
+    assert (lights.find_refusal(rendered_by(controls, **options)) is None) == can_predict
 
 
 # ---- searches -------------------------------------------------------------------------------------------------------
@@ -207,20 +189,3 @@ def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
     assert stopped.summary.ending == "interrupted"
     advsearch.attack("mug", run=tmp_path / "parts", resume=True, **settings)
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        ({"estimators": {"light": "adjoint"}}, "the estimator of light.power is forced"),
-        ({}, "basis pictures pay from 20 evaluations on"),
-    ],
-)
-def test_a_search_over_light_that_renders_says_why(
-    options: dict[str, Any], reason: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(searching, "MIN_STEPS_PER_LIGHT", 10)
-    found = advsearch.attack("mug", run=None, **{**SEARCH, "steps": 16, **options}).summary
-    assert found.transport is not None and found.transport.reason == reason
-    assert found.renders["products"] == 0

@@ -81,7 +81,7 @@ def test_a_mask_is_of_its_own_configuration_and_leaves_renders_as_they_are(moved
     before, mask = moved(first, seed=1, spp=2), moved.mask(first)
     assert not torch.equal(moved.mask(second), mask) and torch.equal(moved.mask(first), mask)
     assert torch.allclose(moved(first, seed=1, spp=2), before, atol=1e-6)
-    with pytest.raises(InputError, match="expected every entry of u in"):
+    with pytest.raises(InputError, match="entry of u"):
         moved.mask(first + 2.0)
 
 
@@ -97,7 +97,3 @@ def test_a_lamp_hides_the_object_only_while_it_shines() -> None:
     dark, lit = (mask_of({"light": {**between, "power": power}}) for power in ([0.0, 0.5], [4.0, 5.0]))
     assert torch.equal(dark, plain)
     assert int((plain & ~lit).sum()) > 10 and not bool((lit & ~plain).any())
-
-
-def test_a_lens_is_looked_through_at_its_middle() -> None:
-    assert torch.equal(mask_of({"material": {}}), mask_of({"material": {}, "camera": {"aperture": 0.1}}))

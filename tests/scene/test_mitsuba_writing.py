@@ -1,18 +1,15 @@
-"""Scenes as Mitsuba's XML: what is written is what is read, and a picture on a shape is where Mitsuba has it."""
+"""Scenes as Mitsuba's XML: what is written is what is read."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenEXR
 import pytest
 
-import advsearch
-from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_xml
 from advsearch.scene.mitsuba_backend.xml_files import read_scene
@@ -68,60 +65,3 @@ def test_pictures_are_written_in_a_pool_of_one_thread_too(tmp_path: Path) -> Non
             found = channel.pixels.reshape(8, 16, -1)
         np.testing.assert_array_equal(found, values[..., : found.shape[2]])
     assert len(list(tmp_path.glob("*.exr"))) == 3
-
-
-SQUARE = """v -1 -1 0
-v 1 -1 0
-v 1 1 0
-v -1 1 0
-vt 0 0
-vt 1 0
-vt 1 1
-vt 0 1
-f 1/1 2/2 3/3
-f 1/1 3/3 4/4
-"""
-
-
-SIDE = {"cube": [2, 3, 4], "sphere": [3, -3, 3], "cylinder": [4, 3, 2]}
-"""Where the camera is, if not right before the shape."""
-
-
-@pytest.mark.parametrize(
-    "kind", [
-        "rectangle", "obj", "ply", "obj as it is", "ply turned", "cube", "sphere", "cylinder", "disk",
-    ],
-)  # fmt: skip
-def test_a_picture_on_a_shape_is_where_mitsuba_has_it(tmp_path: Path, kind: str) -> None:
-    mi = import_mitsuba()
-    (tmp_path / "square.obj").write_text(SQUARE)
-    mi.load_dict({"type": "obj", "filename": str(tmp_path / "square.obj")}).write_ply(str(tmp_path / "square.ply"))
-    colors = np.linspace(0.1, 0.9, 16 * 8 * 3, dtype=np.float32).reshape(16, 8, 3)
-    with OpenEXR.File({}, {"RGB": colors}) as file:
-        file.write(str(tmp_path / "colors.exr"))
-    picture = {"type": "bitmap", "filename": str(tmp_path / "colors.exr"), "raw": True}
-    surface = {"type": "diffuse", "reflectance": picture}
-    shape: dict[str, Any] = {"type": kind.partition(" ")[0], "bsdf": {"type": "twosided", "bsdf": surface}}
-    if shape["type"] in ("obj", "ply"):
-        shape["filename"] = str(tmp_path / f"square.{shape['type']}")
-    if kind == "cylinder":
-        shape |= {"p0": [-0.5, 0.2, -0.6], "p1": [0.4, -0.3, 0.7], "radius": 0.6}
-    if " " in kind:
-        shape["flip_tex_coords"] = kind == "ply turned"
-    scene = {
-        "type": "scene",
-        "paths": {"type": "path", "max_depth": 2},
-        "front": {
-            "type": "perspective",
-            "fov": 30.0,
-            "to_world": mi.ScalarTransform4f().look_at(SIDE.get(kind, [0, 0, 5]), [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
-        },
-        "light": {"type": "constant"},
-        "square": shape,
-    }
-    write_xml(tmp_path / "square.xml", scene, {}, "")
-    theirs = np.array(mi.render(mi.load_file(str(tmp_path / "square.xml")), spp=64))
-    description = advsearch.load_scene(f"{tmp_path}/square.xml#square").description
-    ours = MitsubaScene(description, (16, 16), max_depth=2).render_radiance({}, 0, 64).numpy()
-    assert np.abs(ours - theirs).mean() < 0.02

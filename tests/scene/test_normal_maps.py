@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,17 +16,15 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 import advsearch
-from advsearch.errors import FileFormatError
 from advsearch.scene.assembly import pose_mesh
 from advsearch.scene.assets import Float32Array, ObjectAsset
 from advsearch.scene.description import OBJECT, SceneDescription, load_description
 from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.parts import FLAT_TEXEL, has_normals, make_normal_map
+from advsearch.scene.importing.parts import FLAT_TEXEL, make_normal_map
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import import_mitsuba
-from advsearch.scene.mitsuba_backend.writing import write_scene
 from advsearch.scene.parts import PointLamp
+from glb_files import change_material
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -89,12 +85,9 @@ WAYS: dict[str, Callable[[], Any]] = {
     "as it is": card,
     "mirrored": lambda: card(UNIT * [-1, 1] + [1, 0]),
     "turned": lambda: card(np.roll(UNIT, 1, axis=0)),
-    "upside down": lambda: card(UNIT * [1, -1] + [0, 1]),
     "half of it mirrored": lambda: halves(True, 0.7),
-    "two materials": lambda: halves(False, 0.69),
     "two materials, one mirrored": lambda: halves(True, 0.69),
     "a corner of the picture": corner,
-    "on the next texture": lambda: card(UNIT + np.array([3, -2])),
 }
 
 
@@ -160,17 +153,6 @@ def test_a_bump_is_lit_as_its_geometry_from_two_sides(
     np.testing.assert_allclose(found, wanted, atol=0.06)
 
 
-def with_material(data: bytes, **entries: Any) -> bytes:
-    """A .glb file whose first material has other entries."""
-    length = struct.unpack_from("<I", data, 12)[0]
-    header = json.loads(data[20 : 20 + length])
-    header["materials"][0] |= entries
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
-
-
 def vectors(texels: Float32Array | None) -> np.ndarray:
     assert texels is not None
     return texels.astype(np.float64) * 2.0 - 1.0
@@ -183,34 +165,12 @@ def of_the_bump(scale: float = 1.0) -> np.ndarray:
 @pytest.mark.parametrize("scale", [0.5, 2.0, -1.0, 1e30, 0.0])
 def test_the_scale_of_gltf_is_a_factor_of_the_slope(scale: float, tmp_path: Path) -> None:
     file = tmp_path / "card.glb"
-    file.write_bytes(with_material(card().export(file_type="glb"), normalTexture={"index": 0, "scale": scale}))
+    file.write_bytes(change_material(card().export(file_type="glb"), normalTexture={"index": 0, "scale": scale}))
     normals, plain = vectors(import_object(file).normal_map), bump() / 127.5 - 1.0
     assert np.abs(np.linalg.norm(normals, axis=2) - 1.0).max() < 1e-5 and normals[..., 2].min() > 0.0
     at = (60, 80)
     slope, wanted = normals[at][:2] / normals[at][2], min(scale, 100.0) * plain[at][:2] / plain[at][2]
     np.testing.assert_allclose(slope, wanted, rtol=2e-3, atol=1e-6)
-
-
-@pytest.mark.parametrize("scale", ["NaN", "Infinity", '"1"', "1e999"])
-def test_a_scale_that_is_no_number_is_refused(scale: str, tmp_path: Path) -> None:
-    file = tmp_path / "card.glb"
-    data = with_material(card().export(file_type="glb"), normalTexture={"index": 0, "scale": 12345678})
-    file.write_bytes(data.replace(b"12345678", scale.ljust(8).encode()))
-    with pytest.raises(FileFormatError):
-        import_object(file)
-
-
-def test_a_normal_map_by_other_coordinates_than_the_base_color_is_left_out_and_said(tmp_path: Path) -> None:
-    file = tmp_path / "card.glb"
-    made = card()
-    made.visual.material.baseColorTexture = Image.new("RGB", (4, 4), (200, 100, 50))
-    data = made.export(file_type="glb")
-    file.write_bytes(data)
-    assert import_object(file).normal_map is not None and import_object(file).warnings == ()
-    file.write_bytes(with_material(data, normalTexture={"index": 1, "texCoord": 1}))
-    asset = import_object(file)
-    words = "card.glb: 1 normal map with other texture coordinates than the base colour: left out"
-    assert asset.normal_map is None and asset.warnings == (words,)
 
 
 def in_a_material_file(folder: Path, line: str, picture: np.ndarray) -> ObjectAsset:
@@ -231,33 +191,6 @@ def test_a_material_file_names_normals(line: str, scale: float, tmp_path: Path) 
     np.testing.assert_allclose(vectors(asset.normal_map), of_the_bump(scale), atol=1e-6)
 
 
-def test_heights_and_what_is_missing_are_left_out_and_said(tmp_path: Path) -> None:
-    heights = np.uint8(np.tile(np.arange(0, 256, 4), (64, 1)))
-    said = {
-        "map_Bump the bumps.png": "the normal map 'the bumps.png' holds heights, and no normals; it is left out",
-        "norm gone.png": "the normal map 'gone.png' is missing; it is left out",
-    }
-    for line, words in said.items():
-        asset = in_a_material_file(tmp_path, line, heights)
-        assert asset.normal_map is None and asset.warnings == (f"card.obj: {words}",)
-
-
-def test_grey_pictures_and_colours_are_no_normals() -> None:
-    random = np.random.default_rng(0)
-    assert has_normals(bump() / np.float32(255.0))
-    assert not has_normals(np.full((8, 8, 3), 0.79, np.float32))
-    assert not has_normals(random.random((32, 32, 3), np.float32))
-
-
-def test_a_large_normal_map_is_averaged_as_numbers(tmp_path: Path) -> None:
-    stripes = np.full((8, 2048, 3), (255, 128, 128), np.uint8)
-    stripes[:, 1::2, 0] = 0
-    file = written(card(picture=stripes), tmp_path)
-    normals = vectors(import_object(file).normal_map)
-    assert normals.shape == (4, 1024, 3)
-    np.testing.assert_allclose(normals[..., 0], 0.0, atol=0.02)
-
-
 def test_gltf_out_has_the_same_normals(tmp_path: Path) -> None:
     part = load_description(str(written(halves(True, 0.7), tmp_path))).meshes[OBJECT]
     (tmp_path / "out.glb").write_bytes(encode_glb([pose_mesh(part, {})]))
@@ -265,34 +198,6 @@ def test_gltf_out_has_the_same_normals(tmp_path: Path) -> None:
     assert part.normal_map is not None and again.warnings == ()
     np.testing.assert_allclose(vectors(again.normal_map), vectors(part.normal_map), atol=0.012)
     np.testing.assert_allclose(again.mesh.uvs, part.mesh.uvs, atol=1e-5)
-
-
-@pytest.mark.medium
-def test_stock_mitsuba_renders_the_normals_that_are_written(tmp_path: Path) -> None:
-    file = written(card(), tmp_path)
-    renderer = advsearch.load_scene(file, settings=SEEN).renderer("pose", resolution=SIZE, denoise="none")
-    (tmp_path / "out").mkdir()
-    write_scene(renderer.scene, {}, tmp_path / "out" / "scene.xml", "")
-    mi = import_mitsuba()
-    theirs = torch.from_numpy(np.array(mi.render(mi.load_file(str(tmp_path / "out" / "scene.xml")), spp=256)))[..., :3]
-    ours = renderer.scene.render_radiance({}, 0, 256)
-    flat = load_description(str(file), setting_values=SEEN)
-    flat = replace(flat, object=replace(flat.object, normal_map=None))
-    without = MitsubaScene(flat, (SIZE, SIZE)).render_radiance({}, 0, 256)
-    assert (theirs - ours).abs().mean() < 0.03 * ours.mean() < (without - ours).abs().mean() * 3.0
-
-
-def test_surroundings_have_their_normal_maps(tmp_path: Path) -> None:
-    scene = trimesh.Scene()
-    scene.add_geometry(trimesh.creation.box(), node_name="box")
-    scene.add_geometry(card(vertices=CORNERS * 4.0), node_name="wall")
-    file = tmp_path / "room.glb"
-    file.write_bytes(scene.export(file_type="glb"))
-    described = load_description(f"{file}#box")
-    wall = described.meshes["wall"]
-    (default,) = described.notes
-    assert "without material" in default and described.object.normal_map is None and described.has_normal_maps
-    np.testing.assert_allclose(vectors(wall.normal_map), of_the_bump(), atol=1e-6)
 
 
 def test_no_adjoint_with_boundary_terms_is_valid(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from advsearch.controls import make_control, make_space
 from advsearch.errors import InputError
 from advsearch.scene.description import load_description
-from advsearch.scene.people import GAIT, PARAMETERS, Person, add_walk, load_body
+from advsearch.scene.people import PARAMETERS, Person, load_body
 
 PERSON = Person(load_body())
 
@@ -31,14 +31,6 @@ def test_someone_is_as_tall_as_asked_for(height: float, more: dict[str, float]) 
     tall = float(vertices[:, 2].max())  # with soles of 14 mm and hair of 14 mm, which grow along
     assert tall == pytest.approx(height, abs=0.05)
     assert float(vertices[:, 2].min()) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_the_bundled_mesh_is_the_person_that_stands() -> None:
-    mesh = load_description("person").object.mesh
-    assert mesh.rig is not None and load_description("person").object.metres == pytest.approx(PERSON.size, abs=1e-4)
-    size = np.ptp(PERSON.standing_points.numpy(), axis=0) / PERSON.size
-    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), size, atol=2e-6)
-    assert torch.equal(mesh.rig.offsets({}), torch.zeros(len(mesh.vertices), 3))
 
 
 @pytest.mark.parametrize("walk", range(0, 360, 30))
@@ -86,15 +78,6 @@ def test_legs_of_a_walker_stay_as_long_as_they_are() -> None:
             rise = PERSON._compute_leg_corrections(points[:-bones], points[-bones:], values)
             raised.append(abs(float(rise["l"])))
         assert max(raised) <= most, (stride, max(raised))
-
-
-def test_a_turn_of_the_walk_is_the_same_with_the_sides_exchanged() -> None:
-    left, right = (add_walk(PERSON._complete_values(numbers(walk=walk, stride=1.0))) for walk in (40.0, 220.0))
-    for joint in GAIT:
-        torch.testing.assert_close(left[f"left_{joint}"], right[f"right_{joint}"])
-    heel = add_walk(PERSON._complete_values(numbers(walk=0.0, stride=1.0)))
-    assert float(heel["left_hip"]) > 20 > -5 > float(heel["right_hip"]), "the leg whose heel strikes is ahead"
-    assert float(heel["left_shoulder"]) < 0 < float(heel["right_shoulder"]), "arms swing against the legs"
 
 
 @pytest.mark.parametrize(
@@ -156,27 +139,10 @@ def test_gradients_of_every_number_are_those_of_differences() -> None:
         assert float(slope) == pytest.approx(rise, rel=1e-3, abs=1e-3), name
 
 
-def test_the_derivative_at_an_average_weight_is_that_of_one_side() -> None:
-    def waist(weight: float, step: float = 0.0) -> float:
-        return float(PERSON.pose(numbers(weight=weight + step))[:718].square().sum())
-
-    weight = torch.tensor(0.5, requires_grad=True)
-    (slope,) = torch.autograd.grad(PERSON.pose({"weight": weight})[:718].square().sum(), weight)
-    assert float(slope) == pytest.approx((waist(0.5, 0.02) - waist(0.5)) / 0.02, rel=0.1)
-
-
 def test_the_control_refuses_what_has_no_joints_and_angles_past_their_limits() -> None:
-    with pytest.raises(InputError, match="object has no joints; take `object=person`"):
+    with pytest.raises(InputError, match="no joints"):
         make_space([make_control("body")], load_description("mug"))
     with pytest.raises(InputError, match=r"body\.left_elbow"):
         make_control("body", {"left_elbow": [0, 170]})
     space = make_space([make_control("body", {"left_elbow": [0, 140]})], load_description("person"))
     assert len(space.start) == 1 and 40 < float(space.describe(space.start)["body.mass"]["value"]) < 90
-
-
-def test_clothes_are_areas_that_can_be_painted_alone() -> None:
-    scene = load_description("person")
-    for area in ("shirt", "trousers", "skin", "hair", "shoes"):
-        space = make_space([make_control(f"texture:{area}", {"epsilon": 0.5})], scene)
-        sheet = space.controls[0].get_printable_colors(space.start)
-        assert sheet is not None and sheet.shape[-1] == 4 and 0.005 < float(sheet[..., 3].mean()) < 0.5

@@ -10,14 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-import advsearch
 from advsearch.engine.loading import Scene, load_scene
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import load_description
 from advsearch.scene.grounds import Photograph, compute_irradiance
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.settings import resolve_settings
 
 SIZE = 32
 AWAY = {"pose.x": 900.0, "pose.scale": 0.01}
@@ -133,23 +130,3 @@ def test_photographed_environments_show_their_floor_unless_a_table_is_asked_for(
         assert load_description("mug", room(), setting_values=given).photograph is None, given
     assert replace(load_description("mug", room()), backdrop=True).photograph is None
     assert load_scene("mug", room()).with_settings({"ground.kind": "table"}).description.photograph is None
-
-
-def test_the_kind_of_ground_is_told_by_its_name() -> None:
-    scene = load_scene("mug", room(), settings={"ground.kind": "table", "camera.azimuth": 7.0})
-    assert repr(scene) == "Scene('mug', 'room', camera.azimuth=7.0, ground.kind='table')"
-    assert resolve_settings(scene.description.requested_values) == scene.description.values
-
-
-def test_what_contradicts_it_is_explained() -> None:
-    with pytest.raises(InputError, match=r"ground\.kind=photograph: the scene has no environment map to show"):
-        load_description("mug", "none", setting_values={"ground.kind": "photograph"})
-    with pytest.raises(InputError, match=r"ground\.kind=photograph and `set` ground\.red contradict each other"):
-        load_description("mug", room(), setting_values={"ground.kind": "photograph", "ground.red": 0.5})
-    with pytest.raises(UnknownNameError, match=r"unknown ground.kind 'tabel'. Did you mean 'table'"):
-        load_description("mug", setting_values={"ground.kind": "tabel"})
-
-
-def test_a_sweep_refuses_a_photograph_where_there_is_none() -> None:
-    with pytest.raises(InputError, match=r"ground\.kind=photograph.*no environment map"):
-        advsearch.sweep("mug", environment="studio,none", set={"ground.kind": "photograph"}, trials=0)

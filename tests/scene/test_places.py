@@ -7,16 +7,14 @@ import pytest
 import torch
 
 from advsearch.engine.loading import load_scene
-from advsearch.scene import library
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.geometry import compute_base_vertices, compute_footprint, is_overlapping
+from advsearch.scene.geometry import compute_base_vertices, compute_footprint
 from advsearch.scene.grounds import LUMINANCE, is_enclosed, is_paved
-from scenes.places import crossing, room
-from scenes.places.avenue import KERB, StreetPlan, lamp_places
+from scenes.places import room
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
-PLACES = {"crossing": "car", "car-park": "car", "room": "mug"}
+PLACES = {"avenue": "car", "crossing": "car", "car-park": "car", "room": "mug"}
 """Environments, and what stands in them."""
 
 
@@ -73,46 +71,6 @@ def test_below_the_horizon_there_is_ground_all_around(place: str) -> None:
         assert float(seen.depth.max()) < 5.0
 
 
-@pytest.mark.parametrize("plan", [crossing.CROSSING, crossing.CAR_PARK])
-def test_posts_and_trees_stand_on_pavements_or_between_bays(plan: StreetPlan) -> None:
-    lamps = lamp_places(plan.posts)
-    assert (np.hypot(lamps[:, 0], lamps[:, 1]) > 4.0).all()
-    if plan is crossing.CROSSING:
-        places = [(one.x, one.y) for one in plan.trees] + [(x, y) for x, y, _ in plan.posts]
-        for x, y in places:
-            in_street = -2.3 < y < 5.8 or (crossing.NEAR < x < crossing.FAR and abs(y) < crossing.SIDE_END)
-            assert not in_street, (x, y)
-
-
-@pytest.mark.medium
-def test_the_crossing_has_a_stop_sign_that_faces_who_comes_and_a_zebra_ahead() -> None:
-    scene = load_description("car", "crossing")
-    parts = {name: part for name, part in metres(scene).items() if name in ("sign", "sign-metal", "sign-tube")}
-    sign = np.concatenate(list(parts.values()))
-    assert sign[:, 2].min() == pytest.approx(KERB + crossing.SIGN_LOW, abs=1e-3)
-    assert np.ptp(sign[:, 2]) == pytest.approx(library.load_object("stop-sign").metres, rel=1e-3)
-    face = scene.surrounding_meshes["sign"].mesh
-    assert face.normals[face.faces].mean(axis=(0, 1))[0] < -0.9  # it faces where the object comes from
-    road = metres(scene)["road"]
-    paint = road[np.abs(road[:, 2] - 0.004) < 1e-4]
-    zebra = paint[(np.abs(paint[:, 0] - crossing.ZEBRA[0]) < 1e-3) & (paint[:, 1] > -2.0) & (paint[:, 1] < 5.6)]
-    widths = np.diff(np.unique(np.round(zebra[:, 1], 3)))
-    assert len(widths) > 10 and widths == pytest.approx(np.full(len(widths), crossing.STRIPE), abs=1e-3)
-    car = compute_footprint(scene.base_vertices * scene.metres)
-    assert car.outline[:, 0].max() < crossing.STOP[0], "the car is beyond the stop line"
-
-
-def test_a_bay_is_as_large_as_bays_are_and_the_car_is_in_one() -> None:
-    scene = load_description("car", "car-park")
-    car = compute_footprint(scene.base_vertices * scene.metres)
-    assert np.abs(car.outline[:, 0]).max() < crossing.DEEP / 2.0 and np.abs(car.outline[:, 1]).max() < 1.2
-    row = min(crossing.ROWS, key=abs)
-    assert row == -crossing.DEEP / 2.0
-    neighbour = load_description("car", "car-park", things="car@0,2.5")
-    beside = compute_footprint(compute_base_vertices(neighbour.meshes["car"]) * neighbour.metres)
-    assert not is_overlapping(car, beside) and not any("stand in" in one for one in neighbour.notes)
-
-
 def test_things_stand_on_the_table_and_beyond_it_on_the_floor() -> None:
     scene = load_description("mug", "room", things="bottle@0.2,0.2; chair@0,1.2")
     low = {name: float((compute_base_vertices(scene.meshes[name]) * scene.metres)[:, 2].min()) for name in scene.things}
@@ -142,14 +100,3 @@ def test_by_day_the_window_lights_the_room_and_in_the_evening_the_lamp(
     with torch.no_grad():
         picture = renderer(renderer.start, 0, 16)
     assert 0.15 < float(picture.mean()) < 0.75 and float((picture > 0.99).float().mean()) < 0.1
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize("place", ["crossing", "car-park"])
-def test_other_lights_of_a_place_have_the_maps_of_the_avenue(place: str) -> None:
-    for light in ("", "-dusk", "-night"):
-        one, other = library.load_environment(f"{place}{light}"), library.load_environment(f"avenue{light}")
-        assert np.array_equal(one.radiance, other.radiance) and one.candelas == other.candelas
-        assert one.name == f"{place}{light}" and one.ground == place
-    assert load_description("car", f"{place}-night").surrounding_meshes["street-lamps"].emission is not None
-    assert load_description("car", place).surrounding_meshes["street-lamps"].emission is None

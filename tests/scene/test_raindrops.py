@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.errors import InputError
 from advsearch.scene.mitsuba_backend.own_plugins import APERTURE_RADIUS, SHEET_DISTANCE, WATER_IOR, sample_raindrops
 from advsearch.scene.mitsuba_backend.variant import mi
 
@@ -88,16 +87,6 @@ def test_rays_are_refracted_by_snells_law_and_lose_what_fresnel_says() -> None:
     assert changed > 100 and near >= 594, "all but those at an edge, where the grid of the drops decides"
 
 
-def test_a_drop_shows_the_scene_upside_down() -> None:
-    """Above the middle of a drop the camera looks down behind it, as far as a lens of its focal length bends."""
-    radius, curve, up = 3.0, 4.5, 0.3
-    for sign in (1.0, -1.0):
-        ahead = np.array([0.0, sign * up, SHEET_DISTANCE]) / math.hypot(up, SHEET_DISTANCE)
-        out, _ = expected(ahead, np.zeros(2), np.array([[0.0, 0.0, radius, curve]]))
-        turned = math.atan2(out[1], out[2]) - math.atan2(ahead[1], ahead[2])
-        assert turned == pytest.approx(-sign * up * (WATER_IOR - 1.0) / curve, rel=0.1)
-
-
 @pytest.mark.medium
 def test_what_is_true_of_a_picture_is_so_of_the_scene_without_drops() -> None:
     wet, dry = renderer_of(40), renderer_of(0)
@@ -121,11 +110,3 @@ def test_a_textures_derivative_goes_through_the_drops() -> None:
             values.append(float((renderer.radiance(u.detach() + h * way, seed=3, spp=256) * weights).mean()))
     assert u.grad is not None
     assert float(u.grad @ way) == pytest.approx((values[0] - values[1]) / 0.1, rel=0.05)
-
-
-def test_other_drops_come_by_another_seed_and_a_rig_has_none() -> None:
-    (_, first, grid), (_, second, _) = (sample_raindrops(30, 1.5, seed, 0.5) for seed in (0, 1))
-    assert not np.array_equal(first, second)
-    assert np.array_equal(grid, sample_raindrops(30, 1.5, 0, 0.5)[2])
-    with pytest.raises(InputError, match=r"camera\.drops: expected a number from 0 to 2000"):
-        renderer_of(-1)

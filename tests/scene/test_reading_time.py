@@ -89,5 +89,5 @@ def test_a_file_that_names_too_many_is_refused(tmp_path: Path) -> None:
         "mtllib " + " ".join(f"m{number}.mtl" for number in many) + "\n",
         "".join(f"usemtl m{number}\n" for number in many),
     ):
-        with pytest.raises(FileFormatError, match=r"expected at most 10,000 (lines that name )?material"):
+        with pytest.raises(FileFormatError, match="10,000"):
             read(tmp_path, lines + POINTS + "f 1 2 3\n")

@@ -18,7 +18,6 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls.geometry import _Solve
-from advsearch.models.model import compute_checkpointed
 from advsearch.scene.color import LINEAR_LIMIT, linear_to_srgb
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_backend.transport import Vertices
@@ -109,13 +108,3 @@ def test_a_shown_picture_is_the_encoded_one() -> None:
         found.append((picture.detach(), at.grad))
     assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
     assert torch.autograd.gradgradcheck(formation.display, torch.linspace(0.02, 0.6, 9).double().requires_grad_())
-
-
-def test_what_is_computed_again_is_differentiated_as_it_is() -> None:
-    def network(x: Tensor) -> dict[str, Tensor]:
-        return {"one": x.sin() * x, "sum": x.pow(3).sum(dim=0)}
-
-    x = torch.linspace(-1.0, 1.0, 6, dtype=torch.float64).reshape(2, 3).requires_grad_()
-    for name in ("one", "sum"):
-        assert torch.autograd.gradcheck(lambda at, name=name: compute_checkpointed(network, at.sin())[name], x)
-        assert torch.autograd.gradgradcheck(lambda at, name=name: compute_checkpointed(network, at.sin())[name], x)

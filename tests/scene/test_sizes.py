@@ -13,11 +13,10 @@ import torch
 from advsearch.controls.camera import CameraControl
 from advsearch.controls.path import PathControl
 from advsearch.engine.loading import load_scene, scene_to_settings
-from advsearch.errors import InputError
 from advsearch.scene import library
 from advsearch.scene.assembly import pose_mesh
 from advsearch.scene.assets import is_road_vehicle
-from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.description import load_description
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing.objects import import_object
@@ -73,52 +72,6 @@ def test_a_car_stands_in_its_lane_at_its_size(tmp_path: Path, longest: float, sa
     assert {name: scene_to_settings(scene)[name] for name in said} == said
 
 
-def test_what_is_said_of_a_size_wins_over_what_a_file_says(tmp_path: Path) -> None:
-    path = str(glb_of(tmp_path, "car", 4.9))
-    assert load_description(path, unit="cm").metres == pytest.approx(0.049, rel=1e-5)
-    assert load_description(path, size=4.1).metres == 4.1
-    assert load_description("mug", size=0.1).metres == 0.1
-    assert load_description("mug").metres == pytest.approx(0.11, abs=0.001)
-
-
-@pytest.mark.parametrize(
-    ("name", "environment", "said", "words"),
-    [
-        ("sedan", "studio", {}, "size in metres is not known; it is 490 in its file.*`unit=cm`, which makes it 4.9 m"),
-        ("my-car", "studio", {"unit": "m"}, "longest side is 490 m; a car's is 2.5 to 6 m. If that is wrong"),
-        ("thing", "studio", {"unit": "m"}, "longest side is 490 m. If that is wrong"),
-        ("thing", "studio", {}, ""),
-        ("thing", "street", {}, "it is taken for 1 m, as the road is in metres. Give its longest side"),
-        ("sedan", "studio", {"size": 9.0}, ""),
-    ],
-)
-def test_a_size_that_is_unlike_its_name_is_asked_for(
-    tmp_path: Path, name: str, environment: str, said: dict[str, object], words: str
-) -> None:
-    notes = " ".join(load_description(str(box(tmp_path, name, 490.0)), environment, up="z", **said).notes)  # type: ignore[arg-type]
-    if words:
-        with pytest.raises(AssertionError, match=words):
-            raise AssertionError(notes)
-    else:
-        assert not notes
-
-
-def test_what_cannot_be_a_size_is_refused(tmp_path: Path) -> None:
-    path = str(box(tmp_path, "sedan", 1.0))
-    for said, words in (
-        ({"size": 4.9, "unit": "cm"}, "both say how large"),
-        ({"unit": "yd"}, "expected one of mm, cm, m, in"),
-        ({"size": 0.0}, "expected a longest side of 0.0001 to 10000 metres"),
-        ({"size": float("nan")}, "expected a longest side of"),
-    ):
-        with pytest.raises(InputError, match=words):
-            load_description(path, **said)
-    with pytest.raises(InputError, match="mug is no mesh file"):
-        load_description("mug", unit="cm")
-    huge = load_description(str(glb_of(tmp_path, "planet", 1e6)))
-    assert huge.object.metres is None  # nothing that has a size in metres
-
-
 def test_a_node_has_the_size_that_it_has_in_its_scene(tmp_path: Path) -> None:
     part = pose_mesh(load_description(str(box(tmp_path, "seat", 1.0)), up="z").meshes["object"], {})
     both = [
@@ -128,10 +81,6 @@ def test_a_node_has_the_size_that_it_has_in_its_scene(tmp_path: Path) -> None:
     (tmp_path / "room.glb").write_bytes(encode_glb(both))
     assert import_scene(tmp_path / "room.glb", "seat").object.metres == pytest.approx(1.0, rel=1e-5)
     assert import_object(tmp_path / "room.glb").metres == pytest.approx(4.0, rel=1e-5)
-
-
-def away(scene: SceneDescription) -> float:
-    return float(np.linalg.norm(camera_to_world(scene)[:3, 3] - scene.base_vertices.mean(axis=0)))
 
 
 def test_a_path_of_a_file_is_in_metres(tmp_path: Path) -> None:
@@ -144,17 +93,6 @@ def test_a_path_of_a_file_is_in_metres(tmp_path: Path) -> None:
     assert (place - middle) * 5.0 == pytest.approx([20.0, 0.0, 1.0], abs=1e-4)
     said = path.describe(torch.tensor([0.0]))["path.distance"]
     assert said["unit"] == "metres" and said["value"] == pytest.approx(401.0**0.5, abs=1e-3)
-
-
-def test_the_floor_of_a_photograph_is_seen_from_a_tripod(tmp_path: Path) -> None:
-    path = str(box(tmp_path, "sedan", 1.0))
-    for said, given, height in (
-        ({"size": 5.0}, {}, 1.6 / 5.0),
-        ({"size": 5.0}, {"ground.height": 2.0}, 2.0 / 5.0),
-        ({}, {}, 3.0),
-        ({}, {"ground.height": 2.0}, 2.0),
-    ):
-        assert load_description(path, setting_values=given, up="z", **said).capture_height == pytest.approx(height)  # type: ignore[arg-type]
 
 
 SIZES = {

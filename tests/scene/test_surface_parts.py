@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from advsearch.scene import library
-from advsearch.scene import surface_parts as parts_of
 from advsearch.scene.assets import Mesh
 from advsearch.scene.surface_parts import MAP_SIZE, SurfaceParts
 
@@ -65,9 +64,3 @@ def test_a_place_keeps_its_neighbourhood_on_a_new_map() -> None:
         cells = made.find_cells(faces, made.mesh.uvs[own.faces].mean(axis=1).astype(np.float64))
         away = np.linalg.norm(made.centers[cells] - made.centers[MAP_SIZE**2 :], axis=1)
         assert np.median(away) < 0.05 * np.ptp(own.vertices) and (away < 0.15 * np.ptp(own.vertices)).mean() > 0.97
-
-
-def test_faces_of_a_very_large_mesh_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts_of, "MAX_FACES", 3)
-    parts = SurfaceParts(board((0.0, 0.5), (0.5, 1.0)))
-    assert parts.count == MAP_SIZE**2 and list(parts.part_slices) == ["cell"] and len(parts.centers) == MAP_SIZE**2

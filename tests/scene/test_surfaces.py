@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from advsearch.engine.loading import load_scene
-from advsearch.errors import UnknownNameError
 from advsearch.runs.files import write_layers
-from advsearch.scene.formation import AOVS, CHANNELS, Surfaces, parse_aovs
+from advsearch.scene.formation import AOVS, CHANNELS, Surfaces
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
 SIZE = 32
@@ -78,9 +77,3 @@ def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tu
     assert float((facing < 0.0).float().mean()) > 0.9
     nothing = found.id == 0
     assert bool(nothing.any()) and bool(found.depth[nothing].isinf().all()) and not found.normal[nothing].any()
-
-
-def test_layers_are_named_in_a_list() -> None:
-    assert parse_aovs(None) == () and parse_aovs("depth, mask,depth") == ("depth", "mask")
-    with pytest.raises(UnknownNameError, match=r"unknown aov 'deep'"):
-        parse_aovs("deep")

@@ -16,10 +16,6 @@ from torch import Tensor
 import advsearch
 from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
-from advsearch.experiment import RunContext, run_and_save
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.studies import curve
-from advsearch.questions.attack.summary import load_attack_summary
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
@@ -147,7 +143,7 @@ def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_ent
     cotangent = torch.ones(1, 2, 3)
     both = small.multiply_transposed(cotangent), made.multiply_transposed(cotangent)
     torch.testing.assert_close(*both, rtol=2 * HALF, atol=1e-6)
-    assert small.bytes == bytes_an_entry * small._first.entries + 2 * (4 + 6) * 2
+    assert small.bytes == bytes_an_entry * small._sharp.entries + 2 * (4 + 6) * 2
 
 
 def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for() -> None:
@@ -162,26 +158,25 @@ def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for()
 
 
 @pytest.mark.parametrize(
-    ("controls", "options", "reason"),
+    ("controls", "options", "can_predict"),
     [
-        (["texture"], {}, None),
-        (["patch"], {}, None),
-        (["texture", "pose"], {}, "pose.yaw changes more than base colours and light"),
-        ({"texture": {}, "haze": {"density": 0.2}}, {}, "there is haze"),
-        (["texture"], {"denoise": "none"}, "noise is part of the picture without the denoiser"),
-        (["texture"], {"estimators": {"texture": "adjoint"}}, "the estimator of texture.texels is forced"),
+        (["texture"], {}, True),
+        (["patch"], {}, True),
+        (["texture", "pose"], {}, False),
+        ({"texture": {}, "haze": {"density": 0.2}}, {}, False),
+        (["texture"], {"denoise": "none"}, False),
+        (["texture"], {"estimators": {"texture": "adjoint"}}, False),
     ],
 )
-def test_where_it_can_predict(controls: object, options: dict[str, object], reason: str | None) -> None:
+def test_where_it_can_predict(controls: object, options: dict[str, object], can_predict: bool) -> None:
     made = advsearch.load_scene("mug").renderer(controls, resolution=16, **options)  # type: ignore[arg-type]
-    refusal = lights.find_refusal(made)
-    assert (None if refusal is None else refusal.text) == reason
+    assert (lights.find_refusal(made) is None) == can_predict
 
 
 @pytest.mark.medium
 def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(linear, "MAX_BYTES", 1000)
-    with pytest.raises(linear.TransportTooLargeError, match="would take more than"):
+    with pytest.raises(linear.TransportTooLargeError, match="would take"):
         linear.LinearRenderer(renderer, renderer.start, seed=1)
 
 
@@ -211,27 +206,6 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
     found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]
     assert found.smallest is not None and found.smallest.epsilon is not None and found.smallest.searches > 1
     assert made == 1 and guesses >= 5
-
-
-@pytest.mark.medium
-@pytest.mark.slow
-def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    made, linearised = 0, lights.make_predictor
-
-    def counted(*given: Any) -> Any:
-        nonlocal made
-        made += 1
-        return linearised(*given)
-
-    monkeypatch.setattr(searching, "make_predictor", counted)
-    settings: Any = {**SMALL, "baseline": False, "average": 0, "resolution": (SIZE, SIZE)}
-    config = AttackConfig(object="mug", epsilon="0.002,0.004", run=str(tmp_path / "curve"), **settings)
-    found = run_and_save(curve, RunContext(config))
-    assert made == 1 and [one.robust for one in found.curve] == [1, 1]
-    alone = advsearch.attack("mug", epsilon=0.004, run=tmp_path / "alone", **settings)
-    shared = load_attack_summary(tmp_path / "curve" / "parts" / found.parts[1])
-    assert made == 2 and alone.summary.verified is not None and shared.verified == alone.summary.verified
-    assert shared.transport is not None and shared.transport.seconds == 0.0
 
 
 def test_a_guess_learns_how_optimistic_a_prediction_was(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,20 +240,3 @@ def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_wit
     assert stopped.summary.ending == "interrupted"
     advsearch.attack("mug", run=tmp_path / "parts", resume=True, **settings)
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        ({}, "pays from 16"),
-        ({"over": ["camera"]}, "pays from 16"),
-        ({"controls": {"camera": {}}}, "light on surfaces pays from 32"),
-        ({"specialise": False}, "nothing is left out"),
-    ],
-)
-def test_a_search_that_renders_says_why(options: dict[str, object], reason: str) -> None:
-    found = advsearch.attack("mug", **{**SMALL, "steps": 3, "resolution": 32, "baseline": False, **options})  # type: ignore[arg-type]
-    told = found.summary.transport
-    assert told is not None and not told.used and reason in str(told.reason)
-    assert found.summary.renders["products"] == 0

@@ -9,7 +9,7 @@ import numpy as np
 
 from advsearch.scene.glb import GlbBuffer
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.unread import TrackedKeys, join_names
+from advsearch.scene.importing.unread import TrackedKeys
 
 
 def test_what_is_not_read_is_listed_as_it_is_spelled() -> None:
@@ -30,12 +30,6 @@ def test_of_several_names_for_a_thing_the_first_is_read() -> None:
     assert "k" in keys and len(keys) == 2 and keys.get_spelling("k") == "k"
 
 
-def test_messages_are_bounded() -> None:
-    text = join_names([f"{number}{'x' * 5000}" for number in range(1000)] * 2)
-    assert len(text) < 2000 and text.endswith(" and 988 more")
-    assert join_names(["a", "b"]) == "'a', 'b'"
-
-
 def test_keys_inside_of_extensions_that_are_read_are_named(tmp_path: Path) -> None:
     buffer = GlbBuffer()
     points = buffer.add_accessor(np.eye(3, dtype=np.float32), "VEC3", bounds=True)
@@ -51,17 +45,3 @@ def test_keys_inside_of_extensions_that_are_read_are_named(tmp_path: Path) -> No
     text = " ".join(import_object(tmp_path / "a.glb").warnings)
     assert "'extensions.KHR_materials_emissive_strength.emissiveUnit' is left out" in text
     assert "emissiveStrength'" not in text
-
-
-def test_a_second_normal_map_of_a_material_is_named(tmp_path: Path) -> None:
-    from PIL import Image
-
-    for name in ("a.png", "b.png"):
-        Image.new("RGB", (8, 8), (128, 128, 255)).save(tmp_path / name)
-    (tmp_path / "a.obj").write_text(
-        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
-    )
-    for second, is_named in (("a.png", False), ("b.png", True)):
-        (tmp_path / "a.mtl").write_text(f"newmtl m\nnorm a.png\nmap_Bump {second}\n")
-        text = " ".join(import_object(tmp_path / "a.obj").warnings)
-        assert ("'map_Bump' is left out" in text) == is_named

@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from advsearch.controls import make_control, make_space
 from advsearch.engine.loading import Scene, fit_camera, load_scene
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.grounds import (
-    CameraView,
     Surroundings,
     find_surroundings,
     find_valid_range,
@@ -21,7 +19,7 @@ from advsearch.scene.grounds import (
     make_camera_view,
 )
 from advsearch.scene.library import load_environment, load_object
-from scenes.places.road import EDGES, EYE, LENGTH
+from scenes.places.road import EDGES, EYE
 
 SIDE = 96
 FAR_SIDE = 90.0
@@ -112,16 +110,6 @@ def test_from_60_m_the_houses_stand_below_the_road() -> None:
     )
 
 
-def test_along_a_street_it_fits_as_far_as_its_road() -> None:
-    scene = load_description(
-        "car", "street", setting_values={"camera.azimuth": 0.0, "camera.elevation": 2.0, "camera.distance": 40.0}
-    )
-    far, high = find_valid_range(find_surroundings(scene), make_camera_view(scene))  # type: ignore[arg-type]
-    assert LENGTH / 2.0 < far < LENGTH / 2.0 + 10.0
-    assert high == 2.0 * EYE
-    assert not list_view_remarks(scene, [make_camera_view(scene)])
-
-
 def photographed(height: float | None = None, radius: float | None = None, **said: float) -> SceneDescription:
     given = {"ground.height": height, "ground.radius": radius}
     lit = EnvironmentAsset("hall", np.ones((8, 16, 3), np.float32), photographed=True)
@@ -148,43 +136,3 @@ def test_a_photograph_fits_by_its_height_and_its_empty_floor() -> None:
         "a picture, which fits a camera up to 8 m away and 3.2 m high; the camera is 8."
         in list_view_remarks(away, [make_camera_view(away)])[0]
     )
-
-
-def test_what_has_no_ground_to_fit_has_no_bound() -> None:
-    for scene in (
-        load_description("mug", "studio"),
-        load_description("car", "noon"),
-        load_description("mug", "street", setting_values={"ground.size": 0.0}),
-    ):
-        assert find_surroundings(scene) is None
-    noon = load_description("car", "noon", setting_values={"ground.kind": "road"})
-    assert find_valid_range(find_surroundings(noon), make_camera_view(noon))[1] == math.inf  # type: ignore[arg-type]
-    assert find_valid_range(Surroundings(1.5, 12.0, math.inf), CameraView(0.0, 180.0, 0.0, 1.0, -3.0)) == (12.0, 3.0)
-
-
-@pytest.mark.parametrize(
-    ("controls", "words"),
-    [
-        (
-            {"camera": {"azimuth": [0, 360], "elevation": 3.0, "distance": [8, 40]}},
-            r"\d\d % of the views are past that, up to",
-        ),
-        ({"camera": {"azimuth": [0, 10], "elevation": 3.0, "distance": [8, 30]}}, ""),
-        ({"path": {"path": "approach"}}, "100 % of the views are past"),
-        ({"texture": {}}, "the camera is 6.75 m away and 3.88 m high"),
-        ({"environment": {}}, "`environment.rotation` turns against the road"),
-    ],
-)
-def test_a_search_that_goes_past_it_says_so(controls: dict[str, dict[str, object]], words: str) -> None:
-    scene = load_description("car", "street")
-    notes = make_space([make_control(name, said) for name, said in controls.items()], scene).list_notes(scene)
-    assert len(notes) == bool(words)
-    if words:
-        with pytest.raises(AssertionError, match=words):
-            raise AssertionError(notes[0])
-
-
-def test_a_street_that_is_turned_fits_nowhere() -> None:
-    scene = load_description("car", "street", setting_values={"environment.rotation": 30.0, "camera.elevation": 3.0})
-    assert find_valid_range(find_surroundings(scene), make_camera_view(scene)) == (0.0, 0.0)  # type: ignore[arg-type]
-    assert "turns against the road" in list_view_remarks(scene, [make_camera_view(scene)])[0]

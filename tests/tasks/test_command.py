@@ -105,16 +105,8 @@ def test_the_margin_is_the_largest_difference_in_envelopes_less_one() -> None:
     assert kept["text"] == "steer 0.1, gas -0.45, clean 0.1, -0.2" and kept["envelopes"] == pytest.approx(2.5)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_an_action_that_is_no_number_is_neither_right_nor_a_success(bad: float) -> None:
-    (judgement,) = judged().judge(torch.tensor([[bad, -0.2]]), torch.tensor([0.1, -0.2]))
-    assert judgement.is_not_a_number and not judgement.right and not judgement.success and judgement.payload is None
-    with pytest.raises(InputError, match="the clean action has NaN or infinity"):
-        Command(envelope=1).after_calibration(torch.tensor([[bad]]), None)
-
-
 @pytest.mark.medium
-def test_a_target_is_reached_within_its_envelope(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_target_is_reached_within_its_envelope() -> None:
     model = advsearch.load_model(Colours(), task=Command(), input_size=8)
     asked = Command(envelope=0.1, names="r,g,b").on(model, target="g=0.9")
     task = asked.after_calibration(torch.tensor([[0.5, 0.5, 0.5]]), None)
@@ -128,21 +120,10 @@ def test_a_target_is_reached_within_its_envelope(monkeypatch: pytest.MonkeyPatch
     assert reached[0].prediction.label == "action within the envelope of the target"
     positional = Command(envelope=0.1).on(model, target="0.9, 0.5,0.5").target
     assert positional is not None and positional.tolist() == pytest.approx([0.9, 0.5, 0.5])
-    for target, message in {
-        "x=1": "expected elements that `names` has", "a": "finite number", "nan": "finite number",
-    }.items():  # fmt: skip
-        with pytest.raises(InputError, match=message):
-            Command(envelope=0.1, names="r,g,b").on(model, target=target)
     with pytest.raises(InputError, match="more than two envelopes from the clean one"):
         replace(asked, target=torch.tensor([0.5, 0.65, 0.5])).after_calibration(torch.full((1, 3), 0.5), None)
     with pytest.raises(InputError, match="an action of 3 elements, got 1"):
         replace(asked, target=torch.tensor([9.0])).after_calibration(torch.full((1, 3), 0.5), None)
-    with pytest.raises(InputError, match="minimise: the clean action is within its envelope"):
-        Command(envelope=0.1).on(model, minimise=True)
-    with pytest.raises(InputError, match="envelope: expected how far"):
-        Command().on(model)
-    with pytest.raises(InputError, match="label: task command has no classes"):
-        task.check(Facts("mug", label="mug"))
 
 
 # ---- options --------------------------------------------------------------------------------------------------------
@@ -151,19 +132,10 @@ def test_a_target_is_reached_within_its_envelope(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"envelope": 0}, "expected numbers over 0"),
         ({"envelope": [0.1, -1]}, "expected numbers over 0"),
-        ({"envelope": math.inf}, "expected a finite number"),
-        ({"envelope": True}, "expected a finite number"),
-        ({"envelope": []}, "expected a finite number"),
         ({"envelope": {"a": 1}}, "expected a finite number"),
-        ({"names": ["a", "a"]}, "expected different names"),
-        ({"names": ["a", 3]}, "expected texts"),
         ({"names": "a\x1b[2J"}, "expected texts"),
-        ({"state": [1, 2]}, "expected numbers by name"),
-        ({"state": {"a": [1, [2]]}}, "expected a finite number"),
         ({"state": {"a": math.nan}}, "expected a finite number"),
-        ({"state": {"a": [0.0] * 4097}}, "4,097 of them"),
         ({"state": {"a": [0.0] * 4096, "b": 1}}, "at most 4,096 numbers in all"),
     ],
 )
@@ -184,13 +156,6 @@ def test_a_state_is_read_from_a_file_that_is_not_trusted(tmp_path: Path) -> None
     for path in (tmp_path, tmp_path / "none.json", Path("/dev/zero")):
         with pytest.raises(FileFormatError):
             Command(state=str(path))
-
-
-def test_options_of_an_instance_are_written_down() -> None:
-    task = make_task(ASKED)
-    setting = to_setting(task)
-    assert setting == {"name": "command", "state": {"speed": [2.0]}, "envelope": [0.4], "names": ["yaw rate"], "units": ["rad/s"]}  # fmt: skip # noqa: E501
-    assert make_task(json.loads(json.dumps(setting))) == task and to_setting(Command()) == "command"
 
 
 # ---- policies -------------------------------------------------------------------------------------------------------
@@ -215,16 +180,8 @@ def test_a_policy_gets_pictures_and_a_state(tmp_path: Path) -> None:
         assert model.differentiable
     again = advsearch.load_model(model, task=make_task({**ASKED, "state": {"speed": 4}}))
     torch.testing.assert_close(again(pictures), 2.0 * expected)
-    for asked, message in {
-        "command": "takes more than pictures; give task command the `state`",
-        "classification": "takes more than pictures",
-    }.items():
-        with pytest.raises(ModelError, match=message):
-            advsearch.load_model(exported(tmp_path), task=make_task(asked))
     with pytest.raises(ModelError, match=r"cannot be called with pictures and a state of sped \(N, 1\)"):
         advsearch.load_model(TowardsBlue(), task=make_task({**ASKED, "state": {"sped": 2}}), input_size=SIDE)
-    with pytest.raises(ModelError, match="expected actions of 2 elements, as task command has envelope"):
-        advsearch.load_model(TowardsBlue(), task=make_task({**ASKED, "envelope": [1, 2]}), input_size=SIDE)
 
 
 @pytest.mark.parametrize(
@@ -286,17 +243,3 @@ def test_a_texture_turns_a_policy_the_wrong_way_and_the_page_says_no_more(
     assert found["renders"]["gradient"] > 0 or found["renders"].get("products", 0) > 0
     kept: Any = AttackConfig.from_yaml(tmp_path / "run" / "run.yaml").task
     assert kept["state"] == {"speed": 2}
-    page = (tmp_path / "run" / "report.html").read_text()
-    assert "The commanded action left its envelope (yaw rate above it) in 20 of 20 fresh renders" in page
-    assert "nothing moves, and no later picture follows from it" in page and "moved the" not in page
-
-
-@pytest.mark.medium
-def test_a_sweep_counts_actions_within_the_envelope() -> None:
-    model = advsearch.load_model(TowardsBlue(), task=make_task(ASKED), input_size=SIDE)
-    asked = {"name": "command", "state": {"speed": 2}, "envelope": 0.3}
-    grid = {"pose.y": [-0.3, 0.0, 0.3]}
-    found = advsearch.sweep("mug", model, task=asked, grid=grid, trials=0, resolution=SIDE, spp=4, denoise="none")
-    rows = list(found.rows())
-    assert [row.correct for row in rows] == [False, True, False]
-    assert [str(row.label).partition("(")[2] for row in rows] == ["action 1 above it)", "", "action 1 below it)"]

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from advsearch import load_model
 from advsearch.errors import InputError, ModelError
-from advsearch.models.labels import read_labels
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import DetectionTruth
 from advsearch.tasks.detector_outputs import QUERIES
@@ -72,14 +71,6 @@ def test_names_say_how_logits_are_read(form: str, nothing: bool) -> None:
     assert not task.ambiguities and [one.label for one in task.predictions(model(picture), 1)[0]] == ["coffee mug"]
 
 
-def test_the_name_of_nothing_may_be_among_the_names() -> None:
-    model = load_model(Bright(of_its_authors), input_size=32, task="detection", labels=[*NAMES, "no object"])
-    task = Detection().on(model)
-    dark = model(torch.full((32, 32, 3), 0.3))
-    assert task.inferred_order == CHOSEN and [one.label for one in task.predictions(dark, 5)[0]][:1] == ["bowl"]
-    assert "no object" not in [one.label for one in task.predictions(dark, 5)[0]]
-
-
 def test_a_tuple_is_read_as_is_said() -> None:
     with pytest.raises(ModelError, match=r"apply a sigmoid .*, or say `task='detection=\{order: boxes logits\}'` or"):
         load_model(Bright(lambda logits, boxes: (logits[..., :3], boxes)), input_size=32, task="detection")
@@ -91,24 +82,6 @@ def test_a_tuple_is_read_as_is_said() -> None:
     assert found.right and not task.remarks
     with pytest.raises(InputError, match="expected 3 logits of a box for 3 classes"):
         Detection(order=ALONE).on(model)
-
-
-def test_other_names_are_refused_and_those_that_fit_are_named() -> None:
-    def wide(logits: Tensor, boxes: Tensor) -> Any:
-        return of_its_authors(logits.repeat(1, 1, 23), boxes)
-
-    model = load_model(Bright(wide), input_size=32, task="detection", labels=NAMES)
-    with pytest.raises(InputError, match=r"expected 3 logits of a box for 3 classes, or 4 .*, got 92; `labels=coco91`"):
-        Detection().on(model)
-    assert Detection().on(load_model(model, labels=read_labels("coco91"))).inferred_order == CHOSEN
-    with pytest.raises(InputError, match="labels: expected a file with the names of the classes of model Bright"):
-        Detection().on(load_model(Bright(of_its_authors), input_size=32, task="detection"))
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_without_a_task_it_says_which_one_reads_it(form: str) -> None:
-    with pytest.raises(ModelError, match="boxes are what a detector gives: use `task=detection`"):
-        load_model(Bright(FORMS[form]), input_size=32)
 
 
 @pytest.mark.parametrize("nothing", [True, False], ids=["softmax", "sigmoid"])

@@ -6,9 +6,6 @@ import csv
 import io
 import json
 import math
-import re
-import sys
-import types
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,14 +19,11 @@ from advsearch.attacks import Query
 from advsearch.cli.main import main
 from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.engine.record import make_trial_row, read_judgement
-from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import to_json_value
 from advsearch.runs.store import Row, Store
 from advsearch.tasks import Facts, Judgement, Prediction, Sight, Task
-
-DOCS = Path(__file__).parents[2] / "docs"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,18 +66,6 @@ def test_a_box_holds_what_is_seen() -> None:
     assert seen([[1, 0], [0, 1]]).box == (0, 0, 2, 2)
     assert seen([[0, 0]]).box is None
     assert Facts("mug", compute_sight=lambda: pytest.fail("nobody asked")).numbers == {}
-
-
-def test_without_a_configuration_there_is_nothing_to_see() -> None:
-    for name in ("box", "mask", "depth", "z_depth"):
-        with pytest.raises(InputError, match="needs to see mug, which depends on the configuration; set `varies = Tr"):
-            getattr(Facts("mug"), name)
-
-
-def test_the_camera_looks_once_for_all_that_is_seen() -> None:
-    looks = iter([Sight(torch.ones(2, 2).bool(), torch.full((2, 2), 3.0), torch.full((2, 2), 2.5))])
-    facts = Facts("mug", compute_sight=lambda: next(looks))
-    assert facts.box == (0, 0, 2, 2) and facts.depth.tolist() == [[3.0, 3.0]] * 2 and bool(facts.mask.all())
 
 
 KEPT = {"boxes": [[1, 2.5, 3, 4]], "words": ["a, b", 'c"d', None], "deep": {"er": [[True]]}}
@@ -147,58 +129,3 @@ def test_exports_and_show_have_it_too(
     assert main(["export", "swept", "--kind", "sweep", "--out", "rows.parquet"]) == 0
     table = parquet.read_table("rows.parquet").to_pylist()
     assert [json.loads(one["payload"]) for one in table] == nested
-    capsys.readouterr()
-    assert main(["show", "swept", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["worst"]["claimed"]["payload"]["boxes"]
-    assert main(["show", "attacked", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["clean"]["payload"]["boxes"] and found["task"] == "edge"
-
-
-# ---- a network of depth, from the page on extending ------------------------------------------------------------------
-
-
-class Flat(nn.Module):
-    """A depth of 2 everywhere, (N, 24, 24), but for a hundred-thousandth of what is seen."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return 2.0 + 1e-5 * x.mean(dim=1)
-
-
-def depth_task() -> Any:
-    (page,) = (
-        text for text in (DOCS / "extending.md").read_text("utf-8").split("`my_package/")[1:] if text[:9] == "distance."
-    )
-    module = types.ModuleType("my_package.distance")
-    sys.modules["my_package.distance"] = module  # where a dataclass looks for its types
-    exec(re.findall(r"```python\n(.*?)```", page, re.S)[0], vars(module))
-    return module.Distance
-
-
-@pytest.mark.medium
-def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> None:
-    task = depth_task()(factor=1.05)
-    model = load_model(Flat(), input_size=24, read=task.reader)
-    yaws = [0.0, 90.0]
-    fast: dict[str, Any] = {"spp": 1, "denoise": "none", "task": task}
-    advsearch.sweep("banana", model, {"pose.yaw": yaws}, trials=0, run=str(tmp_path / "run"), **fast)
-    with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
-        rows = list(store.rows("sweep"))
-    renderer = advsearch.load_scene("banana").renderer({"pose": {"yaw": [0.0, 90.0]}}, resolution=24)
-    surfaces = [renderer.surfaces(torch.tensor([u])) for u in (0.0, 1.0)]
-    offs = [(2.0 / one.depth[one.visible_mask("object")]).log() for one in surfaces]
-    expected = [float((off - off.mean()).abs().mean()) - math.log(1.05) for off in offs]
-    expected = [-loss for loss in expected]
-    assert [row.margin for row in rows] == pytest.approx(expected, abs=1e-4) and expected[0] != expected[1]
-    distances = torch.cat([one.depth[one.visible_mask("object")] for one in surfaces])
-    assert 0.1 < float(distances.min()) < float(distances.max()) < 1.0, "metres"
-    attack: dict[str, Any] = {
-        "controls": ["pose"],
-        "policy": "random",
-        "steps": 2,
-        "trials": 6,
-        "verify_spp": 1,
-        "measure": "no",
-    }
-    found = advsearch.attack("banana", model, run=str(tmp_path / "attack"), baseline=False, **attack, **fast)
-    assert found.summary.task == "distance" and found.summary.label_set[0].endswith(" away")

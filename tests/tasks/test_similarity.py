@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -15,13 +13,12 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks.objective_functions import NEARBY
-from advsearch.attacks.objectives import check_objective, get_objective
+from advsearch.attacks.objectives import get_objective
 from advsearch.cli.main import main
-from advsearch.errors import AdvsearchError, InputError, ModelError
-from advsearch.models import Model, ModelWarning
+from advsearch.errors import AdvsearchError, InputError
+from advsearch.models import Model
 from advsearch.runs.files import read_png, to_8bit
-from advsearch.runs.summary import compute_file_digests
-from advsearch.tasks import Facts, make_task
+from advsearch.tasks import Facts
 from advsearch.tasks.similarity import ITSELF, SOMETHING_ELSE, TEMPERATURE, Similarity
 from small_models import SIDE
 
@@ -136,35 +133,6 @@ def test_features_are_those_of_the_librarys_own_pipeline(architecture: str, tmp_
     torch.testing.assert_close(again(torch.from_numpy(read_png(file))), theirs, atol=1e-4, rtol=0.0)
 
 
-def test_a_pooler_that_was_never_trained_is_left_out(tmp_path: Path) -> None:
-    network = transformers.ViTModel(transformers.ViTConfig(**EYES), add_pooling_layer=False)
-    network.save_pretrained(tmp_path)
-    with pytest.warns(ModelWarning, match="without an image processor"):
-        loaded = advsearch.load_model(f"hf:{tmp_path}", task="similarity")
-    pictures = torch.rand(2, 16, 16, 3)
-    with torch.no_grad():
-        tokens = network.eval()(pictures.permute(0, 3, 1, 2)).last_hidden_state
-    torch.testing.assert_close(loaded(pictures), tokens[:, 0], atol=1e-5, rtol=0.0)
-
-
-def test_what_has_no_classes_is_refused_as_a_classifier(tmp_path: Path) -> None:
-    spec = published(tmp_path, "Dinov2Model")
-    with pytest.raises(ModelError, match=r"is a Dinov2Model, which returns features .* use `task=similarity`"):
-        advsearch.load_model(spec)
-    network = transformers.Dinov2Model.from_pretrained(tmp_path)
-
-    class Wrapped(nn.Module):
-        def forward(self, x: Tensor) -> Any:
-            return network(x)
-
-    with pytest.raises(ModelError, match="features are what a network without a head gives: use `task=similarity`"):
-        advsearch.load_model(Wrapped(), input_size=16)
-    answer = network(torch.rand(2, 3, 16, 16))
-    torch.testing.assert_close(Similarity().read(answer, 2), answer.pooler_output)
-    with pytest.raises(ValueError, match=r"expected features \(2, D\)"):
-        Similarity().read(torch.zeros(2, 3, 4, 4), 2)
-
-
 # ---- references -----------------------------------------------------------------------------------------------------
 
 
@@ -198,18 +166,6 @@ def test_a_linear_head_is_the_minimum_of_its_loss_and_the_same_each_time(folder:
     assert task.compute_logits(model(asked)).argmax(dim=1).tolist() == [0, 1, 2]
 
 
-def test_references_are_turned_upright_and_cut_to_the_shape_of_the_input(tmp_path: Path, model: Model) -> None:
-    tall = noisy(COLOURS["red"], 5, (24, 8))
-    turned = Image.Exif()
-    turned[0x0112] = 6  # the camera was held on its side: a viewer turns it with the clock
-    write(tmp_path / "a" / "0.png", tall.rot90(1), exif=turned)
-    write(tmp_path / "b" / "0.png", noisy(COLOURS["blue"], 6))
-    task = Similarity(references=str(tmp_path)).on(model)
-    assert task.gallery is not None
-    middle = torch.from_numpy(to_8bit(tall[8:16]).astype(np.float32) / 255)
-    torch.testing.assert_close(task.gallery.features[0], features(model, middle[None])[0])
-
-
 def test_a_judgement_says_where_the_right_one_stands(folder: Path, model: Model) -> None:
     task = Similarity(references=str(folder)).on(model)
     blue, green = (noisy(COLOURS[name], 97) for name in ("blue", "green"))
@@ -230,7 +186,7 @@ def test_a_judgement_says_where_the_right_one_stands(folder: Path, model: Model)
     }
     assert 1 < wrong.payload["rank"] <= 8  # type: ignore[operator]
     (broken,) = task.judge(torch.full((1, 12), torch.nan), truth)
-    assert broken.is_not_a_number and broken.payload is None
+    assert broken.is_non_finite and broken.payload is None
 
 
 @pytest.mark.parametrize(
@@ -325,7 +281,6 @@ def test_an_attack_is_verified(
     assert found["ending"] == "found" and set(found["verified"]["labels"]) == {"bowl"}
     kept = found["adversarial"]["payload"]
     assert kept["rank"] > 1 and kept["references"] == 4 and kept["nearest"].startswith("bowl/")
-    assert f"right one at rank {kept['rank']} of 4" in (run / "report.html").read_text("utf-8")
     if objective == "margin":
         assert found["transport"]["used"]
         return
@@ -361,15 +316,8 @@ def test_what_is_wrong_with_references_is_said_in_a_sentence(folder: Path, model
         return str(error.value)
 
     assert "(No such file or directory); check the path" in said(tmp_path / "none")
-    assert "(Not a directory)" in said(folder / "red" / "0.png")
-    (tmp_path / "empty").mkdir()
-    assert "two folders of pictures at least" in said(tmp_path / "empty") and "got no folder" in said(
-        tmp_path / "empty"
-    )
-    (tmp_path / "empty" / "mug").mkdir()
-    assert "got only mug" in said(tmp_path / "empty")
-    (tmp_path / "empty" / "bowl").mkdir()
-    assert "expected pictures of bowl" in said(tmp_path / "empty")
+    (tmp_path / "empty" / "bowl").mkdir(parents=True)
+    assert "got only bowl" in said(tmp_path / "empty")
     (folder / "red" / "notes.txt").write_text("no picture")
     assert "notes.txt: expected a picture file such as PNG" in said(folder)
     (folder / "red" / "notes.txt").unlink()
@@ -382,48 +330,3 @@ def test_huge_and_many_references_are_refused(folder: Path, model: Model, monkey
     write(folder / "red" / "0.png", torch.zeros(100, 100, 3))
     with pytest.raises(AdvsearchError, match="if you trust it"):
         Similarity(references=str(folder)).on(model)
-
-
-def test_names_that_are_not_there_are_refused_with_those_that_are(folder: Path, model: Model) -> None:
-    task = Similarity(references=str(folder)).on(model)
-    with pytest.raises(InputError, match=r"label: .* no label 'blu'. Did you mean 'blue' \(#0\)"):
-        task.check(Facts("mug", label="blu"))
-    with pytest.raises(InputError, match=r"label: the label of mug itself does not fit .* blue, green, red"):
-        task.check(Facts("mug", object_label="mug"))
-    with pytest.raises(InputError, match=r"target: .* no label 'pink'"):
-        Similarity(references=str(folder)).on(model, target="pink")
-    with pytest.raises(InputError, match="labels: the names of task similarity are those of its folders"):
-        advsearch.load_model(Embedder(), task="similarity", input_size=8, labels=["a", "b"])
-
-
-def test_options_that_make_no_sense_are_refused(model: Model) -> None:
-    cases: dict[str, dict[str, Any]] = {
-        "method: expected one of nearest, linear": {"method": "near"},
-        "k: expected a whole number": {"k": 0},
-        "k: belongs to": {"k": 3, "method": "linear"},
-        "threshold: expected a cosine": {"threshold": 1.5},
-        "leave `references` out": {"threshold": 0.5, "references": "refs"},
-    }
-    for text, options in cases.items():
-        with pytest.raises(InputError, match=text):
-            make_task({"name": "similarity", **options})
-    with pytest.raises(InputError, match="got neither"):
-        Similarity().on(model)
-    bar = Similarity(threshold=0.5)
-    for refused in (lambda: bar.on(model, target="mug"), lambda: bar.on(model).check(Facts("mug", label="mug"))):
-        with pytest.raises(InputError, match="knows no names"):
-            refused()
-    with pytest.raises(InputError, match="it was loaded for its logits"):
-        bar.on(replace(model, read=None))
-    with pytest.raises(InputError, match=r"expected an objective of task similarity .*distance.*got vanish"):
-        check_objective("vanish", "similarity")
-    with pytest.raises(InputError, match="got distance, which takes outputs of similarity"):
-        check_objective("distance", "classification")
-
-
-def test_a_folder_of_references_has_one_digest(folder: Path) -> None:
-    settings = {"task": {"name": "similarity", "references": str(folder)}, "run": str(folder)}
-    before = compute_file_digests(settings)
-    assert list(before) == [str(folder)]
-    write(folder / "red" / "0.png", torch.ones(8, 8, 3))
-    assert compute_file_digests(settings) != before

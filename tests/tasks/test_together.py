@@ -13,7 +13,6 @@ from torch import nn
 import advsearch
 from advsearch.cli.main import main
 from advsearch.engine.judging import make_objective
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.files import read_png
@@ -69,23 +68,6 @@ def test_one_configuration_against_a_detector_and_a_model_of_depth(
         assert (abs(drawn - torch.tensor(colour).numpy() / 255) < 1 / 255).all(axis=2).sum() > 100
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("command", "flags"),
-    [
-        ("sweep", ["--grid", "camera.elevation=25,85", "--trials", "6"]),
-        ("attack", ["--control", "pose", "--trials", "6", "--steps", "3", "--average", "4", "--policy", "random"]),
-    ],
-)
-def test_other_commands_take_both(
-    files: str, command: str, flags: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    asked = ["--object", "mug", "--task", f"detection+depth={{kind: {DISPARITY}}}", "--model", files]
-    asked += ["--labels", "cup,bowl,dog", "--label", "cup", "--spp", "2", "--denoise", "none"]
-    found = answer(capsys, command, *asked, *flags, "--run", str(tmp_path / "run"), "--json")
-    assert found["task"] == "detection+depth" and not list((tmp_path / "run").glob("*.tmp"))
-
-
 # ---- how it is asked for --------------------------------------------------------------------------------------------
 
 FORMS: list[tuple[Any, Any]] = [
@@ -104,16 +86,6 @@ def test_tasks_are_joined_by_a_plus_or_in_a_list(asked: Any, kept: Any) -> None:
     assert config.task == kept and config.models == ("a.pt2,b.pt2",) and not config.is_matrix
     made = make_task(config.task)
     assert isinstance(made, EnsembleTask) and [type(one) for one in made.parts] == [Detection, Depth]
-
-
-def test_each_task_has_a_model() -> None:
-    with pytest.raises(InputError, match="model: expected 2 with commas between them, one for each of detection, dept"):
-        AttackConfig(object="mug", model="a.pt2", task="detection+depth")
-    with pytest.raises(UnknownNameError, match="unknown task 'deep'"):
-        make_task("detection+deep")
-    with pytest.raises(UnknownNameError, match="option of task 'detection\\+depth'"):
-        make_task({"name": "detection+depth", "segmentation": {}})
-    assert AttackConfig(object="mug", model="a.pt2,b.pt2", task="depth").is_matrix
 
 
 # ---- what is judged -------------------------------------------------------------------------------------------------
@@ -149,7 +121,3 @@ def test_each_is_judged_by_its_own_rule() -> None:
     values = [float(parts[0].pixel_margin(output[0][0], truth[0])), scores[1]]
     assert float(objective(output, torch.zeros(1), truth)) == pytest.approx(min(values))
     assert judged.prediction.label.count(";") == 1 and task.select_facts(task.tasks[1], facts).label is None
-    with pytest.raises(InputError, match="model: expected 2, one for each task, got 1"):
-        EnsembleTask(parts=parts).on(both[0])
-    with pytest.raises(InputError, match="label: task depth has no classes"):
-        EnsembleTask(parts=parts[1:], tasks=task.tasks[1:]).check(facts)

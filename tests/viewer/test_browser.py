@@ -25,12 +25,9 @@ from advsearch.questions.recipe.result import RecipeResult
 from advsearch.questions.replay.result import ReplayResult
 from advsearch.questions.stability.result import StabilityResult
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.report.wording import format_percent_number, format_prediction
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result
 from advsearch.runs.store import CachedEvaluation, Row, Store
-from advsearch.tasks import Prediction
-from advsearch.viewer import thumbnails
 from advsearch.viewer.document import read_asset
 from advsearch.viewer.pages import write_page
 from covering import once_each
@@ -65,11 +62,6 @@ PLANNED: dict[str, Any] = {
     "step_in_unit": 0.1, "unit": "object sizes",
 }  # fmt: skip
 """A parameter of a gradient plan that says much."""
-
-
-def test_a_browser_is_looked_for() -> None:
-    """Where there is none the tests below are skipped; tools/browser.sh, which `make test-all` calls, installs one."""
-    assert CHROMIUM is None or Path(CHROMIUM).is_file()
 
 
 @pytest.fixture(scope="module")
@@ -236,76 +228,6 @@ def test_the_arrow_keys_go_from_cell_to_cell(browser: Browser, sweep: Path) -> N
         assert page.evaluate("document.activeElement.getAttribute('aria-pressed')") == "true"
 
 
-def test_keys_reach_every_map(browser: Browser, sweep: Path) -> None:
-    with opened(browser, (sweep / "report.html").as_uri(), 390, bypass_csp=True) as page:
-        page.wait_for_selector("[data-cell]")
-        page.get_by_label("Side by side").select_option("environment")
-        stops = [page.locator(f'figure.map:nth-of-type({one}) [data-cell][tabindex="0"]') for one in (1, 2)]
-        assert [one.count() for one in stops] == [1, 1]
-        stops[1].focus()
-        page.keyboard.press("ArrowRight")
-        assert page.evaluate("document.activeElement.dataset.cell") == "1,0,1"
-        assert faults(page) == []
-
-
-def test_the_map_begins_with_the_axes_of_the_grid(browser: Browser, tmp_path: Path) -> None:
-    """Numbers of a row that follow from others, such as the distance on a path, are offered and not chosen."""
-    counts = {"configurations": 12, "correct": 6, "accuracy": 0.5, "interval": (0.2, 0.8)}
-    axes = [{"axis": "camera.elevation", "unit": "degrees", "value": 10.0, **counts}]
-    with opened(browser, (make_sweep(tmp_path / "grid", axes=axes) / "report.html").as_uri()) as page:
-        page.wait_for_selector("[data-cell]")
-        roles = [page.get_by_label(f"{name}: how it is shown") for name in ("camera.elevation", "pose.yaw")]
-        assert [one.input_value() for one in roles] == ["across", "up"]
-
-
-def test_a_cell_that_was_pointed_at_does_not_outlive_its_map(browser: Browser, sweep: Path) -> None:
-    with opened(browser, (sweep / "report.html").as_uri()) as page:
-        page.wait_for_selector("[data-cell]")
-        page.locator('[data-cell="0,1,2"]').dispatch_event("pointerover", {"pointerType": "mouse"})
-        until(page, lambda: page.locator(".peek").is_visible())
-        page.get_by_label("Side by side").select_option("environment")
-        assert not page.locator(".peek").is_visible()
-
-
-def test_long_paths_are_short_names_that_tell_everything_apart(browser: Browser, tmp_path: Path) -> None:
-    folder = "/data/of/a/person/with a long path from a studio/downloads-2026-11"
-    names = (f"{folder}/abandoned_factory_canteen_01_1k.hdr", f"{folder}/night/room.hdr", f"{folder}/day/room.hdr")
-    run = make_sweep(tmp_path / "paths", environments=names)
-    with opened(browser, (run / "report.html").as_uri(), 390) as page:
-        page.wait_for_selector("[data-cell]")
-        assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
-        page.locator("#parameter-0").select_option("one value")
-        shown = page.locator("output")
-        assert (shown.inner_text(), shown.get_attribute("title")) == ("abandoned_factory_canteen_01_1k.hdr", names[0])
-        assert page.locator("#parameter-0-value").is_visible()
-        page.locator("#parameter-0").select_option("up")
-        rows = page.locator("table.map th[scope=row]")
-        assert rows.all_inner_texts() == ["day/room.hdr", "night/room.hdr", "abandoned_factory_canteen_01_1k.hdr"]
-        assert rows.nth(0).get_attribute("title") == names[2]
-        assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
-        first = page.locator("svg.along text:not(.name)").all_text_contents()
-        assert any(text.endswith("abandoned_facto…") for text in first) and any("day/room.hdr" in one for one in first)
-
-
-def test_the_boxes_of_a_detector_lie_on_its_pictures(browser: Browser, tmp_path: Path) -> None:
-    found = [{"box": [1.0, 1.0, 5.0, 6.0], "label": "bowl", "score": 0.9}]
-    found += [{"box": [4.0, 4.5, 12.0, 12.0], "label": "mug", "score": 0.4}]
-    payload: Any = {"box": [4, 4, 12, 12], "found": found}
-    run = make_sweep(tmp_path / "boxes", keep="all", payload=payload, label="mug", task="detection")
-    with opened(browser, (run / "report.html").as_uri()) as page:
-        page.wait_for_selector(".card svg")
-        page.get_by_label("Show", exact=True).select_option("right")
-        rect = page.locator(".card rect.said").first
-        assert [rect.get_attribute(name) for name in ("x", "y", "width", "height")] == ["4", "4.5", "8", "7.5"]
-        assert page.locator(".card rect.true").count() == page.locator(".card").count() == 18
-        image, drawing = page.locator(".card img").first.bounding_box(), page.locator(".card svg").first.bounding_box()
-        assert image == drawing
-        card = page.locator(".card").first
-        until(page, lambda: "mug (score 0.90)" in card.inner_text())
-        page.get_by_label("Show", exact=True).select_option("wrong")  # "cup", which is none of those that were found
-        assert page.locator(".card rect.said").count() == 0 and page.locator(".card rect.true").count() == 6
-
-
 def test_sweeps_stand_side_by_side(browser: Browser, sweep: Path, tmp_path: Path) -> None:
     with serving(sweep, make_sweep(tmp_path / "second")) as server, opened(browser, server.address) as page:
         page.get_by_label("compare first").check()
@@ -430,16 +352,6 @@ def test_an_object_is_turned(browser: Browser, attack: Path) -> None:
         np.testing.assert_array_equal(still, dragged)  # nothing moves by itself
 
 
-def test_a_browser_without_webgl_has_the_pictures(browser: Browser, attack: Path) -> None:
-    context = browser.new_context()
-    context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
-    page = context.new_page()
-    page.goto((attack / "report.html").as_uri())
-    until(page, lambda: "no WebGL 2" in page.locator("#object").inner_text())
-    assert page.locator("img[data-picture=adversarial]").is_visible()
-    context.close()
-
-
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory, attack: Path) -> Path:
     """Accuracy over epsilon, of which the first part is the attack."""
@@ -449,14 +361,6 @@ def study(tmp_path_factory: pytest.TempPathFactory, attack: Path) -> Path:
     shutil.copytree(attack, run / "parts" / "mug")
     write_page(run, curve(table=rows, curve=points, parts=["mug", "bowl"]))
     return run
-
-
-def test_a_study_leads_to_its_attacks(browser: Browser, study: Path) -> None:
-    with opened(browser, (study / "report.html").as_uri(), 390) as page:
-        assert page.locator("svg.narrow").is_visible() and not page.locator("svg.wide").is_visible()
-        page.get_by_role("link", name="mug").first.click()
-        page.wait_for_selector(".stage")
-        assert page.url.endswith("/parts/mug/report.html")
 
 
 def faults(page: Page) -> list[str]:
@@ -500,64 +404,6 @@ def test_everybody_can_use_the_pages_of_results(browser: Browser, tmp_path: Path
         assert faults(page) == []
         page.set_viewport_size({"width": 1440, "height": 900})
         assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
-
-
-def test_everybody_can_use_the_list_and_what_goes_on(browser: Browser, sweep: Path, tmp_path: Path) -> None:
-    with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "going"))) as run:
-        run.append_rows(Row("search", 0, objective=1.0, label="mug", values={"pose.yaw": described(1.0, "degrees")}))
-        with serving(sweep, run.path, make_sweep(tmp_path / "second")) as server:
-            for path, there in (("", "button"), ("runs/going/", "svg circle")):
-                with opened(browser, server.address + path, 390, bypass_csp=True, color_scheme="light") as page:
-                    page.wait_for_selector(there)
-                    assert faults(page) == []
-                    page.emulate_media(color_scheme="dark")
-                    assert faults(page) == []
-
-
-def test_paper_is_white_whatever_the_screen_is(browser: Browser, attack: Path) -> None:
-    """And a heading stands over something."""
-    with opened(browser, (attack / "report.html").as_uri(), color_scheme="dark") as page:
-        heading = page.get_by_role("heading", name="The search, step by step")
-        assert heading.is_visible()
-        page.emulate_media(media="print", color_scheme="dark")
-        assert not heading.is_visible()
-        ink = page.locator("h1").evaluate("one => getComputedStyle(one).color")
-        assert ink == "rgb(28, 29, 32)"
-
-
-@pytest.mark.parametrize("which", ["sweep", "attack"])
-def test_without_a_script_there_are_still_pictures(
-    browser: Browser, request: pytest.FixtureRequest, which: str
-) -> None:
-    run: Path = request.getfixturevalue(which)
-    with opened(browser, (run / "report.html").as_uri(), java_script_enabled=False) as page:
-        assert not page.locator("#explorer, #compare, #search, #object").filter(visible=True).count()
-        assert page.locator("h1").inner_text()
-        assert page.locator("details").first.inner_text()
-
-
-def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) -> None:
-    """Those that the columns name, whatever was drawn; numbers and answers in words are those of the terminal."""
-    code = read_asset("sweep.js")
-    code = code[code.index("(() => {") : code.index("  // ---- the explorer")]
-    page = browser.new_page()
-    given = "{name: 'd', unit: '', levels: null, edges: [1, 10, 100], data: Float32Array.of(2, 10, 99, 50, 20)}"
-    made = page.evaluate(f"{code} return new Table().axis({given}); }})()")
-    assert made["labels"] == ["1 to 10", "10 to 100"] and made["level"] == [0, 1, 1, 1, 1]
-    numbers = (0.0, 1e-9, 0.0002, 0.0459, 0.5, 0.97, 0.9996, 0.999999999, 1.0)
-    assert page.evaluate(f"{code} return {list(numbers)}.map((one) => percentNumber(one)); }})()") == list(
-        map(format_percent_number, numbers)
-    )
-    for task, label, share in (
-        ("detection", "no car", 0.15),
-        ("detection", "car", 0.8),
-        ("classification", "vase", 0.5),
-        ("classification", "lamp", 0.99999),
-    ):
-        said = page.evaluate(f"{code} return said({task!r}, {label!r}, {share}); }})()")
-        assert said == format_prediction(task, Prediction(label, None, share)).replace(", ", " ").replace(
-            " %", "\u00a0%"
-        )
 
 
 def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Path) -> None:
@@ -632,24 +478,6 @@ def test_a_photograph_is_aligned_taken_and_counted(browser: Browser, tmp_path: P
                 assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
 
 
-@pytest.mark.medium
-def test_edges_alone_are_drawn_from_the_rendering(browser: Browser, tmp_path: Path) -> None:
-    run = make_sweep(tmp_path / "first", keep="all")
-    square = np.zeros((64, 64, 3), np.float32)
-    square[16:48, 16:48] = 1.0
-    thumbnails.write_thumbnail(run, 5, thumbnails.make_thumbnail(square))
-    with serving(run, photographs=Photographs()) as server:
-        with opened(browser, f"{server.address}runs/first/align/?rendering=5") as page:
-            until(page, lambda: page.locator("#align .status").inner_text() == "Rendering 5.")
-            page.get_by_label("Shown").select_option("edges only")
-            drawn = (
-                "one => Array.from(one.getContext('2d').getImageData(0, 32, 64, 1).data).filter((_, k) => k % 4 == 3)"
-            )
-            opaque = [k for k, alpha in enumerate(page.locator(".camera canvas").evaluate(drawn)) if alpha > 200]
-            assert set(opaque) >= {15, 16, 47, 48}
-            assert all(min(abs(k - 15.5), abs(k - 47.5)) < 3 for k in opaque)
-
-
 HOSTILE = """<!doctype html><html><body><p>a report</p><img id="shown" src="data:image/gif;base64,R0lGODlhAQABAAAAACw=">
 <img src="../first/pictures/0000/3.jpg"><iframe src="../first/"></iframe><script>(async () => {
 document.title = "ran";
@@ -718,15 +546,3 @@ def test_our_own_pages_run_with_an_origin_of_their_own(browser: Browser, attack:
         page.get_by_role("link", name="All runs").click()
         page.wait_for_url(server.address)
         assert page.locator("table.runs tbody tr").count() == 2
-
-
-def test_a_page_leads_back_beyond_this_machine_too(browser: Browser, attack: Path) -> None:
-    """The cookie with the token goes along, although the page has an origin of its own."""
-    with serving(attack, host="0.0.0.0") as server:
-        home = server.address.partition("?")[0]
-        with opened(browser, server.address, ignore_https_errors=True) as page:
-            page.get_by_role("link", name="attack", exact=True).click()
-            page.wait_for_url(f"{home}runs/attack/")
-            page.get_by_role("link", name="All runs").click()
-            page.wait_for_url(home)
-            assert page.locator("table.runs").count() == 1

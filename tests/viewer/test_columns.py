@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from advsearch.options import Value
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.tables import make_sweep_frame
-from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, pack_columns, read_columns
+from advsearch.viewer.columns import pack_columns, read_columns
 from advsearch.viewer.thumbnails import find_thumbnails, thumbnail_path
 from stored_sweeps import make_sweep
 
@@ -61,28 +60,6 @@ def test_what_is_packed_is_what_the_rows_are() -> None:
     assert (yaw["name"], yaw["unit"], yaw["levels"]) == ("yaw", "degrees", None)
     assert list(columns["parameter 0"]) == [0, 10, 20, 30, 40]
     assert [environment["levels"][k] for k in columns["parameter 1"]] == ["a", "b", "a", "b", "a"]
-
-
-def test_columns_begin_at_multiples_of_their_size() -> None:
-    head, _ = unpacked(row(k, name="x" * k, yaw=1.0) for k in range(3))
-    for one in head["columns"]:
-        assert one["at"] % np.dtype(one["type"]).itemsize == 0
-
-
-def test_what_a_row_lacks_is_said() -> None:
-    bare = Row("sweep", 7, values={})
-    head, columns = unpacked([row(0, yaw=1.0, name="n"), bare, row(2, yaw=3.0, late=5.0)])
-    assert columns["right"][1] == UNKNOWN
-    assert columns["probability"][1] == NO_PROBABILITY
-    assert math.isnan(columns["margin"][1])
-    assert np.isnan(columns["parameter 0"]).tolist() == [False, True, False]
-    assert [head["parameters"][1]["levels"][k] for k in columns["parameter 1"]] == ["n", "none", "none"]
-    assert np.isnan(columns["parameter 2"]).tolist() == [True, True, False]
-
-
-def test_numbers_among_names_become_names() -> None:
-    head, columns = unpacked([row(0, mixed=1.5), row(1, mixed="inside")])
-    assert [head["parameters"][0]["levels"][k] for k in columns["parameter 0"]] == ["1.5", "inside"]
 
 
 def test_rows_are_read_in_parts(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import CachedEvaluation, Row
-from advsearch.viewer.server import FIRST_ROW_ID, is_unfinished, make_progress_json, make_progress_page
+from advsearch.viewer.server import FIRST_ROW_ID, is_unfinished, make_progress_json
 from stored_sweeps import described, serving
 
 
@@ -71,14 +71,3 @@ def test_its_own_page_is_shown_when_it_has_ended(tmp_path: Path) -> None:
         assert not is_unfinished(path) and news(path)["ended"]
         with urlopen(address) as answer:
             assert answer.read().endswith(b"what came out")
-
-
-def test_a_study_that_goes_on_leads_to_what_has_ended(tmp_path: Path) -> None:
-    path = tmp_path / "<b>"
-    with RunDirectory.create_for(AttackConfig(object="mug", run=str(path))):
-        for name in ("00-mug", "01-bowl"):
-            (path / "parts" / name).mkdir(parents=True)
-        (path / "parts" / "00-mug" / "report.html").write_text("")
-        page = make_progress_page("<b>", path)
-    assert 'href="parts/00-mug/report.html"' in page and "01-bowl" in page and "parts/01-bowl" not in page
-    assert "<b>" not in page

@@ -71,30 +71,6 @@ def test_rows_are_found_by_words_and_by_rules(browser: Browser, tmp_path: Path) 
 
 
 @pytest.mark.medium
-def test_pictures_are_grouped_and_ordered_by_keys(browser: Browser, tmp_path: Path) -> None:  # noqa: F811
-    run = make_sweep(tmp_path / "run", keep="all", environments=("noon", HOSTILE))
-    with opened(browser, (run / "report.html").as_uri(), 390, bypass_csp=True) as page:
-        page.wait_for_selector("[data-cell]")
-        page.get_by_label("Group by").focus()
-        page.keyboard.type("right or")  # a list is chosen from by its letters
-        until(page, lambda: page.locator("#explorer h3").count() == 2)
-        assert page.locator("#explorer h3").all_inner_texts() == ["wrong 6", "right 12 of 18"]
-        assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Group by"
-        page.get_by_label("Group by").select_option("environment")
-        heads = page.locator("#explorer h3").all_inner_texts()
-        assert sorted(heads) == sorted(["noon 12", f"{HOSTILE} 12"]) and page.title() != "planted"
-        page.get_by_label("First").select_option("by camera.elevation")
-        page.locator(".card").first.focus()
-        page.keyboard.press("Enter")
-        facts = page.locator("dialog .facts").inner_text()
-        assert "camera.elevation [degrees]\t10" in facts
-        page.keyboard.press("Escape")
-        until(page, lambda: page.locator("dialog").count() == 0)
-        assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
-        assert faults(page) == []
-
-
-@pytest.mark.medium
 def test_two_runs_stand_beside_each_other_picture_by_picture(browser: Browser, tmp_path: Path) -> None:  # noqa: F811
     first = make_sweep(tmp_path / "first", keep="all")
     second = make_sweep(tmp_path / "second", keep="all", environments=("studio", "noon"))  # wrong in the other half

@@ -13,7 +13,6 @@ import pytest
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.viewer.document import read_asset
 from advsearch.viewer.pages import write_page
 from stored_sweeps import make_sweep
 
@@ -26,28 +25,6 @@ def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
 
 
 sweep_page = import_module("advsearch.questions.sweep.page")  # the room has a function of this name
-
-
-def test_a_file_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = make_sweep(tmp_path / "run", keep="all")
-    assert "pictures that were kept" not in (run / "report.html").read_text()
-    monkeypatch.setattr(sweep_page, "MAX_EMBEDDED_BYTES", 2000)
-    page = write_page(run).read_text()
-    taken = page.count("data:image/jpeg")
-    assert f"This file has {taken} of the 24 pictures that were kept" in page
-    assert 0 < taken < 24
-    monkeypatch.setattr(sweep_page, "MAX_EMBEDDED_ROWS", 23)
-    page = write_page(run).read_text()
-    assert "This file leaves out the 24 rows" in page
-    assert f"<code>advsearch dashboard {run}</code>" in page
-    assert "data:image/jpeg" not in page
-
-
-def test_without_a_script_the_page_says_what_was_found(tmp_path: Path) -> None:
-    page = (make_sweep(tmp_path / "run") / "report.html").read_text()
-    body = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    assert "Right in 18 of 24 configurations" in body.replace("&nbsp;", " ")
-    assert "Accuracy by" in body
 
 
 def test_texts_of_a_run_are_no_markup(tmp_path: Path) -> None:
@@ -90,15 +67,3 @@ def test_the_page_is_made_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert write_page(run).read_text() == before
     assert main(["view", str(run)]) == 0
     assert capsys.readouterr().out.strip() == str(run / "report.html")
-
-
-def test_several_runs_need_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    runs = [str(make_sweep(tmp_path / name)) for name in "ab"]
-    assert main(["view", *runs]) == 2
-    assert "--bundle" in capsys.readouterr().err
-
-
-def test_the_explorer_is_plain_text() -> None:
-    """It stands between script tags as it is."""
-    assert "</script" not in read_asset("sweep.js").lower()
-    assert "<!--" not in read_asset("sweep.js")

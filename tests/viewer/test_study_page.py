@@ -11,14 +11,11 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.recipe.result import RecipeResult
 from advsearch.questions.stability.result import StabilityResult
-from advsearch.report.views import make_default_view
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result, StudyResult
-from advsearch.viewer.document import make_header
-from advsearch.viewer.pages import make_view_page, write_page
-from samples import ACCURACY, AVERAGE, CURVE, RECIPE, STABILITY, curve, make_run, matrix, region
+from advsearch.viewer.pages import write_page
+from samples import ACCURACY, AVERAGE, CURVE, STABILITY, curve, make_run, region
 from stored_sweeps import serving
 
 ACCURACIES = ((0.01, 7), (0.03, 4), (0.1, 1))
@@ -81,59 +78,13 @@ def test_a_curve_is_drawn_with_its_intervals_and_leads_to_its_attacks(tmp_path: 
     assert all((tmp_path / "study" / link).is_file() for link in links)
 
 
-def test_the_average_stands_beside_the_worst_case(tmp_path: Path) -> None:
-    page = (make_study(tmp_path / "study", two_objects()) / "report.html").read_text()
-    text = text_of(page)
-    right = f"{AVERAGE['correct']}/{AVERAGE['configurations']} (75 %)"
-    assert "ending epsilon wrong margin right on average 95 % interval" in text
-    assert f"bowl 20/20 found 0.1 19/20 1.50 {right} 35-97 %" in text
-    assert f"advsearch run {tmp_path}/study/run.yaml" in text
-    assert 'href="parts/bowl/report.html"' in page
-    without = text_of((make_study(tmp_path / "without", a_curve()) / "report.html").read_text())
-    assert "right on average" not in without
-
-
-def test_a_matrix_has_a_colour_for_each_share(tmp_path: Path) -> None:
-    page = (make_study(tmp_path / "study", matrix()) / "report.html").read_text()
-    assert re.findall(r'class="number share share-(\d+)"', page) == ["10", "2", "2", "10"]
-    assert 'href="parts/other/report.html"' in page
-
-
-def test_a_recipe_leads_to_its_runs(tmp_path: Path) -> None:
-    page = tmp_path / "parts" / "views-00" / "report.html"
-    page.parent.mkdir(parents=True)
-    page.write_text("the sweep")
-    assert 'href="parts/views-00/report.html"' in write_page(tmp_path, RecipeResult.of(RECIPE)).read_text()
-
-
-def test_only_words_that_are_shown_are_explained(tmp_path: Path) -> None:
-    result = StabilityResult.of(STABILITY)
-    page = make_view_page(tmp_path, result, make_default_view(result))
-    meanings = page[page.index("What these words mean") :]
-    assert "every picture and gradient was finite" in meanings
-    assert "cases that were not begun" not in meanings
-
-
-@pytest.mark.medium
-def test_an_attack_without_a_page_has_no_link(tmp_path: Path) -> None:
-    run = make_study(tmp_path / "study", two_objects())
-    (run / "parts" / "bowl" / "report.html").unlink()
-    page = write_page(run, two_objects()).read_text()
-    assert "parts/mug/" in page and "parts/bowl/" not in page
-
-
 @pytest.mark.parametrize(
     ("result", "said"),
     [
         (StabilityResult.of(STABILITY), ["1 of 1 cases hold", "ties", "condition number"]),
         (
             region(warnings=["Look out."]),
-            [
-                "wrong in 200 of 200 fresh samples",
-                "pose.yaw 10 55.5 30 degrees",
-                "Look out.",
-                "Share of the space",
-            ],
+            ["wrong in 200 of 200 fresh samples", "pose.yaw 10 55.5 30 degrees", "Look out.", "Share of the space"],
         ),
     ],
 )
@@ -162,14 +113,3 @@ def test_the_dashboard_and_a_bundle_have_the_pages_of_the_attacks(tmp_path: Path
     assert "<h1>" in page
     assert "parts/mug/report.html" in (tmp_path / "site" / "index.html").read_text()
     assert not (tmp_path / "site" / "parts" / "bowl").exists()
-
-
-def test_notes_on_files_stand_outside_of_the_yellow_box() -> None:
-    notes = ["My Car.OBJ: 12 faces without area were removed", "a.hdr, b.exr: the object stands on the scene's table"]
-    weighty = "The worst margin still moved with the sample count: noise may take part in it."
-    shown = str(make_header("sweep", "Right in 7 of 8.", [notes[0], weighty, notes[1]]))
-    assert shown.index('class="remarks"') < shown.index("worst margin") < shown.index('class="notes"')
-    assert all(shown.index('class="notes"') < shown.index(one.partition(":")[0]) for one in notes)
-    assert "<details>" not in shown
-    folded = str(make_header("sweep", "Right in 7 of 8.", [f"{k}.ply: nothing" for k in range(4)]))
-    assert "<summary>4 notes on how files were read</summary>" in folded and "remarks" not in folded

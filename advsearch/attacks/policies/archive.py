@@ -21,37 +21,46 @@ MAX_DIM = 10_000  # more numbers are refused: every cell keeps a whole configura
 MAX_CELLS = 1_000_000  # an archive has no more
 # parameters that span it; with more, nearly every configuration has a cell of its own
 MAX_MEASURES = 4
-# share of the configurations, and of the discrete choices, that are drawn anew
+# fraction of the configurations, and of the discrete choices, that are sampled anew
 RESAMPLED_FRACTION = 0.1
-# so many kept configurations are drawn, and the one with the largest objective is
-# changed
+# stored configurations that are drawn for an offspring; the one with the largest
+# objective is its first parent
 TOURNAMENT = 4
 SIGMA = 0.1
 LINE_SIGMA = 0.3
-"""Standard deviations of a step, in half of each number's range, and of one along the
-line through two configurations, in their distance.
+"""Standard deviations of a step, in half ranges, and of a step along the line through
+both parents, in their distance.
 """
 
 # how much larger steps are in the parameters that span the archive: that is where there
 # are cells to fill
 MEASURE_SIGMA_FACTOR = 4.0
 N_CANDIDATES = 300  # configurations that the surrogate chooses a generation from
-ANY_CELL_FRACTION = 0.5  # share of these whose parameters of the archive are drawn anew
-# what a larger objective in a cell that fails already counts for, beside a failure in
-# another
+# fraction of these whose parameters of the archive are sampled anew
+ANY_CELL_FRACTION = 0.5
+# weight of a larger objective in a cell that fails already; that of a failure in
+# another cell is 1
 IMPROVEMENT_WEIGHT = 0.1
-# the surrogate is made from so many of the best configurations and so many of the
-# latest
+# number of the best, and of the latest, configurations that the surrogate is fitted to
 MEMORY = 300
 
 
 @dataclass(frozen=True, eq=False)
 class ArchiveState:
-    """Where the search stands: positions (k,) in u of what spans the archive, half of
-    each number's range (d,), the archive of ribs, which is never written to again, this
-    generation's configurations (n, d), objectives and successes of the first of them,
-    and what the surrogate is made from; None where there are too many numbers, or a
-    norm ball.
+    """State of the search.
+
+    Attributes:
+        domain: of the search.
+        seed: of random numbers.
+        measure_indices: (k,) indices in u of the parameters that span the archive.
+        half_widths: (d,) half of the range of each element of u.
+        archive: of ribs; never written to again.
+        generation: index of the present generation.
+        points: (n, d) its configurations.
+        values: objectives of the first of them.
+        successes: whether these are failures of the model.
+        observations: what the surrogate is fitted to; None if there are too many
+            numbers for one, or a norm ball.
     """
 
     domain: policies.Domain
@@ -87,8 +96,9 @@ class ArchiveState:
     def make_offspring(self, samples: Tensor, rng: torch.Generator) -> Tensor:
         """Return offspring (n, d) of the archive, which may be out of bounds.
 
-        Each has two parents. Its options are those of the first, now and then of a
-        sample (n, d).
+        Each has two parents: numbers are those of the first plus noise and a random
+        step along the line to the second; options are those of the first, or with
+        probability `RESAMPLED_FRACTION` of the samples (n, d).
         """
         count, dim = samples.shape
         first, second = self._sample_parents(count)
@@ -117,19 +127,20 @@ class ArchiveState:
         shape = (TOURNAMENT + 1, count)
         solutions = torch.from_numpy(elites["solution"]).unflatten(0, shape)
         objectives = torch.from_numpy(elites["objective"]).unflatten(0, shape)
+        # row 0 are the second parents; the other rows compete to be the first
         winner = objectives[1:].argmax(0)
         return solutions[1 + winner, torch.arange(count)], solutions[0]
 
     def select_most_promising(
         self, surrogate: policies.Surrogate, points: Tensor, count: int
     ) -> Tensor:
-        """Return the most promising of the candidates (n, d), (count, d).
+        """Return the `count` most promising of the candidates `points` (n, d).
 
-        They are of different cells as long as there are enough: those that most likely
-        fail where nothing fails yet. Where something does, a larger objective than its
-        own counts for `IMPROVEMENT_WEIGHT` as much.
+        The promise of a candidate is the probability that it exceeds the objective to
+        beat in its cell; in a cell that fails already it counts `IMPROVEMENT_WEIGHT`
+        times. The best of each cell come first, then the rest.
         """
-        mean, deviation = surrogate.predict(surrogate.space.from_configuration(points))
+        mean, deviation = surrogate.predict(surrogate.box.from_configuration(points))
         objective_of_cell, threshold = self._find_objectives_to_beat()
         measures = points[:, self.measure_indices].double().numpy()
         cells = self.archive.index_of(measures).tolist()
@@ -144,9 +155,11 @@ class ArchiveState:
         return points[_order_by_cell(order, cells)[:count]]
 
     def _find_objectives_to_beat(self) -> tuple[dict[int, float], float]:
-        """Return the objectives of cells that fail, and the one to beat elsewhere.
+        """Return the objectives of the cells that fail, by index, and the one to beat
+        in the other cells.
 
-        Elsewhere it is the smallest of a failure, or without one the largest of all.
+        The latter is the smallest objective of a failure; without any failure, the
+        largest objective.
         """
         elites = self.archive.data()
         objectives = torch.from_numpy(elites["objective"])
@@ -175,13 +188,21 @@ def _find_cell_ranges(
     boundaries: Sequence[Any],
     grid_index: Sequence[int],
 ) -> dict[int, tuple[float, float]]:
-    """Return the range of each parameter of the archive in one of its cells."""
-    return {
-        measure: (float(edges[cell]), float(edges[cell + 1]))
-        for measure, edges, cell in zip(
-            measure_indices, boundaries, grid_index, strict=True
-        )
-    }
+    """Return the range (low, high) of each parameter of the archive in a cell.
+
+    Args:
+        measure_indices: of the parameters in u; they are the keys of the result.
+        boundaries: of the cells on each axis, ascending.
+        grid_index: index of the cell on each axis.
+    """
+    ranges = {}
+    for measure, axis_boundaries, index in zip(
+        measure_indices, boundaries, grid_index, strict=True
+    ):
+        low = float(axis_boundaries[index])
+        high = float(axis_boundaries[index + 1])
+        ranges[measure] = (low, high)
+    return ranges
 
 
 def _make_candidates(
@@ -192,7 +213,7 @@ def _make_candidates(
     The parameters of the archive of some of them are sampled uniformly, so that they
     may lie in any cell.
     """
-    box = observations.space
+    box = observations.box
     uniform = torch.rand(N_CANDIDATES, box.count, generator=rng)
     samples = box.low + box.width * uniform
     offspring = state.make_offspring(samples, rng)
@@ -297,7 +318,7 @@ class MapElites(Policy[ArchiveState]):
             extra_fields={"wrong": ((), np.bool_)},
         )
         first_points = [
-            domain.begin[None],
+            domain.initial_point[None],
             domain.sample(policies.seeded(seed, 0), self.population - 1),
         ]
         box = policies.find_box_coordinates(domain)
@@ -328,27 +349,27 @@ class MapElites(Policy[ArchiveState]):
     def update(
         self, state: ArchiveState, evaluated: policies.Evaluated
     ) -> ArchiveState:
-        values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
-        successes = (
-            *state.successes,
-            *(evaluation.success for _, evaluation in evaluated),
-        )
-        observations = (
-            None if state.observations is None else state.observations.extend(evaluated)
-        )
+        """Add evaluations to the generation; start the next once it is complete."""
+        new_values = [evaluation.objective for _, evaluation in evaluated]
+        new_successes = [evaluation.success for _, evaluation in evaluated]
+        observations = state.observations
+        if observations is not None:
+            observations = observations.extend(evaluated)
         state = replace(
-            state, values=values, successes=successes, observations=observations
+            state,
+            values=(*state.values, *new_values),
+            successes=(*state.successes, *new_successes),
+            observations=observations,
         )
-        return (
-            state
-            if len(values) < len(state.points)
-            else self._start_generation(state.add_generation())
-        )
+        if len(state.values) < len(state.points):
+            return state
+        return self._start_generation(state.add_generation())
 
     def failures(self, state: ArchiveState) -> policies.Failures:
-        """Return the cells whose configuration is a success.
+        """Return the cells whose configuration is a failure of the model.
 
-        Those of a generation that is not complete yet count.
+        A generation that is not complete yet counts. Of the cells a diverse selection
+        is returned as examples, and how many there are of how many that are filled.
         """
         archive = state.add_generation().archive
         measure_indices = tuple(state.measure_indices.tolist())
@@ -380,15 +401,18 @@ class MapElites(Policy[ArchiveState]):
         )
 
     def _start_generation(self, state: ArchiveState) -> ArchiveState:
-        """Begin the next generation; no other state has the archive yet."""
+        """Begin the next generation: sample or choose its configurations.
+
+        About one in ten is sampled from the domain; the others are offspring, chosen by
+        the surrogate if there is one. While the archive is empty all are sampled.
+        """
         state = replace(state, generation=state.generation + 1, values=(), successes=())
         domain = state.domain
         rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:
             return replace(state, points=domain.sample(rng, self.population))
-        n_new = int(
-            (torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION).sum()
-        )
+        is_resampled = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
+        n_new = int(is_resampled.sum())
         samples = domain.sample(rng, self.population)
         observations = state.observations
         if observations is None:
@@ -406,7 +430,10 @@ class MapElites(Policy[ArchiveState]):
         return replace(state, points=points, observations=observations)
 
     def _find_measure_indices(self, domain: policies.Domain) -> Tensor:
-        """Return the indices (k,) of the parameters that span the archive."""
+        """Return the indices (k,) of the parameters that span the archive.
+
+        They are those named in `over`, by default the first two of the domain.
+        """
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:
             return torch.arange(min(2, domain.dim))

@@ -1,6 +1,6 @@
-"""The policy to use first (it looks everywhere, then where a model of what it has seen
-promises most, then uphill), and what wraps others: several policies on one budget, or
-several starts of one.
+"""The policy to use first (it looks everywhere, then where a surrogate of the objective
+promises most, then uphill), and policies that wrap others: several policies on one
+budget, or several starts of one.
 """
 
 from __future__ import annotations
@@ -35,42 +35,44 @@ from advsearch.attacks.policies.pgd import PGD, Ascent
 from advsearch.attacks.policies.surrogate import (
     BoxCoordinates,
     Observations,
+    Surrogate,
     find_box_coordinates,
 )
 from advsearch.errors import InputError
 
-# share of the renders that the screen takes, in a box alone and beside a norm ball
+# fraction of the renders that the screen takes: in a domain of box coordinates alone,
+# and in one with norm balls too ("mixed")
 SCREEN_FRACTION = 0.5
 SCREEN_FRACTION_MIXED = 0.25
-ASCENT_START = (
-    0.75  # share of the renders after which an ascent takes over, if there is one
-)
+# fraction of the renders after which an ascent takes over, if there is one
+ASCENT_START = 0.75
 ASCENT_START_MIXED = 0.5
 LOW_DIM = 10
-"""Up to so many box coordinates are worth the whole screen. Of more it sees less and
-less, so if gradients cost nothing its share shrinks in proportion and the ascent
-follows at once.
+"""Largest number of box coordinates that is worth the full screen. Of more coordinates
+a screen sees less and less; so, if gradients cost nothing, it is shorter in proportion
+and the ascent follows at once.
 """
 
 MIN_DERIVATIVES_PER_RENDER = 4
-"""Beside no norm ball, a gradient is worth its renders if it brings so many numbers for
-each, and so many gradients fit into the ascent. One by differences never is: half a
-number for each, and the surrogate was better on average.
+"""In a domain without norm balls, a gradient is worth its renders if it brings at least
+this many derivatives for each, and at least this many gradients fit into the ascent. A
+gradient by differences never is: it brings half a derivative for each render, and the
+surrogate was better on average.
 """
 
-# the ascent's whole step in a box, as a share of half the diagonal: the screen has been
+# unit step of the ascent in a box, as a fraction of the usual one: the screen has been
 # everywhere else
 ASCENT_REACH = 0.1
 EXACT_MOMENTUM = 0.75
 RANDOM_CONDITIONS_MOMENTUM = 0.95
-"""Weight of past gradients where none has noise and all point the same way, and where
-each sees other conditions; with noise PGD's own is better.
+"""Momentum of PGD if evaluations have no noise, and if each has other conditions; with
+noise PGD's default is better.
 """
 
 UCB_KAPPA = 2.0
-"""How many standard deviations of the surrogate a candidate gets on top of its mean.
-One does as well without noise; with a noise as large as all differences it settles too
-soon on a lucky point.
+"""How many standard deviations of the surrogate are added to the mean of a candidate.
+One does as well without noise; but with noise as large as all differences one settles
+too soon on a lucky point.
 """
 
 # candidates near the best points, candidates anywhere, and the number of best points
@@ -82,8 +84,14 @@ UNAFFORDABLE_COST = 1 << 30  # renders of a gradient that no search can pay
 
 @dataclass(frozen=True)
 class BudgetPlan:
-    """What the renders are for: the screen; the ascent, which asks for `gradient`,
-    begins after `ascent_start`, or never at `steps`.
+    """How the renders of a search are divided. The surrogate has those between the
+    screen and the ascent.
+
+    Attributes:
+        steps: renders in all.
+        screen: renders of the screen.
+        ascent_start: renders after which the ascent begins; `steps` if it never does.
+        gradient: which gradient the ascent requests.
     """
 
     steps: int
@@ -93,33 +101,44 @@ class BudgetPlan:
 
 
 def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
+    """Divide the renders of a search among screen, surrogate and ascent; see `Auto`.
+
+    Without box coordinates all are the ascent's. With norm balls and box coordinates
+    there always is an ascent. In box coordinates alone there is one only if gradients
+    are cheap enough, see `MIN_DERIVATIVES_PER_RENDER`.
+    """
     if box.count == 0:
-        return BudgetPlan(steps, 0, 0, True)
+        return BudgetPlan(steps, screen=0, ascent_start=0, gradient=True)
     if box.count < domain.dim:
-        screen = math.ceil(SCREEN_FRACTION_MIXED * steps)
-        until = math.ceil(ASCENT_START_MIXED * steps)
+        has_free_part = domain.gradient_cost and domain.partial_gradients
         return BudgetPlan(
             steps,
-            screen,
-            until,
-            "free" if domain.gradient_cost and domain.partial_gradients else True,
+            screen=math.ceil(SCREEN_FRACTION_MIXED * steps),
+            ascent_start=math.ceil(ASCENT_START_MIXED * steps),
+            gradient="free" if has_free_part else True,
         )
     n_continuous = int((box.options == 0).sum())
     screen = math.ceil(
         SCREEN_FRACTION * steps * min(1.0, LOW_DIM / max(n_continuous, 1))
     )
-    until = math.ceil(ASCENT_START * steps) if n_continuous <= LOW_DIM else screen
+    ascent_start = screen
+    if n_continuous <= LOW_DIM:
+        ascent_start = math.ceil(ASCENT_START * steps)
     cost = domain.gradient_cost
-    if (
-        n_continuous
-        and MIN_DERIVATIVES_PER_RENDER * cost <= n_continuous
-        and MIN_DERIVATIVES_PER_RENDER * (1 + cost) <= steps - until
-    ):
-        return BudgetPlan(steps, screen, until, True)
-    return BudgetPlan(steps, math.ceil(SCREEN_FRACTION * steps), steps, True)
+    is_worth_renders = MIN_DERIVATIVES_PER_RENDER * cost <= n_continuous
+    fits = MIN_DERIVATIVES_PER_RENDER * (1 + cost) <= steps - ascent_start
+    if n_continuous and is_worth_renders and fits:
+        return BudgetPlan(steps, screen, ascent_start, gradient=True)
+    return BudgetPlan(
+        steps,
+        screen=math.ceil(SCREEN_FRACTION * steps),
+        ascent_start=steps,
+        gradient=True,
+    )
 
 
-def _pgd(domain: Domain) -> PGD:
+def _make_pgd(domain: Domain) -> PGD:
+    """Return the policy of the ascent, with the momentum that suits the noise."""
     if domain.draws_conditions:
         return PGD(momentum=RANDOM_CONDITIONS_MOMENTUM)
     return PGD(momentum=EXACT_MOMENTUM) if domain.exact else PGD()
@@ -127,11 +146,21 @@ def _pgd(domain: Domain) -> PGD:
 
 @dataclass(frozen=True, eq=False)
 class AutoState:
-    """Where the search stands: where the screened box coordinates have been, with norm
-    balls at their start, where the screen (m, k) looks next, the renders spent, and,
-    once it has begun, the ascent of PGD, its latest objective and where the box
-    coordinates stood before the latest proposal moved them at random, if it did
-    (`box_before_trial`).
+    """State of the search.
+
+    Attributes:
+        domain: of the search.
+        observations: evaluations of the screen and the surrogate, with norm balls at
+            their start.
+        plan: how the renders are divided.
+        seed: of random numbers.
+        screen: (m, k) box coordinates of the screen's points after the initial one.
+        renders_spent: by the evaluations so far.
+        ascent: state of PGD, once it has begun.
+        is_climbing: whether the latest proposal was the ascent's.
+        latest_objective: of the ascent.
+        box_before_trial: (k,) box coordinates before the latest proposal moved them at
+            random; None if it did not.
     """
 
     domain: Domain
@@ -147,13 +176,15 @@ class AutoState:
 
     @property
     def box(self) -> BoxCoordinates:
-        return self.observations.space
+        return self.observations.box
 
     def to_configuration(self, x: Tensor) -> Tensor:
         """Return the configuration (d,) whose box coordinates are x and whose norm
         balls are at their start.
         """
-        return self.domain.project(self.box.to_configuration(self.domain.begin, x))
+        return self.domain.project(
+            self.box.to_configuration(self.domain.initial_point, x)
+        )
 
 
 @dataclass(frozen=True)
@@ -197,7 +228,7 @@ class Auto(Policy[AutoState]):
                 plan,
                 0,
                 no_points,
-                ascent=_pgd(domain).start(domain, generator, steps),
+                ascent=_make_pgd(domain).start(domain, generator, steps),
             )
         seed = draw_seed(generator)
         with limit_to_single_thread():
@@ -207,53 +238,72 @@ class Auto(Policy[AutoState]):
     def propose(
         self, state: AutoState, n: int
     ) -> tuple[tuple[Proposal, ...], AutoState]:
+        """Propose what the present phase has next: screen, surrogate or ascent.
+
+        An ascent that has nothing more to propose ends the search in a domain with norm
+        balls; in box coordinates alone the surrogate goes on.
+        """
         state = replace(state, is_climbing=False, box_before_trial=None)
         if state.ascent is None and state.renders_spent >= state.plan.ascent_start:
             with limit_to_single_thread():
                 state = self._begin_ascent(state)
         if state.ascent is not None:
-            steps, ascent = _pgd(state.domain).propose(state.ascent, n)
+            steps, ascent = _make_pgd(state.domain).propose(state.ascent, n)
             if steps:
                 (proposal,) = steps
-                proposal = replace(proposal, gradient=state.plan.gradient)
-                state = replace(state, is_climbing=True)
-                if proposal.gradient is True or ascent.count % 2 == 0:
-                    return (proposal,), state
-                # only the balls have a gradient, so every second one moves in the box
-                # too
-                box = state.box
-                x = state.box.from_configuration(proposal.u)
-                moved = box.sample_moves(
-                    x[None], seeded(state.seed, state.plan.steps + ascent.count)
-                )[0]
-                u = state.domain.project(box.to_configuration(proposal.u, moved))
-                return (replace(proposal, u=u),), replace(state, box_before_trial=x)
-            if state.box.count < state.domain.dim:
+                return self._propose_ascent_step(state, proposal, ascent.count)
+            has_norm_balls = state.box.count < state.domain.dim
+            if has_norm_balls:
                 return (), state
-        done = len(state.observations.values)
-        us = [] if done else [state.domain.begin]
-        us += map(
-            state.to_configuration, state.screen[max(0, done - 1) :][: n - len(us)]
-        )
-        if not us:
+        n_observed = len(state.observations.values)
+        points = []
+        if n_observed == 0:
+            points.append(state.domain.initial_point)
+        # the screen follows the initial point
+        screen = state.screen[max(0, n_observed - 1) :][: n - len(points)]
+        points += map(state.to_configuration, screen)
+        if not points:
             with limit_to_single_thread():
-                x, state = self._next_point(state)
-            us = [state.to_configuration(x)]
-        return tuple(map(Proposal, us)), state
+                x, state = self._choose_next_point(state)
+            points = [state.to_configuration(x)]
+        return tuple(map(Proposal, points)), state
+
+    def _propose_ascent_step(
+        self, state: AutoState, proposal: Proposal, count: int
+    ) -> tuple[tuple[Proposal, ...], AutoState]:
+        """Propose a step of the ascent, with the gradient of the plan.
+
+        If only the norm balls have a gradient ("free"), every second step moves the box
+        coordinates at random besides.
+
+        Args:
+            state: of the search.
+            proposal: of PGD.
+            count: evaluations of the ascent so far.
+        """
+        proposal = replace(proposal, gradient=state.plan.gradient)
+        state = replace(state, is_climbing=True)
+        if proposal.gradient is True or count % 2 == 0:
+            return (proposal,), state
+        box = state.box
+        x = box.from_configuration(proposal.u)
+        rng = seeded(state.seed, state.plan.steps + count)
+        moved_x = box.sample_moves(x[None], rng)[0]
+        u = state.domain.project(box.to_configuration(proposal.u, moved_x))
+        return (replace(proposal, u=u),), replace(state, box_before_trial=x)
 
     def update(self, state: AutoState, evaluated: Evaluated) -> AutoState:
-        state = replace(
-            state,
-            renders_spent=state.renders_spent
-            + sum(evaluation.cost for _, evaluation in evaluated),
-        )
+        """Pass evaluations to the ascent, or add them to the observations.
+
+        A random move of the box coordinates is taken back if the objective fell.
+        """
+        cost = sum(evaluation.cost for _, evaluation in evaluated)
+        state = replace(state, renders_spent=state.renders_spent + cost)
         if state.is_climbing and state.ascent is not None:
             ((_, evaluation),) = evaluated
-            ascent = _pgd(state.domain).update(state.ascent, evaluated)
-            if (
-                state.box_before_trial is not None
-                and evaluation.objective < state.latest_objective
-            ):
+            ascent = _make_pgd(state.domain).update(state.ascent, evaluated)
+            has_fallen = evaluation.objective < state.latest_objective
+            if state.box_before_trial is not None and has_fallen:
                 u = state.domain.project(
                     state.box.to_configuration(ascent.u, state.box_before_trial)
                 )
@@ -272,56 +322,61 @@ class Auto(Policy[AutoState]):
     def counts(self, state: AutoState) -> Counts:
         return NO_COUNTS if state.ascent is None else state.ascent.counts
 
-    def _next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
+    def _choose_next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
+        """Return the point (k,) of the box to evaluate next.
+
+        It is the candidate with the largest upper confidence bound of the surrogate; a
+        random point as long as no objective is finite.
+        """
         box = state.box
         generator = seeded(state.seed, len(state.observations.values))
         if not state.observations.has_finite:
             return box.normalize(torch.rand(box.count, generator=generator)), state
         surrogate, observations = state.observations.fit_surrogate()
-        best_points = surrogate.x[
-            surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)
-        ]
-        centres = torch.randint(
-            0,
-            min(N_CENTERS, len(best_points)),
-            (N_NEAR_CANDIDATES,),
-            generator=generator,
-        )
-        centres[: N_NEAR_CANDIDATES // 2] = 0
-        near_candidates = box.sample_moves(best_points[centres], generator)
-        far_candidates = box.normalize(
-            torch.rand(N_FAR_CANDIDATES, box.count, generator=generator)
-        )
-        candidates = torch.cat([best_points[:1], near_candidates, far_candidates])
-        mean, deviation = surrogate.predict(candidates)
-        return candidates[int((mean + UCB_KAPPA * deviation).argmax())], replace(
-            state, observations=observations
-        )
+        candidates = _sample_candidates(surrogate, generator)
+        mean, std = surrogate.predict(candidates)
+        best_candidate = candidates[int((mean + UCB_KAPPA * std).argmax())]
+        return best_candidate, replace(state, observations=observations)
 
     def _begin_ascent(self, state: AutoState) -> AutoState:
-        """Let PGD go on from the best of the points seen so far, with small steps in
-        the box.
+        """Let PGD go on from the best observed point, with small steps in the box.
+
+        The best is by the mean of the surrogate; the initial point if no objective is
+        finite. Norm balls begin at their start.
         """
-        x = state.box.from_configuration(state.domain.begin)
+        x = state.box.from_configuration(state.domain.initial_point)
         blocks = state.domain.blocks
         if state.observations.has_finite:
             surrogate, observations = state.observations.fit_surrogate()
             state = replace(state, observations=observations)
             x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
-        ascent_blocks = (
-            replace(
-                block,
-                reach=ASCENT_REACH * block.radius if block.norm == "box" else None,
-            )
-            for block in blocks
-        )
+        ascent_blocks = []
+        for block in blocks:
+            reach = ASCENT_REACH * block.radius if block.norm == "box" else None
+            ascent_blocks.append(replace(block, reach=reach))
         domain = replace(state.domain, blocks=tuple(ascent_blocks))
-        ascent = _pgd(domain).start(
-            domain,
-            seeded(state.seed, 0),
-            max(1, state.plan.steps - state.renders_spent),
-        )
+        renders_left = max(1, state.plan.steps - state.renders_spent)
+        ascent = _make_pgd(domain).start(domain, seeded(state.seed, 0), renders_left)
         return replace(state, ascent=replace(ascent, u=state.to_configuration(x)))
+
+
+def _sample_candidates(surrogate: Surrogate, generator: torch.Generator) -> Tensor:
+    """Return points (n, k) of the box to choose the next one from.
+
+    They are the best known point, by the surrogate's mean; moves of it, and as many of
+    the `N_CENTERS` best known points; and uniform points.
+    """
+    box = surrogate.box
+    known_mean, _ = surrogate.predict(surrogate.x)
+    ranked_points = surrogate.x[known_mean.argsort(descending=True, stable=True)]
+    n_centers = min(N_CENTERS, len(ranked_points))
+    center_rank = torch.randint(0, n_centers, (N_NEAR_CANDIDATES,), generator=generator)
+    center_rank[: N_NEAR_CANDIDATES // 2] = 0
+    near_candidates = box.sample_moves(ranked_points[center_rank], generator)
+    far_candidates = box.normalize(
+        torch.rand(N_FAR_CANDIDATES, box.count, generator=generator)
+    )
+    return torch.cat([ranked_points[:1], near_candidates, far_candidates])
 
 
 @dataclass(frozen=True)
@@ -379,19 +434,24 @@ class Restarts(RacingPolicy[Race]):
         return self.policy.uses_gradient
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
+        """Start the policy from several points; the first is the domain's own.
+
+        There are as many as `steps` renders allow one evaluation each, at most `times`.
+        """
         seed = draw_seed(generator)
-        each = 1 + (domain.gradient_cost if self.policy.uses_gradient else 0)
-        count = max(1, min(self.times, steps // each))
-        begins = (
-            domain.begin,
-            *(domain.sample(seeded(seed, number))[0] for number in range(1, count)),
-        )
-        return start_race(
-            [(self.policy, replace(domain, first=begin)) for begin in begins],
-            steps,
-            seed,
-            rounds=1,
-        )
+        renders_per_step = 1
+        if self.policy.uses_gradient:
+            renders_per_step += domain.gradient_cost
+        n_starts = max(1, min(self.times, steps // renders_per_step))
+        initial_points = [domain.initial_point]
+        for number in range(1, n_starts):
+            initial_points.append(domain.sample(seeded(seed, number))[0])
+        searches = [
+            (self.policy, replace(domain, restart_point=point))
+            for point in initial_points
+        ]
+        # In a single round nobody drops out.
+        return start_race(searches, steps, seed, rounds=1)
 
 
 @dataclass(frozen=True)
@@ -435,15 +495,20 @@ class Portfolio(RacingPolicy[Race]):
         return any(policy.takes_differences(domain, steps) for policy in self.policies)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
+        """Start a race of the policies that can search the domain.
+
+        Raises:
+            InputError: none of them can; it is the error of the first.
+        """
         seed = draw_seed(generator)
+        steps_each = max(1, steps // len(self.policies))
         searches = []
         errors = []
         for policy in self.policies:
             wrapped = wrap_choices(policy, domain)
             try:
-                wrapped.start(
-                    domain, seeded(seed, 0), max(1, steps // len(self.policies))
-                )
+                # only to learn whether it can; the race starts it again
+                wrapped.start(domain, seeded(seed, 0), steps_each)
             except InputError as error:
                 errors.append(error)
             else:

@@ -1,9 +1,9 @@
 """Discrete choices around a policy that knows only numbers: options outside, the
 continuous search inside. Searches race by successive halving (Karnin, Koren and Somekh
 2013, "Almost optimal exploration in multi-armed bandits"; Jamieson and Talwalkar 2016):
-1 + ceil(log2 n) rounds with equal shares of the renders, and within a round equal
-shares for all that are still in, who take turns, whoever has most left first. A share
-counts what a proposal may cost.
+1 + ceil(log2 n) rounds with equally many renders, divided equally among the searches
+that are still in. They take turns: the one with the most renders left comes first. A
+proposal is charged with what it may cost.
 """
 
 from __future__ import annotations
@@ -33,9 +33,15 @@ from advsearch.attacks.policies.sampling import Random
 
 @dataclass(frozen=True, eq=False)
 class Runner:
-    """One search in a race: a policy and its state, renders left of its share of this
-    round, the largest objective it has met, and whether it has nothing more to propose
-    (`is_over`).
+    """One search in a race.
+
+    Attributes:
+        policy: that searches.
+        domain: that it searches.
+        state: of the policy.
+        renders_left: that it may still use in this round.
+        best_objective: the largest so far.
+        is_over: whether it has nothing more to propose.
     """
 
     policy: Policy[Any]
@@ -51,9 +57,16 @@ Racing = TypeVar("Racing", bound="Race")
 
 @dataclass(frozen=True, eq=False)
 class Race:
-    """Where a race of so many steps and rounds stands: the numbers of those that are in
-    this round, the best first (`active_runners`), renders that the evaluations so far
-    took, and the searches whose proposals wait for theirs (`runner_of_proposal`).
+    """The state of a race.
+
+    Attributes:
+        runners: the searches.
+        steps: renders of the race.
+        n_rounds: of the race.
+        active_runners: indices of the searches in this round, the best first.
+        round: index of the present round.
+        spent: renders that the evaluations so far took.
+        runner_of_proposal: index of the search of each of the latest proposals.
     """
 
     runners: tuple[Runner, ...]
@@ -92,30 +105,31 @@ class Race:
     def propose(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
         """Return up to n proposals of this round that do not wait for each other.
 
-        There are none where the round is over.
+        There are none if the round is over. The search with the most renders left comes
+        first, of equals the first. Each is asked once for proposals, its part of n. The
+        batch ends with the first search whose proposals are used up, since what comes
+        after depends on their evaluations. A search of which not all proposals were
+        used is asked again for just those, so that its state counts on no others.
         """
         runners = list(self.runners)
         waiting = self._find_waiting(runners)
-        proposals_each = -(-n // max(1, len(waiting)))
-        proposals = dict[int, tuple[Proposal, ...]]()
-        n_used = Counter[int]()
+        proposals_each = math.ceil(n / max(1, len(waiting)))
+        proposals = dict[int, tuple[Proposal, ...]]()  # by index of their runner
+        n_used = Counter[int]()  # likewise
         batch = list[Proposal]()
         runner_of_proposal = list[int]()
         while waiting and len(batch) < n:
-            k = max(
-                waiting, key=lambda k: runners[k].renders_left
-            )  # the first of equals
+            k = max(waiting, key=lambda index: runners[index].renders_left)
             proposer = runners[k]
             if k not in proposals:
                 proposals[k], state = proposer.policy.propose(
                     proposer.state, min(proposals_each, proposer.renders_left)
                 )
-                # The runner is changed only where its proposals are used.
+                # put into `runners` only if one of its proposals is used
                 proposer = replace(proposer, state=state)
             if not proposals[k]:
                 self._retire(runners, k)
             elif n_used[k] == len(proposals[k]):
-                # What it proposes next depends on these evaluations.
                 break
             else:
                 proposal = self._limit_proposal(proposals[k][n_used[k]], proposer)
@@ -129,7 +143,6 @@ class Race:
             waiting = self._find_waiting(runners)
         for k, count in n_used.items():
             if count < len(proposals[k]):
-                # Its state must not count on more proposals than were used.
                 _, state = runners[k].policy.propose(self.runners[k].state, count)
                 runners[k] = replace(runners[k], state=state)
         return tuple(batch), replace(
@@ -155,9 +168,12 @@ class Race:
     def _limit_proposal(self, proposal: Proposal, runner: Runner) -> Proposal:
         """Return a proposal that the renders of its runner can pay."""
         proposal = replace(proposal, samples=min(runner.renders_left, proposal.samples))
-        # Before the last round there will be renders to use a gradient.
+        renders_left = runner.renders_left
         has_later_round = self.round + 1 < self.n_rounds
-        return proposal.limit_cost(runner.domain, runner.renders_left + has_later_round)
+        if has_later_round:
+            # the first render of that round, which can use a gradient of this one
+            renders_left += 1
+        return proposal.limit_cost(runner.domain, renders_left)
 
 
 def count_rounds(runners: int) -> int:
@@ -166,8 +182,13 @@ def count_rounds(runners: int) -> int:
 
 
 def max_runners(steps: int, each: int, limit: int) -> int:
-    """Return how many searches, at least 1 and at most `limit`, can have `each` renders
-    in every round.
+    """Return how many searches a race can have if each needs `each` renders in every
+    round.
+
+    Args:
+        steps: renders of the race.
+        each: renders that a search needs in a round.
+        limit: the maximum; the minimum is 1, though the renders may not suffice.
     """
     count = 1
     while count < limit and (count + 1) * count_rounds(count + 1) * each <= steps:
@@ -182,22 +203,27 @@ def start_race(
     *,
     rounds: int | None = None,
 ) -> Race:
-    """Return a race before its first proposal, of `count_rounds` rounds where no other
-    number is given; each search plans for the renders that it gets if it stays in to
-    the end.
+    """Return a race before its first proposal.
+
+    Args:
+        searches: policies, each with the domain that it searches.
+        steps: renders of the race.
+        seed: of random numbers.
+        rounds: by default `count_rounds`.
     """
     steps = max(1, steps)
     rounds = rounds or count_rounds(len(searches))
-    planned = 0.0
-    count = len(searches)
+    # A search plans with the renders that it gets if it stays in to the end.
+    planned_renders = 0.0
+    n_active = len(searches)
     for _ in range(rounds):
-        planned += steps / rounds / count
-        count = -(-count // 2)
+        planned_renders += steps / rounds / n_active
+        n_active = math.ceil(n_active / 2)
     runners = tuple(
         Runner(
             policy,
             domain,
-            policy.start(domain, seeded(seed, number), max(1, int(planned))),
+            policy.start(domain, seeded(seed, number), max(1, int(planned_renders))),
         )
         for number, (policy, domain) in enumerate(searches)
     )
@@ -205,42 +231,44 @@ def start_race(
 
 
 class RacingPolicy(Policy[Racing]):
-    """A policy that is a race; its `start` lines it up."""
+    """A policy that is a race, which its `start` makes."""
 
     def propose(self, state: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
-        """Return the next proposals of this round, up to n; of the next round where
-        this one is done.
+        """Return the next proposals, up to n, of this round or else of the next.
+
+        There are none once all searches are over.
         """
         while True:
             batch, state = state.propose(n)
-            runners = state.runners
-            if batch or all(runner.is_over for runner in runners):
+            if batch or all(runner.is_over for runner in state.runners):
                 return batch, state
-            ranked = sorted(
-                state.active_runners,
-                key=lambda k: runners[k].best_objective,
-                reverse=True,
-            )
-            continuing = [
-                k for k in ranked[: -(-len(ranked) // 2)] if not runners[k].is_over
-            ]
-            # nobody left who can go on: the rest is for whoever can
-            if state.round + 1 >= state.n_rounds or not continuing:
-                remaining = (
-                    k for k, runner in enumerate(runners) if not runner.is_over
-                )
-                continuing = sorted(
-                    remaining, key=lambda k: -runners[k].best_objective
-                )[:1]
-            state = state.begin_round(
-                continuing, min(state.round + 1, state.n_rounds - 1)
-            )
+            next_round = min(state.round + 1, state.n_rounds - 1)
+            state = state.begin_round(self._select_continuing(state), next_round)
+
+    @staticmethod
+    def _select_continuing(race: Race) -> list[int]:
+        """Return the indices of the searches of the next round, the best first.
+
+        They are the better half of this round without those that are over. After the
+        last round, or if all of that half are over, the best search that is not over
+        gets the rest of the renders, even if it dropped out before.
+        """
+        runners = race.runners
+        ranked = sorted(
+            race.active_runners, key=lambda k: runners[k].best_objective, reverse=True
+        )
+        better_half = ranked[: math.ceil(len(ranked) / 2)]
+        continuing = [k for k in better_half if not runners[k].is_over]
+        if continuing and race.round + 1 < race.n_rounds:
+            return continuing
+        remaining = [k for k, runner in enumerate(runners) if not runner.is_over]
+        return sorted(remaining, key=lambda k: -runners[k].best_objective)[:1]
 
     def update(self, state: Racing, evaluated: Evaluated) -> Racing:
         """Update each search with the evaluations of its proposals.
 
-        Both are as its own domain has them. There may be fewer evaluations than
-        proposals.
+        Configurations and gradients are those of the searches' own domain. There may be
+        fewer evaluations than proposals.
         """
         evaluated_by_runner = defaultdict[int, list[Any]](list)
         for k, (u, evaluation) in zip(
@@ -267,8 +295,8 @@ class RacingPolicy(Policy[Racing]):
         return runner.policy.distribution(runner.state)
 
     def failures(self, state: Racing) -> Failures | None:
-        """Return the different failures of the search that has met the most; None where
-        none looks for such.
+        """Return the failures of the search that has met the most; None if no search
+        looks for different ones.
         """
         known = [runner.policy.failures(runner.state) for runner in state.runners]
         return max(
@@ -281,16 +309,21 @@ class RacingPolicy(Policy[Racing]):
         )
 
 
-MAX_COMBINATIONS = 256  # no more combinations than this take part
-# nor more, but two, that have so many numbers together: each search keeps some such
-# vectors
+# limits of the combinations that take part: their number, and the elements of all their
+# configurations together, of which each search stores several; two always may
+MAX_COMBINATIONS = 256
 MAX_NUMBERS = 2**24
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChoicesState(Race):
-    """Where the search stands: a race over the numbers alone, positions in u of numbers
-    (k,) and choices (c,), and the choices' elements (n, c) of each search in it.
+    """State of the search: a race over the numbers alone.
+
+    Attributes:
+        domain: of numbers and choices.
+        numbers: (k,) indices of the numbers in u.
+        choices: (c,) indices of the discrete choices in u.
+        combinations: (n, c) elements of u at the choices, for each search of the race.
     """
 
     domain: Domain
@@ -299,7 +332,11 @@ class ChoicesState(Race):
     combinations: Tensor
 
     def join_choices(self, numbers: Tensor, combination: int) -> Tensor:
-        u = self.domain.begin.clone()
+        """Return the configuration (d,) with numbers (k,) and a combination of options.
+
+        Without numbers in the domain, the only number of the search is dropped.
+        """
+        u = self.domain.initial_point.clone()
         u[self.numbers] = numbers[: len(self.numbers)]
         u[self.choices] = self.combinations[combination]
         return u
@@ -311,10 +348,10 @@ class Choices(RacingPolicy[ChoicesState]):
     inside.
 
     Every combination of options has a search of its own over the numbers, and the
-    combinations race. If there are more combinations than can have a whole evaluation
-    in every round, a random choice of them takes part, the start's among them always.
-    `search` puts this around every policy whose `handles_choices` is false, a user's
-    own included.
+    combinations race. If there are more combinations than can have an evaluation (with
+    its gradient) in every round, a random subset takes part, that of the start always
+    included. `search` wraps every policy whose `handles_choices` is false in this, also
+    those of users.
     """
 
     policy: Policy[Any]
@@ -332,27 +369,27 @@ class Choices(RacingPolicy[ChoicesState]):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> ChoicesState:
+        """Start one search of the numbers for each combination of options.
+
+        If nothing but choices may vary, the inner search is a random one over a number
+        that is dropped afterwards (`ChoicesState.join_choices`).
+        """
         seed = draw_seed(generator)
         options = domain.options
         numbers = (options == 0).nonzero().flatten()
         choices = options.nonzero().flatten()
-        # of one number that is dropped, where nothing but choices may vary
         policy: Policy[Any] = Random()
-        inner = Domain(torch.zeros(1), (Block(1),))
+        inner_domain = Domain(torch.zeros(1), (Block(1),))
         if len(numbers):
-            first = None if domain.first is None else domain.first[numbers]
-            blocks = tuple(block for block in domain.blocks if not block.options)
             policy = self.policy
-            inner = replace(
-                domain, start=domain.start[numbers], blocks=blocks, first=first
-            )
+            inner_domain = _drop_choices(domain, numbers)
         combinations = _select_combinations(
             options[choices].tolist(),
-            domain.begin[choices],
+            domain.initial_point[choices],
             _count_runners(domain, policy, steps),
             seeded(seed, 0),
         )
-        race = start_race([(policy, inner)] * len(combinations), steps, seed)
+        race = start_race([(policy, inner_domain)] * len(combinations), steps, seed)
         return ChoicesState(
             **vars(race),
             domain=domain,
@@ -374,33 +411,51 @@ class Choices(RacingPolicy[ChoicesState]):
         return joined, state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
-        inner = []
+        """Update each search with its evaluations, without their discrete choices."""
+        inner_evaluated = []
         numbers = state.numbers
         for u, evaluation in evaluated:
-            gradient = (
-                None if evaluation.gradient is None else evaluation.gradient[numbers]
-            )
-            inner.append((u[numbers], replace(evaluation, gradient=gradient)))
-        return super().update(state, inner)
+            gradient = evaluation.gradient
+            if gradient is not None:
+                gradient = gradient[numbers]
+            inner_evaluated.append((u[numbers], replace(evaluation, gradient=gradient)))
+        return super().update(state, inner_evaluated)
 
     def distribution(self, state: ChoicesState) -> Distribution | None:
-        inner = super().distribution(state)
-        if inner is None:
+        """Return the distribution of the leading search, with its options fixed."""
+        inner_distribution = super().distribution(state)
+        if inner_distribution is None:
             return None
         deviation = torch.zeros_like(state.domain.start)
-        deviation[state.numbers] = inner.deviation
-        return Distribution(state.join_choices(inner.mean, state.leader), deviation)
+        deviation[state.numbers] = inner_distribution.deviation
+        mean = state.join_choices(inner_distribution.mean, state.leader)
+        return Distribution(mean, deviation)
 
     def failures(self, state: ChoicesState) -> None:
-        """None: those of a search are without their choices."""
+        """Return None: the failures of an inner search lack their choices."""
 
 
 def wrap_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
     """Return the policy, inside `Choices` if the domain has discrete choices that it
     does not handle itself.
     """
-    discrete = any(block.options for block in domain.blocks)
-    return Choices(policy) if discrete and not policy.handles_choices else policy
+    has_choices = any(block.options for block in domain.blocks)
+    if has_choices and not policy.handles_choices:
+        return Choices(policy)
+    return policy
+
+
+def _drop_choices(domain: Domain, numbers: Tensor) -> Domain:
+    """Return a domain without its discrete choices; `numbers` are the other indices."""
+    restart_point = domain.restart_point
+    if restart_point is not None:
+        restart_point = restart_point[numbers]
+    return replace(
+        domain,
+        start=domain.start[numbers],
+        blocks=tuple(block for block in domain.blocks if not block.options),
+        restart_point=restart_point,
+    )
 
 
 def _count_runners(domain: Domain, policy: Policy[Any], steps: int) -> int:
@@ -412,30 +467,42 @@ def _count_runners(domain: Domain, policy: Policy[Any], steps: int) -> int:
 
 
 def _select_combinations(
-    counts: list[int], begin: Tensor, most: int, generator: torch.Generator
+    n_options: list[int],
+    initial_point: Tensor,
+    max_combinations: int,
+    generator: torch.Generator,
 ) -> Tensor:
-    """Return (n, c) elements of u, that of the start first: all combinations in a
-    random order, or `most` of them.
+    """Return combinations of options as elements of u (n, c), the initial one first.
+
+    If there are few enough to list, they follow in a random order; otherwise different
+    ones are sampled, in ascending order.
+
+    Args:
+        n_options: of each of the c choices.
+        initial_point: (c,) elements of u.
+        max_combinations: number of combinations, or fewer if there are fewer.
+        generator: of random numbers.
     """
-    sizes = torch.tensor(counts)
-    total = math.prod(counts)
-    start = torch.floor(begin * sizes).long().clamp(max=sizes - 1)
-    if total <= max(1024, 4 * most):
-        all_combinations = torch.cartesian_prod(
-            *(torch.arange(count) for count in counts)
-        ).reshape(total, len(counts))
-        all_combinations = all_combinations[torch.randperm(total, generator=generator)]
-        selected = all_combinations[~(all_combinations == start).all(dim=1)][: most - 1]
+    sizes = torch.tensor(n_options)
+    n_choices = len(n_options)
+    total = math.prod(n_options)
+    initial = torch.floor(initial_point * sizes).long().clamp(max=sizes - 1)
+    if total <= max(1024, 4 * max_combinations):
+        axes = [torch.arange(count) for count in n_options]
+        combinations = torch.cartesian_prod(*axes).reshape(total, n_choices)
+        combinations = combinations[torch.randperm(total, generator=generator)]
+        is_initial = (combinations == initial).all(dim=1)
+        selected = combinations[~is_initial][: max_combinations - 1]
     else:
-        first = tuple(start.tolist())
-        sampled = {first}
-        while len(sampled) < most:
-            sampled.add(
-                tuple(
-                    int(torch.randint(count, (1,), generator=generator))
-                    for count in counts
-                )
-            )
-        selected = torch.tensor(sorted(sampled - {first})).reshape(-1, len(counts))
+        initial_options = tuple(initial.tolist())
+        sampled = {initial_options}
+        while len(sampled) < max_combinations:
+            options = [
+                int(torch.randint(count, (1,), generator=generator))
+                for count in n_options
+            ]
+            sampled.add(tuple(options))
+        others = sorted(sampled - {initial_options})
+        selected = torch.tensor(others).reshape(-1, n_choices)
     centers = option_center((selected + 0.5) / sizes, sizes)
-    return torch.cat([begin[None], centers.to(begin.dtype)])
+    return torch.cat([initial_point[None], centers.to(initial_point.dtype)])

@@ -36,9 +36,9 @@ from advsearch.errors import InputError
 from advsearch.seeds import stream
 
 MAX_FULL_DIM = 80
-"""Up to so many numbers have a full covariance matrix; more have its diagonal (Ros and
-Hansen 2008). Also about the size from which the linear algebra would use several
-threads, whose last bits may differ.
+"""Largest dimension with a full covariance matrix; above it only its diagonal is
+adapted (Ros and Hansen 2008). Also about the size from which the linear algebra would
+use several threads, whose last bits may differ.
 """
 
 # more numbers are refused: a generation would take longer than renders, and an ascent
@@ -46,43 +46,53 @@ threads, whose last bits may differ.
 MAX_DIM = 10_000
 MAX_STEP_SIZE = 10.0
 MIN_STEP_SIZE = 1e-3
-"""In half ranges: the step size grows no further (it does where all objectives are
-equal), and a run is over when its largest deviation is no more than this.
+"""In half ranges. The step size grows no further than the maximum (it does grow if all
+objectives are equal), and a run is over when its largest standard deviation is no more
+than the minimum.
 """
 
-Doubles = npt.NDArray[np.float64]
+Float64Array = npt.NDArray[np.float64]
 
 
 def utilities(values: Sequence[float]) -> list[float]:
-    """Return weights that sum to zero, larger for larger objectives; equal objectives
-    share theirs.
+    """Return the weights of n objectives by their rank; see `NES`.
+
+    They sum to zero and are larger for larger objectives. Equal objectives take up
+    several ranks and get the mean of their weights.
     """
     n = len(values)
-    by_rank = [
+    rank_weights = [
         max(0.0, math.log(n / 2 + 1) - math.log(rank)) for rank in range(1, n + 1)
     ]
-    total = math.fsum(by_rank)
-    ranked = sorted(values, reverse=True)
-    weight = {}
+    total = math.fsum(rank_weights)
+    descending = sorted(values, reverse=True)
+    weight_of_value = {}
     for value in set(values):
-        first = ranked.index(value)
-        count = ranked.count(value)
-        weight[value] = (
-            math.fsum(by_rank[first : first + count]) / count / total - 1.0 / n
-        )
-    return [weight[value] for value in values]
+        first = descending.index(value)
+        count = descending.count(value)
+        mean_weight = math.fsum(rank_weights[first : first + count]) / count
+        weight_of_value[value] = mean_weight / total - 1.0 / n
+    return [weight_of_value[value] for value in values]
 
 
 @dataclass(frozen=True, eq=False)
 class NESState:
-    """Where the search stands: half ranges (d,), the mean (d,) in u and deviation (d,)
-    in half ranges of the distribution, and the objectives of the generation so far.
-    Samples are drawn again from their seeds, not kept.
+    """State of the search. Samples are not stored but drawn again from their seeds.
+
+    Attributes:
+        domain: of the search.
+        seed: of random numbers.
+        half_widths: (d,) half of the range of each element of u.
+        mean: (d,) of the distribution, in u.
+        deviation: (d,) its standard deviation, in half ranges.
+        population: samples of a generation, an even number.
+        generation: index of the present generation.
+        values: objectives of its first samples.
     """
 
     domain: Domain
     seed: int
-    scale: Tensor
+    half_widths: Tensor
     mean: Tensor
     deviation: Tensor
     population: int
@@ -90,13 +100,15 @@ class NESState:
     values: tuple[float, ...] = ()
 
     def noise(self, number: int) -> Tensor:
-        """Return sample `number` of the generation, (d,) standard normal; odd ones
-        mirror the one before.
+        """Return standard normal noise (d,) for sample `number` of the generation.
+
+        An odd sample has the negative of the one before (antithetic pairs).
         """
-        pair, mirrored = divmod(number, 2)
-        generator = seeded(self.seed, self.generation * (self.population // 2) + pair)
+        pair, is_mirrored = divmod(number, 2)
+        pairs_per_generation = self.population // 2
+        generator = seeded(self.seed, self.generation * pairs_per_generation + pair)
         noise = torch.randn(self.domain.dim, generator=generator)
-        return noise.neg_() if mirrored else noise
+        return noise.neg_() if is_mirrored else noise
 
 
 @dataclass(frozen=True)
@@ -153,19 +165,19 @@ class NES(Policy[NESState]):
             domain,
             draw_seed(generator),
             compute_half_widths(domain),
-            domain.begin,
+            domain.initial_point,
             deviation,
             population,
         )
 
     def propose(self, state: NESState, n: int) -> tuple[tuple[Proposal, ...], NESState]:
-        numbers = range(len(state.values), min(len(state.values) + n, state.population))
-        moves = (
-            state.scale * state.deviation * state.noise(number) for number in numbers
-        )
-        return tuple(
-            Proposal(state.domain.project(state.mean + move)) for move in moves
-        ), state
+        """Propose the next samples of the present generation, up to n."""
+        first = len(state.values)
+        proposals = []
+        for number in range(first, min(first + n, state.population)):
+            offset = state.half_widths * state.deviation * state.noise(number)
+            proposals.append(Proposal(state.domain.project(state.mean + offset)))
+        return tuple(proposals), state
 
     def update(self, state: NESState, evaluated: Evaluated) -> NESState:
         state = replace(
@@ -179,19 +191,21 @@ class NES(Policy[NESState]):
             return state
         weights = utilities(state.values)
         d = state.domain.dim
-        towards = torch.zeros(d)
-        wider = torch.zeros(d)
-        for first in range(0, state.population, 2):
-            noise = state.noise(first)
-            towards.add_(noise, alpha=weights[first] - weights[first + 1])
-            wider.addcmul_(noise, noise, value=weights[first] + weights[first + 1])
-        # weights sum to zero, so the -1 of every term drops out
+        mean_gradient = torch.zeros(d)  # sum_k w_k s_k
+        square_sum = torch.zeros(d)  # sum_k w_k s_k^2
+        for number in range(0, state.population, 2):
+            noise = state.noise(number)
+            weight = weights[number]
+            mirrored_weight = weights[number + 1]
+            mean_gradient.add_(noise, alpha=weight - mirrored_weight)
+            square_sum.addcmul_(noise, noise, value=weight + mirrored_weight)
+        # weights sum to zero, so the -1 of every term of the deviation drops out
         rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))
-        deviation = (state.deviation * wider.mul_(rate / 2.0).exp_()).clamp_(
+        deviation = (state.deviation * square_sum.mul_(rate / 2.0).exp_()).clamp_(
             MIN_STEP_SIZE, MAX_STEP_SIZE
         )
         mean = state.domain.project(
-            state.mean + state.scale * state.deviation * towards
+            state.mean + state.half_widths * state.deviation * mean_gradient
         )
         return replace(
             state,
@@ -202,20 +216,21 @@ class NES(Policy[NESState]):
         )
 
     def distribution(self, state: NESState) -> Distribution:
-        return Distribution(state.mean, state.scale * state.deviation)
+        return Distribution(state.mean, state.half_widths * state.deviation)
 
 
-def _sample_normal(*shape: int) -> Doubles:
-    """Standard normal numbers from numpy's global generator. (A copy of pycma's default
-    carries its own along.)
+def _sample_normal(*shape: int) -> Float64Array:
+    """Return standard normal numbers from numpy's global generator.
+
+    pycma's default generator would be copied with every copy of a strategy.
     """
     return np.random.standard_normal(shape)  # noqa: NPY002
 
 
 @contextmanager
 def _isolate_numpy_random(seed: int, generation: int) -> Iterator[None]:
-    """Let pycma draw numbers of its own from numpy's global generator, and put that
-    back; its warnings are not ours.
+    """Seed numpy's global generator for pycma inside the context, and restore its state
+    afterwards; pycma's warnings are ignored.
     """
     state_before = np.random.get_state()  # noqa: NPY002
     np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
@@ -229,66 +244,90 @@ def _isolate_numpy_random(seed: int, generation: int) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class CMAESState:
-    """Where the search stands. u = P(origin + scale * x) for coordinates x of pycma,
-    whose strategy, as it is after the latest `ask`, is never written to again; of this
-    generation's points (n, d) in x, the first have values and squared distances from
-    the domain, means over elements (`outside`). `before` is the largest objective of
-    the runs before, with the distribution at the end of the one that met it.
+    """State of the search. u = P(origin + half_widths * x) for coordinates x of pycma.
+
+    Attributes:
+        domain: of the search.
+        seed: of random numbers.
+        origin: (d,) configuration at x = 0, where the present run began.
+        half_widths: (d,) half of the range of each element of u.
+        is_periodic: (d,) which elements wrap, and so are never out of the domain.
+        strategy: pycma's object after the latest `ask`; never written to again.
+        generation: index of the present generation.
+        points: (n, d) its points, in x.
+        values: objectives of its first points.
+        violations: of the same points, mean squared distance from the domain.
+        best: largest objective of the present run.
+        best_run: largest objective of the runs before and the distribution at the end
+            of the run that met it; None in the first run.
     """
 
     domain: Domain
     seed: int
     origin: Tensor
-    scale: Tensor
-    wraps: Tensor
+    half_widths: Tensor
+    is_periodic: Tensor
     strategy: Any
     generation: int
-    points: Doubles
+    points: Float64Array
     values: tuple[float, ...] = ()
-    outside: tuple[float, ...] = ()
+    violations: tuple[float, ...] = ()
     best: float = -math.inf
-    before: tuple[float, Distribution] | None = None
+    best_run: tuple[float, Distribution] | None = None
 
     @property
-    def deviations(self) -> Doubles:
+    def stds(self) -> Float64Array:
         return np.asarray(self.strategy.stds, dtype=np.float64)
 
     @property
     def distribution(self) -> Distribution:
         mean, _ = self.project(np.asarray(self.strategy.mean))
         return Distribution(
-            mean, torch.from_numpy(self.deviations).float() * self.scale
+            mean, torch.from_numpy(self.stds).float() * self.half_widths
         )
 
-    def project(self, x: Doubles) -> tuple[Tensor, float]:
-        """Return the configuration for coordinates x, and how far outside they lie:
-        mean square over the elements.
+    def project(self, x: Float64Array) -> tuple[Tensor, float]:
+        """Return the configuration for coordinates x (d,), and how far they lie outside
+        the domain: mean squared distance over the elements, in half ranges.
         """
-        wanted = torch.add(self.origin, self.scale * torch.from_numpy(x).float())
-        u = self.domain.project(wanted)
-        excess = ((wanted - u) / self.scale).masked_fill_(self.wraps, 0.0)
+        unprojected = torch.add(
+            self.origin, self.half_widths * torch.from_numpy(x).float()
+        )
+        u = self.domain.project(unprojected)
+        excess = ((unprojected - u) / self.half_widths).masked_fill_(
+            self.is_periodic, 0.0
+        )
         return u, float(torch.dot(excess, excess)) / len(x)
 
     def ask(self) -> CMAESState:
-        """Draw a generation; the strategy belongs to nobody else yet."""
+        """Return the state with the points of the next generation.
+
+        It changes the strategy, which no other state may hold yet.
+        """
         number = self.generation + 1
         with _isolate_numpy_random(self.seed, number):
             points = np.array(self.strategy.ask())
-        return replace(self, generation=number, points=points, values=(), outside=())
+        return replace(self, generation=number, points=points, values=(), violations=())
 
     def tell(self) -> CMAESState:
+        """Return the state with a copy of the strategy that has learnt the generation.
+
+        What could not be evaluated counts as worse than the worst, by the distance of
+        the quartiles; points outside the domain are penalised, see `CMAES`.
+        """
         values = np.array(self.values)
         spread = 0.0
-        finite = np.isfinite(values)
-        if finite.any():
-            low, high = np.percentile(values[finite], (25, 75))
-            spread = float(high - low)
-            values[~finite] = values[finite].min() - spread
+        is_finite = np.isfinite(values)
+        if is_finite.any():
+            lower_quartile, upper_quartile = np.percentile(values[is_finite], (25, 75))
+            spread = float(upper_quartile - lower_quartile)
+            values[~is_finite] = values[is_finite].min() - spread
         else:
             values[:] = 0.0
         strategy = copy.deepcopy(self.strategy)
-        penalty = spread * np.array(self.outside) / max(strategy.sigma, 1e-30) ** 2
+        penalty = spread * np.array(self.violations) / max(strategy.sigma, 1e-30) ** 2
         with _isolate_numpy_random(self.seed, self.generation):
+            # pycma minimises
             strategy.tell(list(self.points), list(penalty - values))
         strategy.sigma = min(strategy.sigma, MAX_STEP_SIZE)
         return replace(self, strategy=strategy)
@@ -358,12 +397,17 @@ class CMAES(Policy[CMAESState]):
         population = self.population or 4 + int(3 * math.log(d))
         seed = draw_seed(generator)
         strategy = self._make_strategy(d, population, seed)
-        scale = compute_half_widths(domain)
-        around = find_periodic(domain)
-        none = np.empty((0, d))
-        return CMAESState(
-            domain, seed, domain.begin, scale, around, strategy, 0, none
-        ).ask()
+        state = CMAESState(
+            domain,
+            seed,
+            domain.initial_point,
+            compute_half_widths(domain),
+            find_periodic(domain),
+            strategy,
+            generation=0,
+            points=np.empty((0, d)),
+        )
+        return state.ask()
 
     def propose(
         self, state: CMAESState, n: int
@@ -372,42 +416,47 @@ class CMAES(Policy[CMAESState]):
         return tuple(Proposal(state.project(x)[0]) for x in points), state
 
     def update(self, state: CMAESState, evaluated: Evaluated) -> CMAESState:
+        """Add evaluations to the generation; begin the next once it is complete.
+
+        If the run has converged, another begins elsewhere with twice the population.
+        """
         values = [evaluation.objective for _, evaluation in evaluated]
-        outside = [
-            state.project(x)[1]
-            for x in state.points[len(state.values) :][: len(values)]
-        ]
+        evaluated_points = state.points[len(state.values) :][: len(values)]
+        violations = [state.project(x)[1] for x in evaluated_points]
         best = max(state.best, *values)
         state = replace(
             state,
             values=(*state.values, *values),
-            outside=(*state.outside, *outside),
+            violations=(*state.violations, *violations),
             best=best,
         )
         if len(state.values) < len(state.points):
             return state
         state = state.tell()
-        if float(state.deviations.max()) > MIN_STEP_SIZE:
+        if float(state.stds.max()) > MIN_STEP_SIZE:
             return state.ask()
-        # another run elsewhere, with twice the population; the better one of those that
-        # are over is remembered
-        before = state.before
-        if before is None or state.best > before[0]:
-            before = (state.best, state.distribution)
+        best_run = state.best_run
+        if best_run is None or state.best > best_run[0]:
+            best_run = (state.best, state.distribution)
         strategy = self._make_strategy(
             state.domain.dim, 2 * len(state.points), state.seed
         )
         origin = state.domain.sample(seeded(state.seed, state.generation))[0]
         return replace(
-            state, origin=origin, strategy=strategy, best=-math.inf, before=before
+            state, origin=origin, strategy=strategy, best=-math.inf, best_run=best_run
         ).ask()
 
     def distribution(self, state: CMAESState) -> Distribution:
-        if state.before is not None and state.before[0] > state.best:
-            return state.before[1]
+        if state.best_run is not None and state.best_run[0] > state.best:
+            return state.best_run[1]
         return state.distribution
 
     def _make_strategy(self, d: int, population: int, seed: int) -> Any:
+        """Return pycma's strategy for d coordinates, around 0 with the width `sigma`.
+
+        It writes no files and prints nothing. A seed of NaN leaves numpy's generator as
+        it is.
+        """
         options = {
             "CMA_diagonal": d > MAX_FULL_DIM,
             "popsize": population,

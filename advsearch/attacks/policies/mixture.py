@@ -17,46 +17,59 @@ MAX_DIM = (
 WINDOW = 1000
 ELITE_FRACTION = 0.1
 MIN_ELITE = 10
-"""Where fewer draws failed, those with the largest objectives stand in for failures: a
-tenth of them, ten at least.
+"""A mixture is fitted to the samples that failed. If fewer than `MIN_ELITE` did, the
+samples with the largest objectives stand in for them: a tenth of all, `MIN_ELITE` at
+least.
 """
 
 N_FIT_ROUNDS = 8
-UNIFORM_DEVIATION = 12**-0.5
+UNIFORM_STD = 12**-0.5
 PRIOR_COUNT = 3.0
-"""Deviation of the even distribution in shares of a range; it counts for so many draws
-of each component, so that what does not matter stays wide.
+"""Standard deviation of the uniform distribution on [0, 1], the prior of each element;
+it counts as much as `PRIOR_COUNT` samples of a component, so that an element that does
+not matter stays wide.
 """
 
-MIN_DEVIATION = (
-    0.02  # deviations of a number, in shares of its range, at least and at most
-)
-MAX_DEVIATION = 10.0
+# limits of the standard deviation of a number, as fractions of its range
+MIN_STD = 0.02
+MAX_STD = 10.0
 DISTINCTIVE_FRACTION = 0.5
-"""A number tells a component apart where its deviation is under so much of the even
-one's; an option, where it has more than so much of the probability.
+"""A number distinguishes a component if its standard deviation is less than this
+fraction of the uniform one's; an option, if its probability is more than this.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """The d elements of u in shares of their ranges: options (d,) of each choice, 0 of
-    a number, and which (d,) are angles.
+    """Kinds of the d elements of a point, whose values are fractions of their ranges.
+
+    Attributes:
+        n_options: (d,) number of options of a choice; 0 for a number.
+        is_periodic: (d,) whether it is an angle.
     """
 
     n_options: Tensor
     is_periodic: Tensor
 
+    def find_option(self, x: Tensor, max_options: int) -> Tensor:
+        """Return the index (n, d) of the option that points x (n, d) lie in; 0 for a
+        number.
+        """
+        return (x * self.n_options).long().clamp(max=max_options - 1)
+
     def compute_offset(self, x: Tensor, mean: Tensor) -> Tensor:
-        """Return the offset of x from a mean; of an angle the shorter, within a
-        half.
+        """Return the offset of x from a mean; for an angle the shorter way round, in
+        [-0.5, 0.5).
         """
         offset = x - mean
         wrapped_offset = torch.remainder(offset + 0.5, 1.0) - 0.5
         return torch.where(self.is_periodic, wrapped_offset, offset)
 
     def compute_bounds(self, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the offsets of the lower and upper bound of each range from a mean."""
+        """Return the offsets of the lower and upper bound of each range from a mean.
+
+        An angle has no bounds: it goes half a turn to both sides of its mean.
+        """
         half = torch.full_like(mean, 0.5)
         lower = torch.where(self.is_periodic, -half, -mean)
         upper = torch.where(self.is_periodic, half, 1.0 - mean)
@@ -65,127 +78,172 @@ class Ranges:
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """A mixture of k products: normal distributions (k, d) cut to their ranges, in
-    shares of these, and probabilities of options (k, d, most options); the weights (k,)
-    have the sum 1.
+    """A mixture of k components.
+
+    A component is a product over the d elements of a point: a normal distribution
+    truncated to the element's range, or a categorical distribution if the element is
+    a choice. Each element has the tensors of both; `Ranges.n_options` tells which one
+    holds.
+
+    Attributes:
+        weights: (k,) of the components; their sum is 1.
+        means: (k, d) of the normal distributions, in fractions of each range.
+        stds: (k, d) their standard deviations before truncation, likewise.
+        option_probs: (k, d, m) probabilities of options, m the largest number of
+            options of an element.
     """
 
     weights: Tensor
     means: Tensor
-    deviations: Tensor
-    options: Tensor
+    stds: Tensor
+    option_probs: Tensor
 
     def compute_log_densities(self, x: Tensor, ranges: Ranges) -> Tensor:
-        """Return the logarithms (n, k) of weight times density of each component.
+        """Return log(weight * density) (n, k) of each component at points x (n, d).
 
-        The density at x (n, d) is relative to the uniform density.
+        Densities are relative to the uniform density on the ranges.
         """
-        lower_offset, upper_offset = ranges.compute_bounds(self.means)
-        lower_cdf = torch.special.ndtr(lower_offset / self.deviations)
-        upper_cdf = torch.special.ndtr(upper_offset / self.deviations)
-        scaled = ranges.compute_offset(x[:, None], self.means) / self.deviations
-        log_density = -0.5 * scaled.square() - torch.log(
-            self.deviations * math.sqrt(2.0 * math.pi) * (upper_cdf - lower_cdf)
-        )
-        option = (x * ranges.n_options).long().clamp(max=self.options.shape[2] - 1)
-        probability = self.options.expand(len(x), *self.options.shape).gather(
-            3, option[:, None, :, None].expand(-1, len(self.weights), -1, 1)
-        )
         log_density = torch.where(
             ranges.n_options > 0,
-            torch.log(probability[..., 0] * ranges.n_options.clamp(min=1)),
-            log_density,
-        )
+            self._compute_categorical_log_densities(x, ranges),
+            self._compute_normal_log_densities(x, ranges),
+        )  # (n, k, d)
         return self.weights.log() + log_density.sum(dim=2)
 
+    def _compute_normal_log_densities(self, x: Tensor, ranges: Ranges) -> Tensor:
+        """Return log densities (n, k, d) of the truncated normal distributions."""
+        lower_offset, upper_offset = ranges.compute_bounds(self.means)
+        lower_cdf = torch.special.ndtr(lower_offset / self.stds)
+        upper_cdf = torch.special.ndtr(upper_offset / self.stds)
+        z = ranges.compute_offset(x[:, None], self.means) / self.stds
+        return -0.5 * z.square() - torch.log(
+            self.stds * math.sqrt(2.0 * math.pi) * (upper_cdf - lower_cdf)
+        )
+
+    def _compute_categorical_log_densities(self, x: Tensor, ranges: Ranges) -> Tensor:
+        """Return log densities (n, k, d) of the options that x lies in.
+
+        An option of n takes up 1 / n of its range, so that its density relative to the
+        uniform one is n times its probability.
+        """
+        n_points = len(x)
+        n_components, _, max_options = self.option_probs.shape
+        option = ranges.find_option(x, max_options)  # (n, d)
+        index = option[:, None, :, None].expand(-1, n_components, -1, 1)
+        probs = self.option_probs.expand(n_points, *self.option_probs.shape)
+        prob = probs.gather(3, index)[..., 0]  # (n, k, d)
+        return torch.log(prob * ranges.n_options.clamp(min=1))
+
     def sample(self, generator: torch.Generator, ranges: Ranges) -> Tensor:
-        """Return one sample (d,) of the mixture, in fractions of each range."""
+        """Return one sample (d,) of the mixture, in fractions of each range.
+
+        Numbers are sampled by inverting the distribution function between the bounds;
+        an option gives the center of its part of the range.
+        """
         k = int(torch.multinomial(self.weights, 1, generator=generator))
         mean = self.means[k]
-        deviation = self.deviations[k]
+        std = self.stds[k]
         lower_offset, upper_offset = ranges.compute_bounds(mean)
-        lower_cdf = torch.special.ndtr(lower_offset / deviation)
-        upper_cdf = torch.special.ndtr(upper_offset / deviation)
+        lower_cdf = torch.special.ndtr(lower_offset / std)
+        upper_cdf = torch.special.ndtr(upper_offset / std)
         uniform = torch.rand(len(mean), generator=generator, dtype=torch.float64)
         cdf = torch.lerp(lower_cdf, upper_cdf, uniform)
-        x = mean + deviation * torch.special.ndtri(cdf)
+        x = mean + std * torch.special.ndtri(cdf)
         wrapped = torch.remainder(x, 1.0)
+        # The inverse is infinite at 0 and 1, and NaN where rounding goes beyond them.
         clipped = x.nan_to_num(0.5).clamp(0.0, 1.0)
         x = torch.where(ranges.is_periodic, wrapped, clipped)
-        option = torch.multinomial(self.options[k], 1, generator=generator)[:, 0]
+        option = torch.multinomial(self.option_probs[k], 1, generator=generator)[:, 0]
         option_center = (option + 0.5) / ranges.n_options.clamp(min=1)
         return torch.where(ranges.n_options > 0, option_center, x)
 
     def maximize(
-        self, x: Tensor, weights: Tensor, ranges: Ranges, even: Tensor
+        self, x: Tensor, weights: Tensor, ranges: Ranges, uniform_probs: Tensor
     ) -> Components:
         """Return the components after one step of expectation and maximisation.
+
+        A quarter of the new weights is uniform, so that no component dies out.
 
         Args:
             x: (n, d) samples, in fractions of each range.
             weights: (n,) of the samples.
             ranges: of the elements.
-            even: (k, d, most options) uniform probabilities of options, the prior.
+            uniform_probs: (k, d, m) uniform probabilities of options, the prior.
         """
-        responsibility = (
-            self.compute_log_densities(x, ranges).softmax(dim=1) * weights[:, None]
+        log_densities = self.compute_log_densities(x, ranges)
+        responsibility = log_densities.softmax(dim=1) * weights[:, None]  # (n, k)
+        counts = responsibility.sum(dim=0)  # (k,)
+        # (k, n); clamped, since a component may have no samples at all
+        sample_weights = (responsibility / counts.clamp(min=1e-12)).T
+        offset = ranges.compute_offset(x[:, None], self.means)  # (n, k, d)
+        mean_offset = torch.einsum("kn,nkd->kd", sample_weights, offset)
+        squared_residual = (offset - mean_offset).square()
+        variance = torch.einsum("kn,nkd->kd", sample_weights, squared_residual)
+        means, stds = self._divide_out_prior(
+            mean_offset, variance, counts[:, None], ranges
         )
-        counts = responsibility.sum(dim=0)
-        portion = (responsibility / counts.clamp(min=1e-12)).T
-        offset = ranges.compute_offset(x[:, None], self.means)
-        shift = torch.einsum("kn,nkd->kd", portion, offset)
-        spread = torch.einsum("kn,nkd->kd", portion, (offset - shift).square())
-        means, deviations = self._divide_out_prior(
-            shift, spread, counts[:, None], ranges
+        option = ranges.find_option(x, max_options=uniform_probs.shape[2])
+        option_probs = _estimate_option_probs(
+            sample_weights, option, counts, uniform_probs
         )
-        max_options = even.shape[2]
-        option = (x * ranges.n_options).long().clamp(max=max_options - 1)
-        is_option = torch.nn.functional.one_hot(option, max_options).double()
-        options = _estimate_options(portion, is_option, counts, even)
         fraction = counts / counts.sum()
         new_weights = 0.75 * fraction + 0.25 / len(fraction)
-        return Components(new_weights, means, deviations, options)
+        return Components(new_weights, means, stds, option_probs)
 
     def _divide_out_prior(
-        self, shift: Tensor, spread: Tensor, counts: Tensor, ranges: Ranges
+        self, mean_offset: Tensor, variance: Tensor, counts: Tensor, ranges: Ranges
     ) -> tuple[Tensor, Tensor]:
-        """Return means and deviations (k, d) without the uniform density.
+        """Return means and standard deviations (k, d) of normal distributions.
+
+        Samples of a truncated normal distribution have about the moments of a normal
+        density times the uniform one, taken as a normal density too (mean 1/2). So the
+        precision of the uniform density is subtracted from that of the samples, and
+        the mean is corrected likewise, except of an angle, which is not truncated.
 
         Args:
-            shift: (k, d) from the old means to those of the samples.
-            spread: (k, d) variance of the samples.
+            mean_offset: (k, d) from the old means to those of the samples.
+            variance: (k, d) of the samples.
             counts: (k, 1) samples of each component.
             ranges: of the elements.
         """
-        variance = (
-            (counts * spread + PRIOR_COUNT * UNIFORM_DEVIATION**2)
-            / (counts + PRIOR_COUNT)
-        ).clamp(max=0.999 * UNIFORM_DEVIATION**2)
-        precision = 1.0 / variance - 1.0 / UNIFORM_DEVIATION**2
-        deviations = (1.0 / precision).sqrt().clamp(MIN_DEVIATION, MAX_DEVIATION)
-        means = self.means + shift
-        tilted = deviations.square() * (means / variance - 0.5 / UNIFORM_DEVIATION**2)
-        means = torch.where(
-            ranges.is_periodic, torch.remainder(means, 1.0), tilted.clamp(0.0, 1.0)
+        # below the uniform variance, so that the precision stays positive
+        shrunk_variance = (
+            (counts * variance + PRIOR_COUNT * UNIFORM_STD**2) / (counts + PRIOR_COUNT)
+        ).clamp(max=0.999 * UNIFORM_STD**2)
+        precision = 1.0 / shrunk_variance - 1.0 / UNIFORM_STD**2
+        stds = (1.0 / precision).sqrt().clamp(MIN_STD, MAX_STD)
+        sample_means = self.means + mean_offset
+        corrected_means = stds.square() * (
+            sample_means / shrunk_variance - 0.5 / UNIFORM_STD**2
         )
-        return means, deviations
+        means = torch.where(
+            ranges.is_periodic,
+            torch.remainder(sample_means, 1.0),
+            corrected_means.clamp(0.0, 1.0),
+        )
+        return means, stds
 
 
-def _estimate_options(
-    portion: Tensor, is_option: Tensor, counts: Tensor, even: Tensor
+def _estimate_option_probs(
+    sample_weights: Tensor, option: Tensor, counts: Tensor, uniform_probs: Tensor
 ) -> Tensor:
-    """Return the probabilities of options (k, d, most options), with the even prior.
+    """Return the probabilities of options (k, d, m).
+
+    They are the weighted frequencies in the samples, averaged with uniform
+    probabilities that count as `PRIOR_COUNT` samples.
 
     Args:
-        portion: (k, n) of each sample in each component.
-        is_option: (n, d, most options) float64, 1 for the option of a sample, else 0.
+        sample_weights: (k, n) of samples in each component; the sum of a row is 1.
+        option: (n, d) int64, index of the option of each sample.
         counts: (k,) samples of each component.
-        even: (k, d, most options) uniform probabilities.
+        uniform_probs: (k, d, m) uniform probabilities.
     """
-    frequency = torch.einsum("kn,ndo->kdo", portion, is_option)
-    option_counts = counts[:, None][..., None]
-    return (option_counts * frequency + PRIOR_COUNT * even) / (
-        option_counts + PRIOR_COUNT
+    max_options = uniform_probs.shape[2]
+    indicator = torch.nn.functional.one_hot(option, max_options).double()  # (n, d, m)
+    frequency = torch.einsum("kn,ndo->kdo", sample_weights, indicator)
+    n_samples = counts[:, None, None]
+    return (n_samples * frequency + PRIOR_COUNT * uniform_probs) / (
+        n_samples + PRIOR_COUNT
     )
 
 
@@ -203,8 +261,9 @@ class MixtureState:
         mixtures: mixtures of the generations in the window; None of a uniform one.
         points: (n, d) samples of the present generation.
         evaluated_points: (m, d) the latest `WINDOW` samples that were evaluated.
-        log: (t, 5) of all samples: objective, failed, unknown, weight and largest
-            weight; see `estimate_failure_rate`.
+        log: (t, 5) float64, of all samples: objective, failed, unknown (no objective
+            could be computed), importance weight and largest weight that it could have
+            had; see `estimate_failure_rate`.
         n_evaluated: samples of the present generation that were evaluated.
     """
 
@@ -226,21 +285,22 @@ class MixtureState:
     def find_distinctive_ranges(
         self, mixture: Components, k: int
     ) -> dict[int, tuple[float, float]]:
-        """Return the ranges that distinguish a component, by index in u.
+        """Return the ranges (low, high) that distinguish component k, by index in u.
 
-        They reach two deviations to both sides, or are those of the most probable
-        option.
+        A range reaches two standard deviations to both sides of the mean, or is that
+        of the most probable option. An element that does not distinguish the
+        component is left out. Bounds are in the units of u, not fractions.
         """
         lower = self.domain.lower.double()
         width = (self.domain.upper - self.domain.lower).double()
         ranges: dict[int, tuple[float, float]] = {}
         for index, n_options in enumerate(self.ranges.n_options.tolist()):
             if n_options:
-                bounds = self._option_bounds(mixture.options[k, index], n_options)
+                bounds = self._option_bounds(mixture.option_probs[k, index], n_options)
             else:
                 bounds = self._number_bounds(
                     float(mixture.means[k, index]),
-                    float(mixture.deviations[k, index]),
+                    float(mixture.stds[k, index]),
                     is_periodic=bool(self.ranges.is_periodic[index]),
                 )
             if bounds is not None:
@@ -260,14 +320,19 @@ class MixtureState:
 
     @staticmethod
     def _number_bounds(
-        mean: float, deviation: float, *, is_periodic: bool
+        mean: float, std: float, *, is_periodic: bool
     ) -> tuple[float, float] | None:
-        """Return the range of a number; None if it is wide, or goes through 0."""
-        reach = 2.0 * deviation
-        crosses_zero = is_periodic and (mean - reach < 0.0 or mean + reach > 1.0)
-        if crosses_zero or not reach < 2.0 * DISTINCTIVE_FRACTION * UNIFORM_DEVIATION:
+        """Return the range of a number, in fractions; None if it is too wide.
+
+        None too for an angle whose range goes through 0, which two bounds cannot state.
+        """
+        reach = 2.0 * std
+        lower = mean - reach
+        upper = mean + reach
+        crosses_zero = is_periodic and (lower < 0.0 or upper > 1.0)
+        if crosses_zero or not reach < 2.0 * DISTINCTIVE_FRACTION * UNIFORM_STD:
             return None
-        return max(0.0, mean - reach), min(1.0, mean + reach)
+        return max(0.0, lower), min(1.0, upper)
 
 
 @dataclass(frozen=True)
@@ -422,7 +487,8 @@ class Mixture(Policy[MixtureState]):
     ) -> MixtureState:
         """Begin the next generation: sample its points from a mixture.
 
-        Some of them are uniform; without a mixture all are.
+        Each is uniform with probability `even`; without a mixture all are. Mixtures and
+        points that leave the window are dropped.
         """
         number = state.generation + 1
         rng = policies.seeded(state.seed, number)
@@ -438,8 +504,10 @@ class Mixture(Policy[MixtureState]):
         for row in range(self.population):
             if mixture is not None and float(torch.rand(1, generator=rng)) >= self.even:
                 points[row] = mixture.sample(rng, state.ranges)
-        window = WINDOW // self.population * self.population or self.population
-        n_generations = window // self.population + 1
+        # whole generations, at least one; and the one that begins here
+        n_past_generations = max(1, WINDOW // self.population)
+        window = n_past_generations * self.population
+        n_generations = n_past_generations + 1
         return replace(
             state,
             generation=number,
@@ -450,7 +518,10 @@ class Mixture(Policy[MixtureState]):
         )
 
     def _density(self, mixture: Components | None, x: Tensor, ranges: Ranges) -> Tensor:
-        """Return the density (n,) of a generation at x (n, d), relative to uniform."""
+        """Return the density (n,) of a generation at x (n, d), relative to uniform.
+
+        It includes the generation's uniform samples.
+        """
         if mixture is None:
             return torch.ones(len(x), dtype=torch.float64)
         mixture_density = (
@@ -461,7 +532,9 @@ class Mixture(Policy[MixtureState]):
     def _fit(self, state: MixtureState) -> Components | None:
         """Return the mixture fitted to the failures in the window.
 
-        None where nothing could be evaluated.
+        Samples are weighted by the uniform density over the mean density of the
+        generations in the window. The first centers are diverse failures. None if
+        nothing could be evaluated.
         """
         log = state.log[-len(state.evaluated_points) :]
         ranges = state.ranges
@@ -474,7 +547,7 @@ class Mixture(Policy[MixtureState]):
                 self._density(mixture, points, ranges) for mixture in state.mixtures
             ]
             weights = 1.0 / torch.stack(densities).mean(dim=0)
-            # scaled to have the effective sample size as their sum
+            # Their sum becomes the effective sample size, which the prior is set against.
             weights *= weights.sum() / weights.square().sum()
             center_index = policies.select_diverse(
                 points,
@@ -484,15 +557,15 @@ class Mixture(Policy[MixtureState]):
                 self.components,
             )
             means = points[center_index]
-            even = self._uniform_options(len(means), ranges)
+            uniform_probs = self._make_uniform_option_probs(len(means), ranges)
             mixture = Components(
                 torch.full((len(means),), 1.0 / len(means), dtype=torch.float64),
                 means,
-                torch.full_like(means, 0.5 * UNIFORM_DEVIATION),
-                even,
+                torch.full_like(means, 0.5 * UNIFORM_STD),
+                uniform_probs,
             )
             for _ in range(N_FIT_ROUNDS):
-                mixture = mixture.maximize(points, weights, ranges, even)
+                mixture = mixture.maximize(points, weights, ranges, uniform_probs)
         return mixture
 
     @staticmethod
@@ -511,10 +584,13 @@ class Mixture(Policy[MixtureState]):
         return is_elite
 
     @staticmethod
-    def _uniform_options(n_components: int, ranges: Ranges) -> Tensor:
-        """Return uniform probabilities of options, (k, d, most options)."""
+    def _make_uniform_option_probs(n_components: int, ranges: Ranges) -> Tensor:
+        """Return uniform probabilities of options, (k, d, m).
+
+        They are 0 beyond an element's options; a number is treated as one option.
+        """
         n_elements = len(ranges.n_options)
         max_options = max(1, int(ranges.n_options.max()))
-        options = torch.ones(n_components, n_elements, max_options, dtype=torch.float64)
-        options *= torch.arange(max_options) < ranges.n_options.clamp(min=1)[:, None]
-        return options / options.sum(dim=2, keepdim=True)
+        probs = torch.ones(n_components, n_elements, max_options, dtype=torch.float64)
+        probs *= torch.arange(max_options) < ranges.n_options.clamp(min=1)[:, None]
+        return probs / probs.sum(dim=2, keepdim=True)

@@ -26,27 +26,37 @@ from advsearch.attacks.evaluation import (
 )
 from advsearch.errors import InputError
 
-CLIP = 3.0  # what exceeds the median so many times is out of the usual
-MEMORY = 15  # latest gradients whose lengths say what is usual
-# the same of numbers in an l2 block, whose true gradient may be uneven: its direction
-# is at stake
+# An outlier is larger than this many medians: of the elements of an l-infinity block,
+# and of the lengths of the latest gradients.
+CLIP = 3.0
+MEMORY = 15  # latest gradients whose lengths have the median
+# the same for elements of an l2 block, whose true gradient may be uneven and whose
+# direction must be preserved
 CLIP_L2 = 10.0
-MIN_CLIPPED_SIZE = 8  # fewer numbers than this have no median to speak of
+MIN_CLIPPED_SIZE = 8  # smaller blocks have no meaningful median
 
 
 def clip_gradient(
     domain: Domain, gradient: Tensor, lengths: tuple[float, ...]
 ) -> tuple[Tensor, tuple[float, ...], Counts]:
-    """Return a gradient (d,), finite, without outliers, the lengths of the latest ones,
-    and what was an outlier.
+    """Clip the outliers of a gradient.
 
-    - In a ball of at least `MIN_CLIPPED_SIZE`, each is cut to so many medians of those
-      that are not zero: `CLIP` in an l-infinity ball, where the step follows the signs,
-      so that this changes how gradients are averaged and no single step; `CLIP_L2` in
-      an l2 ball.
-    - A gradient that is longer than `CLIP` times the median of the last `MEMORY` is
-    shortened to that.
-    - In a domain that is `exact` or `drawn` nothing is an outlier.
+    - In a norm ball of at least `MIN_CLIPPED_SIZE` elements, each element is clipped to
+      a multiple of the median magnitude of those that are not zero: `CLIP` in an
+      l-infinity ball, where the step follows the signs, so that clipping changes how
+      gradients are averaged but no single step; `CLIP_L2` in an l2 ball.
+    - Then a gradient that is longer than `CLIP` times the median of the last `MEMORY`
+      lengths, its own included, is scaled down to that.
+    - In a domain that is `exact`, or `draws_conditions`, nothing is an outlier.
+
+    Args:
+        domain: of the gradient.
+        gradient: (d,), finite.
+        lengths: of the latest gradients, before this.
+
+    Returns:
+        The clipped gradient; the lengths with this one's, before it was scaled down;
+        and the counts of outliers.
     """
     if domain.exact or domain.draws_conditions:
         return gradient, lengths, NO_COUNTS
@@ -59,23 +69,19 @@ def clip_gradient(
             and bool(clipped_gradient[part].any())
         ):
             magnitudes = clipped_gradient[part].abs()
-            limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(
-                magnitudes[magnitudes > 0].median()
-            )
+            n_medians = CLIP if block.norm == "linf" else CLIP_L2
+            limit = n_medians * float(magnitudes[magnitudes > 0].median())
             if float(magnitudes.amax()) > limit:
                 has_outliers = True
                 clipped_gradient[part] = clipped_gradient[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(clipped_gradient))
     lengths = (*lengths, length)[-MEMORY:]
     median_length = sorted(lengths)[len(lengths) // 2]
-    shortened = length > CLIP * median_length > 0.0
-    return (
-        clipped_gradient * (CLIP * median_length / length)
-        if shortened
-        else clipped_gradient,
-        lengths,
-        Counts(int(has_outliers), int(shortened)),
-    )
+    is_too_long = length > CLIP * median_length > 0.0
+    if is_too_long:
+        clipped_gradient = clipped_gradient * (CLIP * median_length / length)
+    counts = Counts(cut=int(has_outliers), shortened=int(is_too_long))
+    return clipped_gradient, lengths, counts
 
 
 FIRST_WINDOW = 0.22
@@ -85,9 +91,8 @@ MIN_WINDOW_FRACTION = 0.06
 fractions of the steps.
 """
 
-MIN_WINDOW = (
-    3  # no window is shorter than this: two noisy values say nothing about a trend
-)
+# no window is shorter than this: two noisy values say nothing about a trend
+MIN_WINDOW = 3
 # fraction of a window's steps that must improve the objective to keep the step size
 # (Auto-PGD's rho)
 MIN_IMPROVING_FRACTION = 0.75
@@ -99,16 +104,19 @@ MIN_WINDOW_EXACT = 5
 # without noise, what a window must add to the best of the one before, as a fraction of
 # all that was gained
 MIN_WINDOW_GAIN = 1e-3
-MAX_IDLE_WINDOWS = (
-    3  # windows in a row that add less, after which there is nothing to gain
-)
+# windows in a row that add less, after which there is nothing to gain
+MAX_IDLE_WINDOWS = 3
 # evaluations in a row without any gradient after which there is nothing to follow
 MAX_FLAT_GRADIENTS = 5
 
 
 class Peak(NamedTuple):
-    """The best evaluation so far by its raw objective, and the direction in which the
-    search stood to go on there.
+    """The best evaluation so far.
+
+    Attributes:
+        objective: of that evaluation, with its noise.
+        u: (d,) its configuration.
+        direction: (d,) the accumulated gradient after it.
     """
 
     objective: float
@@ -118,45 +126,59 @@ class Peak(NamedTuple):
 
 @dataclass(frozen=True)
 class Window:
-    """The objectives since the last checkpoint, so many until the next, and the one
-    before them, NaN at the start; how many exceed their predecessor; the best at the
-    checkpoint, without noise of the window before it; and whether the step size was
-    halved there.
+    """The evaluations between two checkpoints, at which the step size may be halved.
+
+    Attributes:
+        length: number of evaluations until the next checkpoint.
+        values: objectives since the last checkpoint.
+        previous: the objective before these; NaN at the start.
+        n_improved: how many of them exceed the one before.
+        reference_best: the best objective of the search at the last checkpoint; in a
+            domain without noise, that of the window before it alone.
+        was_halved: whether the step size was halved at the last checkpoint.
     """
 
     length: int
     values: tuple[float, ...] = ()
-    before: float = math.nan
-    improved: int = 0
-    best: float = -math.inf
-    halved: bool = True
+    previous: float = math.nan
+    n_improved: int = 0
+    reference_best: float = -math.inf
+    was_halved: bool = True
 
     def add(self, value: float) -> Window:
-        last = self.values[-1] if self.values else self.before
-        return replace(
-            self, values=(*self.values, value), improved=self.improved + (value > last)
-        )
+        last = self.values[-1] if self.values else self.previous
+        n_improved = self.n_improved + 1 if value > last else self.n_improved
+        return replace(self, values=(*self.values, value), n_improved=n_improved)
 
     def stalled(self, best: float) -> bool:
-        """Return whether the step size is due for halving: too few steps improved the
-        objective, or the best has not moved since the last checkpoint although the step
-        size was kept there (conditions 1 and 2 of Auto-PGD).
+        """Return whether the step size is due for halving (conditions 1 and 2 of
+        Auto-PGD).
+
+        That is if too few steps improved the objective, or if the best of the search
+        has not moved since the last checkpoint although the step size was not halved
+        there.
         """
-        return self.improved < MIN_IMPROVING_FRACTION * len(self.values) or (
-            not self.halved and best <= self.best
+        return self.n_improved < MIN_IMPROVING_FRACTION * len(self.values) or (
+            not self.was_halved and best <= self.reference_best
         )
 
     def lags(self, best: float) -> bool:
-        """Return whether `best` beats this window by more than noise explains: by two
-        of its standard deviations.
+        """Return whether `best` beats the mean of this window by more than noise
+        explains: by two standard deviations of its values.
         """
         mean = sum(self.values) / len(self.values)
-        spread = math.sqrt(
-            sum((v - mean) ** 2 for v in self.values) / max(1, len(self.values) - 1)
-        )
-        return best > mean + 2.0 * spread
+        squared_deviations = sum((value - mean) ** 2 for value in self.values)
+        std = math.sqrt(squared_deviations / max(1, len(self.values) - 1))
+        return best > mean + 2.0 * std
 
     def next(self, steps: int, best: float, halved: bool) -> Window:
+        """Return the window after this one, which is a little shorter.
+
+        Args:
+            steps: evaluations of the search.
+            best: objective of the search so far.
+            halved: whether the step size is halved between the two.
+        """
         length = max(
             MIN_WINDOW,
             round(MIN_WINDOW_FRACTION * steps),
@@ -170,12 +192,25 @@ NO_SQUARES = torch.zeros(())
 
 @dataclass(frozen=True, eq=False)
 class Ascent:
-    """Where an ascent of so many evaluations stands: u (d,) to propose next, the
-    accumulated gradient (d,), of Adam its mean and the mean (d,) of squares, the step
-    size, the best evaluation, evaluations so far (`count`), gradients in these means
-    (`n_updates`), zero gradients in a row (`flat`), and lengths of gradients as
-    `clip_gradient` wants them. PGD has besides the objective at the start, a window,
-    and windows in a row that added nothing (`idle`, without noise only).
+    """The state of an ascent.
+
+    Attributes:
+        domain: of the search.
+        steps: evaluations that are planned.
+        seed: of random numbers.
+        u: (d,) to propose next.
+        direction: (d,) accumulated gradient; of Adam, the mean of gradients.
+        step_size: before it is decayed, in units of each block's radius.
+        square: (d,) of Adam, the mean of squared gradients.
+        peak: the best evaluation; None as long as none is finite.
+        count: evaluations so far.
+        n_updates: gradients that were accumulated.
+        n_flat: gradients of zero in a row.
+        lengths: of the latest gradients, see `clip_gradient`.
+        counts: outliers and rejected steps.
+        window: of PGD, the present window.
+        start_objective: of PGD, the objective of its first evaluation; NaN before it.
+        n_idle_windows: of PGD without noise, windows in a row that added nothing.
     """
 
     domain: Domain
@@ -188,15 +223,17 @@ class Ascent:
     peak: Peak | None = None
     count: int = 0
     n_updates: int = 0
-    flat: int = 0
+    n_flat: int = 0
     lengths: tuple[float, ...] = ()
     counts: Counts = NO_COUNTS
     window: Window = field(default_factory=lambda: Window(MIN_WINDOW))
-    first: float = math.nan
-    idle: int = 0
+    start_objective: float = math.nan
+    n_idle_windows: int = 0
 
     def decay_step_size(self, number: int) -> float:
-        """Return the step size of evaluation `number` where it falls in a line."""
+        """Return the step size of evaluation `number` if it falls linearly over the
+        planned ones, down to `FINAL_STEP_FRACTION`.
+        """
         return self.step_size * max(FINAL_STEP_FRACTION, 1.0 - number / self.steps)
 
 
@@ -206,11 +243,24 @@ class AscentPolicy(Policy[Ascent]):
     uses_gradient: ClassVar[bool] = True
 
     def propose(self, state: Ascent, n: int) -> tuple[tuple[Proposal, ...], Ascent]:
-        if state.flat >= MAX_FLAT_GRADIENTS or state.idle >= MAX_IDLE_WINDOWS:
+        """Propose the next configuration, alone and with its gradient.
+
+        There is none after too many gradients of zero, or windows that added nothing.
+        """
+        if (
+            state.n_flat >= MAX_FLAT_GRADIENTS
+            or state.n_idle_windows >= MAX_IDLE_WINDOWS
+        ):
             return (), state
         return (Proposal(state.u, gradient=True, step_size=self.pace(state)),), state
 
     def update(self, state: Ascent, evaluated: Evaluated) -> Ascent:
+        """Accumulate the gradient, remember the best evaluation, and take a step.
+
+        After an evaluation whose objective could not be computed, the search retreats
+        with half the step size. Without a gradient the step follows the accumulated
+        one.
+        """
         ((u, evaluation),) = evaluated
         state = replace(state, count=state.count + 1)
         if not evaluation.is_finite:
@@ -218,7 +268,6 @@ class AscentPolicy(Policy[Ascent]):
             return self.retreat(
                 replace(state, step_size=state.step_size / 2, counts=counts)
             )
-        # without one nothing is known: go on as before
         if evaluation.gradient is not None:
             gradient, lengths, outliers = clip_gradient(
                 state.domain, evaluation.gradient, state.lengths
@@ -227,13 +276,13 @@ class AscentPolicy(Policy[Ascent]):
                 state,
                 lengths=lengths,
                 counts=state.counts + outliers,
-                flat=state.flat + 1,
+                n_flat=state.n_flat + 1,
             )
             if bool(gradient.any()):
                 state = replace(
                     self.learn(state, gradient),
                     n_updates=state.n_updates + 1,
-                    flat=0,
+                    n_flat=0,
                 )
         if state.peak is None or evaluation.objective > state.peak.objective:
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
@@ -328,34 +377,41 @@ class PGD(AscentPolicy):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         seed = draw_seed(generator)
-        u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.begin
+        u = domain.initial_point
+        if self.random_start:
+            u = domain.sample(seeded(seed, 0))[0]
+        # every step needs a gradient
         steps = max(1, steps // (1 + domain.gradient_cost))
-        min_length, window_fraction = (
-            (MIN_WINDOW_EXACT, MIN_WINDOW_FRACTION)
-            if domain.exact
-            else (MIN_WINDOW, FIRST_WINDOW)
-        )
-        window = Window(max(min_length, round(window_fraction * steps)))
+        if domain.exact:
+            window_length = max(MIN_WINDOW_EXACT, round(MIN_WINDOW_FRACTION * steps))
+        else:
+            window_length = max(MIN_WINDOW, round(FIRST_WINDOW * steps))
         return Ascent(
-            domain, steps, seed, u, torch.zeros_like(u), self.step_size, window=window
+            domain,
+            steps,
+            seed,
+            u,
+            torch.zeros_like(u),
+            self.step_size,
+            window=Window(window_length),
         )
 
     def pace(self, state: Ascent) -> float:
-        return (
-            state.decay_step_size(state.count)
-            if state.domain.exact or state.domain.draws_conditions
-            else state.step_size
-        )
+        if state.domain.exact or state.domain.draws_conditions:
+            return state.decay_step_size(state.count)
+        return state.step_size
 
     def retreat(self, state: Ascent) -> Ascent:
         if state.peak is None:
             return self._move_uphill(
-                replace(state, direction=torch.zeros_like(state.u)), state.domain.begin
+                replace(state, direction=torch.zeros_like(state.u)),
+                state.domain.initial_point,
             )
         return replace(state, u=state.peak.u, direction=state.peak.direction)
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
-        # sums of huge or tiny elements stay within float32
+        # m <- momentum * m + g / mean|g|; divided by the largest element first, so that
+        # the sum of huge or tiny elements stays within float32
         scaled = gradient / float(gradient.abs().amax())
         direction = (state.direction * self.momentum).add_(
             scaled, alpha=1.0 / float(scaled.abs().mean())
@@ -363,43 +419,63 @@ class PGD(AscentPolicy):
         return replace(state, direction=direction)
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
-        if math.isnan(state.first):
-            state = replace(state, first=objective)
+        if math.isnan(state.start_objective):
+            state = replace(state, start_objective=objective)
         if state.domain.draws_conditions:
             return self._move_uphill(state, u)
         window = state.window.add(objective)
-        peak = state.peak
-        slower = replace(state, step_size=state.step_size / 2)
         if len(window.values) < window.length:
             return self._move_uphill(replace(state, window=window), u)
-        # (the best of all may stem from another matrix of light transport)
         if state.domain.exact:
-            best = max(window.values)
-            idle = best - window.best <= MIN_WINDOW_GAIN * (best - state.first)
-            state = (
-                replace(slower, idle=state.idle + 1) if idle else replace(state, idle=0)
-            )
-            return self._move_uphill(
-                replace(state, window=Window(window.length, best=best)), u
-            )
+            return self._move_uphill(self._end_exact_window(state, window), u)
+        return self._end_noisy_window(state, window, u)
+
+    def _end_exact_window(self, state: Ascent, window: Window) -> Ascent:
+        """Halve the step size if a window without noise added nothing to the one
+        before.
+
+        It is compared with that window, not with the best of the search, which may stem
+        from another matrix of light transport. The next window is as long.
+        """
+        best = max(window.values)
+        gain = best - window.reference_best
+        is_idle = gain <= MIN_WINDOW_GAIN * (best - state.start_objective)
+        if is_idle:
+            step_size = state.step_size / 2
+            n_idle_windows = state.n_idle_windows + 1
+        else:
+            step_size = state.step_size
+            n_idle_windows = 0
+        return replace(
+            state,
+            step_size=step_size,
+            n_idle_windows=n_idle_windows,
+            window=Window(window.length, reference_best=best),
+        )
+
+    def _end_noisy_window(self, state: Ascent, window: Window, u: Tensor) -> Ascent:
+        """Halve the step size if the objective stalled in a window, and take a step.
+
+        If the window lags behind the best evaluation besides, the step goes from there
+        instead of u, with the direction of that time, and counts as rejected.
+        """
+        peak = state.peak
         best = peak.objective if peak else -math.inf
-        stalled = window.stalled(best)
-        state = slower if stalled else state
-        if peak is not None and stalled and window.lags(best):
+        is_stalled = window.stalled(best)
+        if is_stalled:
+            state = replace(state, step_size=state.step_size / 2)
+        if peak is not None and is_stalled and window.lags(best):
             u = peak.u
             state = replace(
                 state,
                 direction=peak.direction,
                 counts=state.counts + Counts(rejected=1),
             )
-        return self._move_uphill(
-            replace(state, window=window.next(state.steps, best, stalled)), u
-        )
+        next_window = window.next(state.steps, best, is_stalled)
+        return self._move_uphill(replace(state, window=next_window), u)
 
     def _move_uphill(self, state: Ascent, u: Tensor) -> Ascent:
-        """Move from u along the accumulated gradient, or at random where there is
-        none.
-        """
+        """Move from u along the accumulated gradient, or at random if that is zero."""
         uphill = state.direction
         if not bool(uphill.any()):
             uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
@@ -453,19 +529,25 @@ class Adam(AscentPolicy):
         steps = max(1, steps // (1 + domain.gradient_cost))
         zero = torch.zeros_like(domain.start)
         return Ascent(
-            domain, steps, draw_seed(generator), domain.begin, zero, self.step_size
+            domain,
+            steps,
+            draw_seed(generator),
+            domain.initial_point,
+            zero,
+            self.step_size,
         )
 
     def pace(self, state: Ascent) -> float:
         return state.decay_step_size(state.count)
 
     def retreat(self, state: Ascent) -> Ascent:
-        u = state.domain.begin if state.peak is None else state.peak.u
+        u = state.domain.initial_point if state.peak is None else state.peak.u
         return replace(
             state, u=u, direction=torch.zeros_like(u), square=NO_SQUARES, n_updates=0
         )
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
+        """Average the gradient and its squares; in an l2 block, the mean square."""
         squares = gradient.square()
         for block, part in state.domain.list_block_slices():
             if block.norm == "l2":
@@ -477,21 +559,15 @@ class Adam(AscentPolicy):
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         if state.n_updates:
+            # m' / sqrt(v'), without the bias of means that began at zero
             mean = state.direction / (1.0 - self.beta1**state.n_updates)
-            direction = mean / (
-                state.square / (1.0 - self.beta2**state.n_updates)
-            ).sqrt_().clamp_(min=1e-30)
+            mean_square = state.square / (1.0 - self.beta2**state.n_updates)
+            direction = mean / mean_square.sqrt_().clamp_(min=1e-30)
         else:  # at random as long as nothing is known
-            direction = torch.randn(
-                u.numel(), generator=seeded(state.seed, state.count)
-            ).sign_()
-        # of the evaluation that this step follows
+            noise = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
+            direction = noise.sign_()
+        # of the evaluation that this step follows, which is counted already
         rate = state.decay_step_size(state.count - 1)
-        return replace(
-            state,
-            u=state.domain.project(
-                torch.addcmul(
-                    u, compute_half_widths(state.domain), direction, value=rate
-                )
-            ),
-        )
+        half_widths = compute_half_widths(state.domain)
+        u = torch.addcmul(u, half_widths, direction, value=rate)
+        return replace(state, u=state.domain.project(u))

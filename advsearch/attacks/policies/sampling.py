@@ -17,11 +17,10 @@ from advsearch.attacks.domain import Block, Domain, option_center
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
-MAX_SOBOL_DIM = (
-    21_201  # Scipy has direction numbers for so many dimensions (Joe and Kuo 2008)
-)
-# numbers of a Sobol sequence that are drawn and kept at once, at most, and one point at
-# least
+# dimensions that scipy has direction numbers for (Joe and Kuo 2008)
+MAX_SOBOL_DIM = 21_201
+# largest number of elements of the points of a Sobol sequence that are computed at
+# once; but at least one point is
 MAX_CHUNK_NUMBERS = 2**20
 
 
@@ -30,9 +29,14 @@ NO_POINTS = torch.empty(0, 0)
 
 @dataclass(frozen=True, eq=False)
 class PointsState:
-    """Where a search stands that does not look at evaluations: how many configurations
-    are done, and what the next ones come from, if not from the seed alone: points (n,
-    k), the whole grid or so many of a sequence.
+    """State of a search that does not look at evaluations.
+
+    Attributes:
+        domain: of the search.
+        seed: of random numbers.
+        points: (n, k) that the next configurations come from: the full grid, or the
+            present chunk of a sequence. Empty if they come from the seed alone.
+        n_proposed: configurations that were proposed so far.
     """
 
     domain: Domain
@@ -40,13 +44,16 @@ class PointsState:
     points: Tensor = NO_POINTS
     n_proposed: int = 0
 
-    def propose(self, us: Iterable[Tensor]) -> tuple[tuple[Proposal, ...], PointsState]:
-        proposals = tuple(map(Proposal, us))
+    def propose(
+        self, configurations: Iterable[Tensor]
+    ) -> tuple[tuple[Proposal, ...], PointsState]:
+        """Return proposals of configurations, and the state in which they are counted."""
+        proposals = tuple(map(Proposal, configurations))
         return proposals, replace(self, n_proposed=self.n_proposed + len(proposals))
 
 
 class NonAdaptivePolicy(Policy[PointsState]):
-    """A policy that proposes what it would propose anyway."""
+    """A policy whose proposals do not depend on evaluations."""
 
     uses_gradient: ClassVar[bool] = False
     handles_choices: ClassVar[bool] = True
@@ -105,7 +112,8 @@ class Sobol(NonAdaptivePolicy):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> PointsState:
-        size = domain.dim + sum(block.norm == "l2" for block in domain.blocks)
+        n_l2_balls = sum(block.norm == "l2" for block in domain.blocks)
+        size = domain.dim + n_l2_balls
         if size > MAX_SOBOL_DIM:
             raise InputError(
                 f"policy 'sobol': expected at most {MAX_SOBOL_DIM} dimensions, got "
@@ -113,29 +121,34 @@ class Sobol(NonAdaptivePolicy):
                 "policy random, nes, pgd or auto"
             )
         seed = draw_seed(generator)
-        most = max(1, MAX_CHUNK_NUMBERS // size)
-        count = 2 ** max(0, min(steps - 1, most - 1).bit_length())
+        # the smallest power of two for all renders, or for the maximum of a chunk
+        max_points = max(1, MAX_CHUNK_NUMBERS // size)
+        count = 2 ** max(0, min(steps - 1, max_points - 1).bit_length())
         return PointsState(domain, seed, sample_sobol_points(size, seed, 0, count))
 
     def propose(
         self, state: PointsState, n: int
     ) -> tuple[tuple[Proposal, ...], PointsState]:
-        count, size = state.points.shape
-        if state.n_proposed and state.n_proposed % count == 0:
-            state = replace(
-                state,
-                points=sample_sobol_points(size, state.seed, state.n_proposed, count),
-            )
-        return state.propose(
-            to_domain(state.domain, x)
-            for x in state.points[state.n_proposed % count :][:n]
-        )
+        """Propose the next points of the present chunk, up to n; of the next chunk once
+        this one is used up.
+        """
+        chunk_size, size = state.points.shape
+        index_in_chunk = state.n_proposed % chunk_size
+        if state.n_proposed and index_in_chunk == 0:
+            points = sample_sobol_points(size, state.seed, state.n_proposed, chunk_size)
+            state = replace(state, points=points)
+        next_points = state.points[index_in_chunk:][:n]
+        return state.propose(to_domain(state.domain, x) for x in next_points)
 
 
 def sample_sobol_points(size: int, seed: int, begin: int, count: int) -> Tensor:
-    """Return `count` points of the scrambled sequence of that seed from number `begin`
-    on: (count, size) float32. The first call takes a power of two, which is what keeps
-    the points balanced.
+    """Return points (count, size) float32 of a scrambled Sobol sequence.
+
+    Args:
+        size: dimensions.
+        seed: of the scrambling.
+        begin: number of the first point.
+        count: number of points; a power of two, which keeps them balanced.
     """
     from scipy.stats import qmc  # takes most of a second, and few runs need it
 
@@ -146,8 +159,11 @@ def sample_sobol_points(size: int, seed: int, begin: int, count: int) -> Tensor:
 
 
 def to_domain(domain: Domain, x: Tensor) -> Tensor:
-    """Return the configuration (d,) for a point (d + number of l2 blocks,) of the unit
-    cube; see `Sobol`.
+    """Return the configuration (d,) for a point x (d + number of l2 blocks,) of the
+    unit cube; see `Sobol`.
+
+    The first d elements of x belong to the elements of u; the others give the radius in
+    each l2 ball.
     """
     u = torch.lerp(domain.lower, domain.upper, x[: domain.dim])
     radii = iter(x[domain.dim :].tolist())
@@ -155,6 +171,7 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
         if block.options:
             u[part] = option_center(x[part], block.options)
         elif block.norm == "l2" and block.epsilon is not None:
+            # normal quantiles, finite also at 0 and 1
             direction = torch.special.ndtri(x[part].double().clamp(1e-9, 1.0 - 1e-9))
             length = block.epsilon * next(radii) ** (1.0 / block.size)
             norm = max(float(torch.linalg.vector_norm(direction)), 1e-30)
@@ -203,12 +220,8 @@ class Grid(NonAdaptivePolicy):
     def propose(
         self, state: PointsState, n: int
     ) -> tuple[tuple[Proposal, ...], PointsState]:
-        return state.propose(
-            map(
-                state.domain.project,
-                state.points[state.n_proposed : state.n_proposed + n],
-            )
-        )
+        next_points = state.points[state.n_proposed :][:n]
+        return state.propose(map(state.domain.project, next_points))
 
 
 def _list_blocks(domain: Domain) -> list[Block]:
@@ -217,11 +230,13 @@ def _list_blocks(domain: Domain) -> list[Block]:
 
 
 def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
-    """Return the values of each element of u, (count,) in rising order."""
+    """Return the values of each element of u, (count,) in ascending order.
+
+    Bounds of an l2 ball are those of the cube around it, cut by its block's.
+    """
     lower = domain.lower.clone()
     upper = domain.upper.clone()
     for block, part in domain.list_block_slices():
-        # the cube around the ball
         if block.norm == "l2" and block.epsilon is not None:
             lower[part] = lower[part].maximum(domain.start[part] - block.epsilon)
             upper[part] = upper[part].minimum(domain.start[part] + block.epsilon)
@@ -244,8 +259,9 @@ def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Ten
     They are sorted by the largest level of a point, then by the sum of its levels. The
     last axis of the grid runs fastest.
     """
+    # of all points of the grid over the axes so far
     max_level = torch.zeros(1, dtype=torch.long)
-    level_sum = max_level
+    level_sum = torch.zeros(1, dtype=torch.long)
     for level in map(_compute_levels, blocks, counts):
         max_level = torch.maximum(max_level[:, None], level).flatten()
         level_sum = (level_sum[:, None] + level).flatten()
@@ -256,6 +272,9 @@ def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Ten
 def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
     """Return how many values each element of u takes.
 
+    A choice takes all its options. Without `points` all numbers take as many values as
+    fit, at least 2; then each in turn takes one more as long as the grid fits.
+
     Args:
         domain: to search.
         steps: renders that the grid may take.
@@ -265,46 +284,68 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
         InputError: the grid does not fit into the renders.
     """
     options = domain.options.tolist()
-    numbers = options.count(0)
-    combinations = math.prod(n for n in options if n)
-    least = combinations * (points or 2) ** min(numbers, 64)
-    if least > steps:
-        more = (
-            f" and {combinations} combinations of options" if combinations > 1 else ""
-        )
-        many = str(least) if least < 10**9 else "billions of"
+    n_numbers = options.count(0)
+    n_combinations = math.prod(count for count in options if count)
+    min_values = points or 2
+    # 2^64 is too much for any budget; more would only take long to compute
+    min_renders = n_combinations * min_values ** min(n_numbers, 64)
+    if min_renders > steps:
+        combinations_text = ""
+        if n_combinations > 1:
+            combinations_text = f" and {n_combinations} combinations of options"
+        renders_text = str(min_renders) if min_renders < 10**9 else "billions of"
         raise InputError(
-            f"policy 'grid': {points or 2} values for each of {numbers} numbers{more} "
-            f"are {many} renders, and "
+            f"policy 'grid': {min_values} values for each of {n_numbers} "
+            f"numbers{combinations_text} are {renders_text} renders, and "
             f"there are {steps}; use policy sobol, cmaes, nes, pgd or auto, or give "
             "more `steps`"
         )
-    each = points or max(
-        2, int((steps // combinations) ** (1.0 / max(numbers, 1)) * (1 - 1e-9))
-    )
-    counts = [n or each for n in options]
+    if points:
+        return [count or points for count in options]
+    return _fill_budget(options, steps)
+
+
+def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
+    """Return how many values each element of u takes so that the grid just fits.
+
+    Args:
+        options: of each element; 0 of a number, which takes at least 2 values.
+        steps: points of the grid, at most.
+    """
+    n_combinations = math.prod(count for count in options if count)
+    root = (steps // n_combinations) ** (1.0 / max(options.count(0), 1))
+    # reduced a little, since a root that is rounded up would not fit
+    values_each = max(2, int(root * (1 - 1e-9)))
+    counts = [count or values_each for count in options]
     total = math.prod(counts)
-    grew = not points
-    while grew:
-        grew = False
-        for j, fixed in enumerate(options):
-            if not fixed and total // counts[j] * (counts[j] + 1) <= steps:
-                total = total // counts[j] * (counts[j] + 1)
-                grew = True
-                counts[j] += 1
+    has_grown = True
+    while has_grown:
+        has_grown = False
+        for index, n_options in enumerate(options):
+            grown_total = total // counts[index] * (counts[index] + 1)
+            if not n_options and grown_total <= steps:
+                total = grown_total
+                counts[index] += 1
+                has_grown = True
     return counts
 
 
 def _compute_levels(block: Block, count: int) -> Tensor:
-    """Return (count,) how often an axis must be halved until a value is met: 0 for both
-    ends and for every option.
+    """Return the level (count,) of each value of an axis: how often the axis must be
+    halved until the value is met.
+
+    It is 0 for both ends of a number's range and for every option. The end of an angle
+    is its beginning, which is no value of its own.
     """
     level = torch.zeros(count, dtype=torch.long)
-    gaps = [] if block.options else [(0, count if block.periodic else count - 1, 1)]
+    if block.options:
+        return level
+    last = count if block.periodic else count - 1
+    gaps = [(0, last, 1)]  # (lower index, upper index, level of what lies between)
     while gaps:
-        low, high, depth = gaps.pop()
-        middle = (low + high) // 2
-        if low < middle < high:
+        lower, upper, depth = gaps.pop()
+        middle = (lower + upper) // 2
+        if lower < middle < upper:
             level[middle] = depth
-            gaps += [(low, middle, depth + 1), (middle, high, depth + 1)]
+            gaps += [(lower, middle, depth + 1), (middle, upper, depth + 1)]
     return level

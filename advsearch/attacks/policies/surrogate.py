@@ -1,5 +1,5 @@
-"""A Gaussian process (Matérn-5/2, a length for each coordinate, noise) over the box
-blocks of a domain as one unit box. All is fitted by maximum likelihood over fixed
+"""A Gaussian process (Matérn-5/2, a length scale for each coordinate, noise) over the
+box blocks of a domain as one unit box. All is fitted by maximum likelihood over fixed
 grids, and every proposal is one of finitely many, so that last bits of a factorisation
 do not change a result.
 """
@@ -18,22 +18,28 @@ from advsearch.attacks.evaluation import Evaluated, seeded
 # more coordinates than this are screened with independent points; Sobol's advantage is
 # long gone
 MAX_SOBOL_DIM = 1000
-# about so many coordinates change in one local move; all, where there are no more
+# expected number of coordinates that a local move changes
 N_MOVED_COORDINATES = 4
-RESAMPLED_FRACTION = 0.3  # share of moved choices that are drawn anew
-# deviations of local moves, in a coordinate's whole range; between them log-uniform
+RESAMPLED_FRACTION = 0.3  # fraction of the moved choices that are sampled anew
+# standard deviation of local moves, as fractions of a coordinate's range; log-uniform
+# between these
 MIN_MOVE = 0.01
 MAX_MOVE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class BoxCoordinates:
-    """Which elements of u these are (k,), and what a point x in [0, 1]^k means:
-    u[where] = low + width * x. At the ends of `periodic` ones is the same place; a
-    discrete choice has `options`, others 0.
+    """The k coordinates of the unit box: u[indices] = low + width * x for x in [0, 1]^k.
+
+    Attributes:
+        indices: (k,) of the elements of u.
+        low: (k,) their lower bounds.
+        width: (k,) of their ranges.
+        periodic: (k,) whether 0 and 1 are the same place (an angle).
+        options: (k,) number of options of a discrete choice; 0 for a number.
     """
 
-    where: Tensor
+    indices: Tensor
     low: Tensor
     width: Tensor
     periodic: Tensor
@@ -41,23 +47,23 @@ class BoxCoordinates:
 
     @property
     def count(self) -> int:
-        return len(self.where)
+        return len(self.indices)
 
     def from_configuration(self, u: Tensor) -> Tensor:
-        """Return the points (..., k) at which configurations (..., d) stand."""
-        return ((u[..., self.where] - self.low) / self.width).clamp_(0.0, 1.0)
+        """Return the points (..., k) of configurations (..., d)."""
+        return ((u[..., self.indices] - self.low) / self.width).clamp_(0.0, 1.0)
 
     def to_configuration(self, u: Tensor, x: Tensor) -> Tensor:
         """Return a copy of configurations (..., d), moved to points (..., k)."""
         u = u.clone()
-        u[..., self.where] = torch.clamp(
+        u[..., self.indices] = torch.clamp(
             self.low + self.width * x, self.low, self.low + self.width
         )
         return u
 
     def normalize(self, x: Tensor) -> Tensor:
-        """Return points (n, k) brought back: angles wrap, choices go to the middle of
-        their option, the rest clips.
+        """Return points (n, k) moved into the box: angles wrap, choices go to the
+        center of their option, other numbers are clipped.
         """
         x = torch.where(self.periodic, torch.remainder(x, 1.0), x).clamp_(0.0, 1.0)
         return torch.where(
@@ -74,94 +80,100 @@ class BoxCoordinates:
         return self.normalize(engine.draw(n))
 
     def sample_moves(self, x: Tensor, generator: torch.Generator) -> Tensor:
-        """Return points (n, k), each near its own in x: a few coordinates of each
-        moved, near or far.
+        """Return a random move (n, k) of each of the points x (n, k).
+
+        A few coordinates move, at least one. Numbers move by normal noise whose size is
+        random; choices are sampled anew, or stay.
         """
         n, k = x.shape
-        far = math.log(MAX_MOVE / MIN_MOVE)
-        size = MIN_MOVE * torch.exp(far * torch.rand(n, 1, generator=generator))
-        moved = torch.rand(n, k, generator=generator) < N_MOVED_COORDINATES / k
-        moved[torch.arange(n), torch.randint(k, (n,), generator=generator)] = True
-        near = x + moved * size * torch.randn(n, k, generator=generator)
-        anew = (
-            moved
-            & (self.options > 0)
-            & (torch.rand(n, k, generator=generator) < RESAMPLED_FRACTION)
-        )
-        x = torch.where(self.options > 0, x, near)
-        return self.normalize(
-            torch.where(anew, torch.rand(n, k, generator=generator), x)
-        )
+        log_range = math.log(MAX_MOVE / MIN_MOVE)
+        size = MIN_MOVE * torch.exp(log_range * torch.rand(n, 1, generator=generator))
+        is_moved = torch.rand(n, k, generator=generator) < N_MOVED_COORDINATES / k
+        is_moved[torch.arange(n), torch.randint(k, (n,), generator=generator)] = True
+        noise = torch.randn(n, k, generator=generator)
+        is_choice = self.options > 0
+        x = torch.where(is_choice, x, x + is_moved * size * noise)
+        may_resample = torch.rand(n, k, generator=generator) < RESAMPLED_FRACTION
+        is_resampled = is_moved & is_choice & may_resample
+        uniform = torch.rand(n, k, generator=generator)
+        return self.normalize(torch.where(is_resampled, uniform, x))
 
     def embed(self, x: Tensor, lengths: Tensor) -> Tensor:
-        """Return points (n, k) as points (n, f) whose ordinary distances are what a
-        surrogate needs.
+        """Return points x (n, k) as features (n, f) whose Euclidean distances are those
+        of the kernel.
 
-        Differences are divided by (k,) lengths. An angle becomes a circle of
+        Differences are divided by the length scales (k,). An angle becomes a circle of
         circumference 2, an option the corner of a simplex with edges of length 1.
         """
         x = x.double()
-        plain = ~self.periodic & (self.options == 0)
+        is_plain = ~self.periodic & (self.options == 0)
         angle = 2.0 * math.pi * x[:, self.periodic]
-        radius = math.pi * lengths[self.periodic]
-        parts = [
-            x[:, plain] / lengths[plain],
-            angle.cos() / radius,
-            angle.sin() / radius,
+        # the circle has the radius 1 / pi, divided by the length scale
+        scaled_length = math.pi * lengths[self.periodic]
+        features = [
+            x[:, is_plain] / lengths[is_plain],
+            angle.cos() / scaled_length,
+            angle.sin() / scaled_length,
         ]
-        for j in torch.nonzero(self.options).flatten().tolist():
-            count = int(self.options[j])
-            number = (x[:, j] * count).long().clamp_(max=count - 1)
-            corner = torch.nn.functional.one_hot(number, count).double()
-            parts.append(corner / (math.sqrt(2.0) * lengths[j]))
-        return torch.cat(parts, dim=1)
+        for coordinate in torch.nonzero(self.options).flatten().tolist():
+            n_options = int(self.options[coordinate])
+            option = (x[:, coordinate] * n_options).long().clamp_(max=n_options - 1)
+            corner = torch.nn.functional.one_hot(option, n_options).double()
+            # two corners of a one-hot code are sqrt(2) apart
+            features.append(corner / (math.sqrt(2.0) * lengths[coordinate]))
+        return torch.cat(features, dim=1)
 
 
 def find_box_coordinates(domain: Domain) -> BoxCoordinates:
     """Return the coordinates of a domain that belong to no norm ball; there may be
     none.
     """
-    boxes = [
+    index_blocks = [
         torch.arange(part.start, part.stop)
         for block, part in domain.list_block_slices()
         if block.norm == "box"
     ]
-    where = torch.cat([torch.empty(0, dtype=torch.long), *boxes])
-    low = domain.lower[where]
-    width = domain.upper[where] - domain.lower[where]
+    # an empty one first, since `cat` needs at least one tensor
+    indices = torch.cat([torch.empty(0, dtype=torch.long), *index_blocks])
     return BoxCoordinates(
-        where, low, width, find_periodic(domain)[where], domain.options[where]
+        indices,
+        low=domain.lower[indices],
+        width=domain.upper[indices] - domain.lower[indices],
+        periodic=find_periodic(domain)[indices],
+        options=domain.options[indices],
     )
 
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
-"""Candidate lengths, times the square root of the number of coordinates (as distances
-between points grow).
+"""Candidate length scales, in units of the square root of the number of coordinates, as
+distances between points grow with it.
 """
 
-# candidate variances of the noise, as shares of the signal's
-NOISES = (1e-4, 1e-2, 0.1, 0.5, 2.0)
-STRETCHES = (0.5, 2.0, 4.0)  # by how much one coordinate's length is changed on trial
-# no length is more than this many times the root of the number of coordinates: it no
-# longer matters then
+# candidate variances of the noise, as fractions of the signal's
+NOISE_VARIANCES = (1e-4, 1e-2, 0.1, 0.5, 2.0)
+# factors by which the length scale of a single coordinate is changed on trial
+LENGTH_FACTORS = (0.5, 2.0, 4.0)
+# largest length scale, in the same units: above it the coordinate no longer matters
 MAX_LENGTH = 8.0
 # gain in log-likelihood that a coordinate's own length must bring; less would fit the
 # noise
 MIN_LIKELIHOOD_GAIN = 1.0
-# lengths and noise are fitted again after so many new points, or a tenth of all if that
-# is more
+# new points after which length scales and noise are fitted again, or a tenth of all if
+# that is more
 REFIT_INTERVAL = 5
-# so many of the best points and so many of the latest count, unless more are asked for
+# number of the best points, and of the latest points, that a process is fitted to
 MEMORY = 100
-MAX_SCALED_DIM = (
-    16  # up to so many coordinates have lengths of their own; more share one
-)
+# largest number of coordinates with length scales of their own; more share one
+MAX_SCALED_DIM = 16
 
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """What is fitted: (k,) lengths, and the noise's variance as a share of the
-    signal's.
+    """Hyperparameters of the process.
+
+    Attributes:
+        lengths: (k,) length scales.
+        noise: variance of the noise, as a fraction of the signal's.
     """
 
     lengths: Tensor
@@ -170,12 +182,21 @@ class Scales:
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """A fitted process at points (n, k) of the unit box: the Cholesky factor (n, n) of
-    the kernel matrix with noise, of signal variance 1; its inverse times the centred
-    values (n,); mean and variance of the signal; log-likelihood.
+    """A process fitted to n points.
+
+    Attributes:
+        box: what the coordinates are.
+        x: (n, k) points of the unit box.
+        scales: hyperparameters.
+        factor: (n, n) Cholesky factor of the kernel matrix with noise, for a signal of
+            variance 1.
+        weights: (n,) the inverse of that matrix, times the values without their mean.
+        mean: of the signal.
+        variance: of the signal.
+        likelihood: log-likelihood, up to a constant.
     """
 
-    space: BoxCoordinates
+    box: BoxCoordinates
     x: Tensor
     scales: Scales
     factor: Tensor
@@ -189,24 +210,33 @@ class Surrogate:
         (m, k).
         """
         lengths = self.scales.lengths
-        cross = kernel(self.space.embed(x, lengths), self.space.embed(self.x, lengths))
+        # (m, n) correlations of the new points with the known ones
+        cross = kernel(self.box.embed(x, lengths), self.box.embed(self.x, lengths))
         solved = torch.linalg.solve_triangular(self.factor, cross.mT, upper=False)
-        left = (1.0 - solved.square().sum(dim=0)).clamp_(min=1e-12)
-        return self.mean + cross @ self.weights, (self.variance * left).sqrt_()
+        # not below 0 by rounding, where a point is known
+        unexplained = (1.0 - solved.square().sum(dim=0)).clamp_(min=1e-12)
+        return self.mean + cross @ self.weights, (self.variance * unexplained).sqrt_()
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """What was evaluated, points (n, k) and n objectives, not finite where it could not
-    be, and the scales of the process behind it, fitted to the first `fitted`. The best
-    and the latest points count, so many of each; for the scales `MEMORY`.
+    """The evaluations of a search, and the scales of the process behind them.
+
+    Attributes:
+        box: what the coordinates are.
+        points: (n, k) that were evaluated.
+        values: n objectives; not finite if a point could not be evaluated.
+        scales: as they were last fitted; None before that.
+        n_fitted: number of points at that time.
+        memory: how many of the best and of the latest points a process is fitted to;
+            its scales are fitted to `MEMORY` of each.
     """
 
-    space: BoxCoordinates
+    box: BoxCoordinates
     points: Tensor
     values: tuple[float, ...] = ()
     scales: Scales | None = None
-    fitted: int = 0
+    n_fitted: int = 0
     memory: int = MEMORY
 
     @property
@@ -214,52 +244,46 @@ class Observations:
         return any(math.isfinite(value) for value in self.values)
 
     def extend(self, evaluated: Evaluated) -> Observations:
-        points = torch.cat(
-            [
-                self.points,
-                *(self.space.from_configuration(u)[None] for u, _ in evaluated),
-            ]
-        )
+        """Return the observations with further evaluations."""
+        new_points = [self.box.from_configuration(u)[None] for u, _ in evaluated]
+        new_values = [evaluation.objective for _, evaluation in evaluated]
         return replace(
             self,
-            points=points,
-            values=(
-                *self.values,
-                *(evaluation.objective for _, evaluation in evaluated),
-            ),
+            points=torch.cat([self.points, *new_points]),
+            values=(*self.values, *new_values),
         )
 
     def fit_surrogate(self) -> tuple[Surrogate, Observations]:
-        """Return the process behind what was seen, its scales fitted again if it is
-        time; something is finite.
+        """Fit a process; return it, and the observations with its scales.
 
-        What could not be evaluated counts as the smallest value; of many points the
-        best and the latest count.
+        At least one value must be finite; those that are not count as the smallest. Of
+        many points the best and the latest are used. The scales are fitted again only
+        after `REFIT_INTERVAL` new points, or a tenth of all if that is more.
         """
         n = len(self.values)
         values = torch.tensor(self.values, dtype=torch.float64)
-        finite = torch.isfinite(values)
-        values = torch.where(finite, values, values[finite].min())
+        is_finite = torch.isfinite(values)
+        values = torch.where(is_finite, values, values[is_finite].min())
         scales = self.scales
-        fitted = self.fitted
-        if scales is None or n - fitted >= max(REFIT_INTERVAL, fitted // 10):
+        n_fitted = self.n_fitted
+        if scales is None or n - n_fitted >= max(REFIT_INTERVAL, n_fitted // 10):
             used = _select_best_and_latest(values, MEMORY)
-            scales = _find_best_scales(self.space, self.points[used], values[used])
-            fitted = n
+            scales = _find_best_scales(self.box, self.points[used], values[used])
+            n_fitted = n
         used = _select_best_and_latest(values, self.memory)
-        surrogate = fit(self.space, self.points[used], values[used], scales)
-        return surrogate, replace(self, scales=scales, fitted=fitted)
+        surrogate = fit(self.box, self.points[used], values[used], scales)
+        return surrogate, replace(self, scales=scales, n_fitted=n_fitted)
 
 
 def _select_best_and_latest(values: Tensor, memory: int) -> Tensor:
-    """Return places of so many of the largest values and so many of the last; of all if
-    there are no more.
+    """Return the indices of the `memory` last values, after those of the `memory`
+    largest before them; of all values, in their order, if there are no more.
     """
-    last = len(values) - memory
-    if last <= memory:
+    n_before_last = len(values) - memory
+    if n_before_last <= memory:
         return torch.arange(len(values))
-    best = values[:last].argsort(descending=True, stable=True)[:memory]
-    return torch.cat([best, torch.arange(last, len(values))])
+    order = values[:n_before_last].argsort(descending=True, stable=True)
+    return torch.cat([order[:memory], torch.arange(n_before_last, len(values))])
 
 
 def kernel(a: Tensor, b: Tensor) -> Tensor:
@@ -269,55 +293,61 @@ def kernel(a: Tensor, b: Tensor) -> Tensor:
 
 
 def fit(
-    space: BoxCoordinates, x: Tensor, y: Tensor, scales: Scales | None = None
+    box: BoxCoordinates, x: Tensor, y: Tensor, scales: Scales | None = None
 ) -> Surrogate:
-    """Return the process given values (n,) at points (n, k), mean and variance at their
-    best; the scales too are fitted unless they are given.
+    """Return the process for values y (n,) at points x (n, k).
+
+    Its mean and variance are those of maximum likelihood; so are the scales, unless
+    they are passed.
     """
-    scales = scales or _find_best_scales(space, x, y)
-    points = space.embed(x, scales.lengths)
+    scales = scales or _find_best_scales(box, x, y)
+    features = box.embed(x, scales.lengths)
     n = len(x)
-    matrix = kernel(points, points) + (scales.noise + 1e-8) * torch.eye(
+    # 1e-8 keeps the matrix positive definite where points coincide
+    matrix = kernel(features, features) + (scales.noise + 1e-8) * torch.eye(
         n, dtype=torch.float64
     )
     factor = torch.linalg.cholesky(matrix)
-    both = torch.cholesky_solve(
-        torch.stack([y.double(), torch.ones(n, dtype=torch.float64)], dim=1), factor
-    )
-    mean = float(both[:, 0].sum() / both[:, 1].sum())
-    weights = both[:, 0] - mean * both[:, 1]
+    right_sides = torch.stack([y.double(), torch.ones(n, dtype=torch.float64)], dim=1)
+    solved_values, solved_ones = torch.cholesky_solve(right_sides, factor).T
+    mean = float(solved_values.sum() / solved_ones.sum())
+    weights = solved_values - mean * solved_ones
     variance = max(float(weights @ (y.double() - mean)) / n, 1e-30)
     likelihood = -0.5 * n * math.log(variance) - float(factor.diagonal().log().sum())
-    return Surrogate(space, x, scales, factor, weights, mean, variance, likelihood)
+    return Surrogate(box, x, scales, factor, weights, mean, variance, likelihood)
 
 
-def _find_best_scales(space: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
-    """The most likely common length and noise, then length by length what the evidence
-    asks for.
+def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
+    """Return the scales of greatest likelihood for values y (n,) at points x (n, k).
+
+    First a common length scale and the noise are chosen from the grids. Then the length
+    scale of one coordinate after the other is changed if that brings at least
+    `MIN_LIKELIHOOD_GAIN`.
     """
     k = x.shape[1]
-    unit = math.sqrt(k)
+    length_unit = math.sqrt(k)
 
-    def most_likely(tried: list[Scales]) -> Surrogate:
-        return max(
-            (fit(space, x, y, scales) for scales in tried),
-            key=lambda fitted: fitted.likelihood,
-        )
+    def find_most_likely(candidates: list[Scales]) -> Surrogate:
+        fits = [fit(box, x, y, scales) for scales in candidates]
+        return max(fits, key=lambda surrogate: surrogate.likelihood)
 
-    best = most_likely(
+    best = find_most_likely(
         [
-            Scales(torch.full((k,), unit * length).double(), noise)
+            Scales(torch.full((k,), length_unit * length).double(), noise)
             for length in LENGTHS
-            for noise in NOISES
+            for noise in NOISE_VARIANCES
         ]
     )
-    for j in range(k if 1 < k <= MAX_SCALED_DIM else 0):
-        changed = []
-        for stretch in STRETCHES:
+    if not 1 < k <= MAX_SCALED_DIM:
+        return best.scales
+    for coordinate in range(k):
+        candidates = []
+        for factor in LENGTH_FACTORS:
             lengths = best.scales.lengths.clone()
-            lengths[j] = min(unit * MAX_LENGTH, float(lengths[j]) * stretch)
-            changed.append(Scales(lengths, best.scales.noise))
-        other = most_likely(changed)
+            changed_length = float(lengths[coordinate]) * factor
+            lengths[coordinate] = min(length_unit * MAX_LENGTH, changed_length)
+            candidates.append(Scales(lengths, best.scales.noise))
+        other = find_most_likely(candidates)
         if other.likelihood > best.likelihood + MIN_LIKELIHOOD_GAIN:
             best = other
     return best.scales

@@ -26,19 +26,17 @@ class Sheets(Exporter):
     ) -> Exported:
         from advsearch.extend import exports  # takes seconds
 
-        known_size = (
-            exports.get_real_size(run) if options["size"] is None else options["size"]
-        )
+        known_size = options["size"]
+        if known_size is None:
+            known_size = exports.get_real_size(run)
         longest = USUAL_SIZE if known_size is None else known_size
         pieces = exports.make_printable_pieces(run, longest)
         profile = None if options["icc"] is None else Path(options["icc"])
         title = f"{Path(run).name}, object of {exports.format_rounded(longest)} mm"
         paper = (options["paper"] or "a4").lower()
-        most = (
-            exports.DEFAULT_MAX_SHEETS
-            if options["sheets"] is None
-            else options["sheets"]
-        )
+        max_sheets = options["sheets"]
+        if max_sheets is None:
+            max_sheets = exports.DEFAULT_MAX_SHEETS
         with writing.name_setting_in_errors("out"), writing.replace_file(out) as part:
             pages = exports.write_sheets(
                 part,
@@ -46,7 +44,7 @@ class Sheets(Exporter):
                 title,
                 paper=paper,
                 profile=profile,
-                max_sheets=most,
+                max_sheets=max_sheets,
                 make_last_page=exports.draw_chart_page,
             )
         sizes = [
@@ -54,8 +52,7 @@ class Sheets(Exporter):
             for piece in pieces
         ]
         text = (
-            f"{pages} pages in {out}; print them at 100 % and measure the square "
-            "on "
+            f"{pages} pages in {out}; print them at 100 % and measure the square on "
             "the first"
         )
         if known_size is None:

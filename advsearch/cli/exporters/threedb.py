@@ -73,6 +73,15 @@ def write_threedb(
 
 
 def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]:
+    """Return one line of a 3DB log, for a row of a sweep.
+
+    Args:
+        row: of the results.
+        names: parameters that every line has; one that the row lacks is "none".
+        prediction: index of the predicted class.
+
+    3DB minimizes where we maximize, so that its loss is the negative margin.
+    """
     value_of = {name: entry["value"] for name, entry in row.values.items()}
     parameters = {
         "network" if name == "model" else name: value_of.get(name, "none")

@@ -62,12 +62,12 @@ def interpolate_table(
 def interpolate_severity(
     level: Tensor, make_at_severity: Callable[[int], Tensor]
 ) -> Tensor:
-    """Mix what `make_at_severity` returns for the whole severities below and above a
-    severity.
+    """Interpolate between what `make_at_severity` returns for the integer severities
+    below and above a severity.
 
     Args:
         level: () in [1, 5]; the result is differentiable in it, and on its device.
-        make_at_severity: returns a tensor for a whole severity.
+        make_at_severity: returns a tensor for an integer severity.
     """
     below = min(int(level.detach()), MAX_SEVERITY - 1)
     fraction = level - below
@@ -112,7 +112,9 @@ def blur_along_line(
         step: pixels of this image for a pixel of the reference image.
     """
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
+    # in pixels of the reference image
     distance = torch.arange(count, device=image.device) / step
+    # soft over one pixel, so that the result is differentiable in the radius
     cut_off = (2.0 * radius + 1.0 - distance).clamp(0.0, 1.0)
     weights = torch.exp(-0.5 * (distance / sigma) ** 2) * cut_off
     weights = weights / weights.sum()
@@ -157,16 +159,16 @@ def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
 def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Draw photon counts: Poisson numbers with the image as their mean.
 
-    The values are exact. Counts have no derivative, so each is taken to keep its place
-    in the distribution, a number of standard deviations from the mean, when the mean or
-    the spread changes a little.
+    The values are exact. Counts have no derivative, so the derivative is that of a
+    value which stays the same number of standard deviations from the mean when the mean
+    or the standard deviation changes a little.
     """
     (photons,) = interpolate_table(SHOT, level)
     quantile = _noise(image, seed, "shot noise", normal=False)
     with torch.no_grad():
-        counted = sample_poisson(image * photons, quantile) / photons
-        deviations = (counted - image) / torch.sqrt(image / photons + _DARK)
-    return image + deviations * torch.sqrt(image / photons + _DARK)
+        noisy = sample_poisson(image * photons, quantile) / photons
+        z = (noisy - image) / torch.sqrt(image / photons + _DARK)
+    return image + z * torch.sqrt(image / photons + _DARK)
 
 
 def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
@@ -242,6 +244,8 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     disc = (radius + 0.5 - distance).clamp(0.0, 1.0)
     height, width = image.shape[:2]
     padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
+    # By Fourier transforms, which are faster for large discs; of the full convolution
+    # only the part over the image is returned.
     size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(
         disc / disc.sum(), s=size
@@ -335,7 +339,11 @@ def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
 def _swap_in_neighbors(
     origins: list[int], to_neighbor: list[int], rows: int, columns: int, reach: int
 ) -> None:
-    """Let each pixel take over the origin of its neighbor, from the bottom right."""
+    """Let each pixel take over the origin of its neighbor, from the bottom right.
+
+    Pixels nearer to an edge than `reach` keep theirs. `origins` is changed in place;
+    `to_neighbor` is how much to add to a pixel's index.
+    """
     for row in range(rows - reach, reach, -1):
         for pixel in range(row * columns + columns - reach, row * columns + reach, -1):
             origins[pixel] = origins[pixel + to_neighbor[pixel]]
@@ -388,6 +396,8 @@ def _shear(rows: int, columns: int, corners: Tensor) -> Tensor:
 
     They are corners of the middle third of the image.
     """
+    # An affine map is its value at the center, and its slopes along rows and columns,
+    # from the shifts of the lower right, upper right and upper left corner.
     third = REFERENCE_SIDE // 3
     by_row = (corners[0] - corners[1]) / (2 * third)
     by_column = (corners[0] - corners[2]) / (2 * third) - by_row
@@ -475,10 +485,9 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
 
 def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Lay ice crystals over the picture."""
-    keep, ice = interpolate_table(FROST, level)
-    return keep * image + ice * _crystals(image.shape[0], image.shape[1], seed).to(
-        image.device
-    )
+    image_weight, ice_weight = interpolate_table(FROST, level)
+    ice = _crystals(image.shape[0], image.shape[1], seed).to(image.device)
+    return image_weight * image + ice_weight * ice
 
 
 @lru_cache(maxsize=4)
@@ -531,14 +540,16 @@ def _line(pen: ImageDraw.ImageDraw, begin: complex, end: complex, shine: float) 
 
 def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pale the picture and let streaks of snow fall before it."""
-    (keep,) = interpolate_table(SNOW_IMAGE_WEIGHT, level)
+    (image_weight,) = interpolate_table(SNOW_IMAGE_WEIGHT, level)
     layer = interpolate_severity(
         level,
         lambda severity: _snowfall(image.shape[0], image.shape[1], seed, severity),
     ).to(image.device)
     grey = (image * image.new_tensor(LUMA_WEIGHTS)).sum(dim=-1, keepdim=True)
     pale = torch.maximum(image, 1.5 * grey + 0.5)
-    return keep * image + (1.0 - keep) * pale + layer + layer.rot90(2)
+    mixed = image_weight * image + (1.0 - image_weight) * pale
+    # once more turned by 180 degrees, for twice as many flakes
+    return mixed + layer + layer.rot90(2)
 
 
 @lru_cache(maxsize=8)

@@ -104,22 +104,27 @@ class Placement:
     """Where an occluder goes, in the camera's coordinates.
 
     Lengths are in object sizes.
+
+    Attributes:
+        axes: (3, 3) rows right, up and forward of a camera that looks at the center of
+            what is visible of the object.
+        angle: from that center to the occluder, radians.
+        size: of the occluder, made smaller if it would not fit.
+        distance: from the camera, changed if it would not fit.
+        hidden: fraction of the object's area in the image.
+        is_out_of_sight: whether the occluder is put away.
     """
 
-    # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is
-    # seen
     axes: assets.Float64Array
-    angle: float  # from that middle to the occluder, radians
-    size: float  # made smaller where it would not fit
-    distance: float  # from the camera, changed where it would not fit
-    hidden: float  # share of the object's picture area
-    is_out_of_sight: bool  # it is put away, out of sight
+    angle: float
+    size: float
+    distance: float
+    hidden: float
+    is_out_of_sight: bool
 
 
 class OcclusionControl(Control):
-    """A second object between the camera and the object, hiding a wanted share of
-    it.
-    """
+    """A second object between the camera and the object, hiding a fraction of it."""
 
     kind = "occlusion"
     amount = "coverage"
@@ -240,20 +245,20 @@ class OcclusionControl(Control):
             f"{self._part_name(option)}.to_world": geometry.make_hidden_pose(camera)
             for option in self._list_options()
         }
-        placed = self.find_placement(values, so_far)
-        if not placed.is_out_of_sight:
+        placement = self.find_placement(values, so_far)
+        if not placement.is_out_of_sight:
             part = self._part_name(self._select_option(values))
-            inputs[f"{part}.to_world"] = _compute_pose(camera, placed, values)
+            inputs[f"{part}.to_world"] = _compute_pose(camera, placement, values)
         return inputs
 
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how much is hidden, and the true size and distance of the occluder."""
-        placed = self.find_placement(values, so_far)
-        measurements = {"hidden": Value(value=float(placed.hidden), unit="1")}
-        if not placed.is_out_of_sight:
-            lengths = {"true_size": placed.size, "true_distance": placed.distance}
+        placement = self.find_placement(values, so_far)
+        measurements = {"hidden": Value(value=float(placement.hidden), unit="1")}
+        if not placement.is_out_of_sight:
+            lengths = {"true_size": placement.size, "true_distance": placement.distance}
             for name, length in lengths.items():
                 measurements[name] = Value(value=float(length), unit="object sizes")
         return measurements
@@ -265,11 +270,10 @@ class OcclusionControl(Control):
         return tuple(map(str, self.list_allowed_values("which", PRIMITIVES[0])))
 
     def _select_option(self, values: Values) -> str:
-        return (
-            self._list_options()[0]
-            if self.chosen["object"] is not None
-            else OPTIONS[int(values["which"])]
-        )
+        """Return the occluder of a configuration."""
+        if self.chosen["object"] is not None:
+            return self._list_options()[0]
+        return OPTIONS[int(values["which"])]
 
     def _part_name(self, option: str) -> str:
         """Return the name of an occluder's part of the scene.
@@ -279,10 +283,11 @@ class OcclusionControl(Control):
         return self.name if len(self._list_options()) == 1 else f"{self.name}-{option}"
 
     def find_placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
-        """Work out where the occluder goes, with camera and object where others put
-        them.
+        """Find where the occluder goes, given the pose of camera and object by the
+        controls before this one; without derivatives.
 
-        Without derivatives.
+        It moves in from its side of the image until it hides the requested coverage. It
+        is out of sight if the object is not in the image, or nothing is to be hidden.
         """
         requested = {name: float(value.detach()) for name, value in values.items()}
         view = _ObjectView.of(self.scene, so_far)
@@ -450,7 +455,7 @@ def _spread_directions(
 ) -> assets.Float64Array:
     """Return unit directions (N, 3) in which a lens sees a part of the image.
 
-    They are spread as those of `Silhouette.directions`.
+    They are spread as those of `Silhouette.list_directions`.
 
     Args:
         model: of the camera.
@@ -460,6 +465,7 @@ def _spread_directions(
     """
     row, column = np.divmod(np.arange(count * count), count)
     index = np.arange(count * count)
+    # one in each cell, at a point of a low-discrepancy sequence (Roberts 2018)
     x_in_cells = column + (0.5 + 0.7548777 * index) % 1.0
     y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
     x = across[0] + x_in_cells / count * (across[1] - across[0])
@@ -500,15 +506,16 @@ def _fit_occluder(
     half_width = float(np.hypot(points[:, 1], points[:, 2]).max())
     near = max(near, 3.0 * MIN_CAMERA_DISTANCE)
     for _ in range(200):
-        nearest = MIN_CAMERA_DISTANCE + size * front
-        squared_reach = near * near - (size * half_width) ** 2
-        farthest = 0.0
-        if squared_reach > 0.0:
-            farthest = math.sqrt(squared_reach) - size * back
-        if farthest >= nearest:
+        min_distance = MIN_CAMERA_DISTANCE + size * front
+        # The back corners lie on a sphere of radius `near` around the camera.
+        squared_back_distance = near * near - (size * half_width) ** 2
+        max_distance = 0.0
+        if squared_back_distance > 0.0:
+            max_distance = math.sqrt(squared_back_distance) - size * back
+        if max_distance >= min_distance:
             break
         size *= 0.95
-    return size, min(max(distance, nearest), farthest)
+    return size, min(max(distance, min_distance), max_distance)
 
 
 def _to_facing_camera(
@@ -532,25 +539,28 @@ def _rotate_pair(first: Tensor, second: Tensor, angle: float) -> tuple[Tensor, T
     return cosine * first + sine * second, cosine * second - sine * first
 
 
-def _compute_pose(camera: Tensor, placed: Placement, values: Values) -> Tensor:
+def _compute_pose(camera: Tensor, placement: Placement, values: Values) -> Tensor:
     """Return the occluder's pose (4, 4).
 
     Differentiable in the camera, the direction and the turn, at the angle of the
     placement; nothing else has a derivative here, which is why the control is
     differentiated by differences.
     """
-    right, up, forward = torch.from_numpy(placed.axes).to(camera)
+    right, up, forward = torch.from_numpy(placement.axes).to(camera)
     direction = torch.deg2rad(values["direction"])
-    # of the image: towards the occluder, and at a right angle
+    # in the image: towards the occluder, and at a right angle to that
     outwards = torch.cos(direction) * right + torch.sin(direction) * up
     sideways = -torch.sin(direction) * right + torch.cos(direction) * up
-    to_occluder, outwards = _rotate_pair(forward, outwards, placed.angle)
+    to_occluder, outwards = _rotate_pair(forward, outwards, placement.angle)
+    # right and up as seen by a camera that looks at the occluder
     right = torch.cos(direction) * outwards - torch.sin(direction) * sideways
     up = torch.sin(direction) * outwards + torch.cos(direction) * sideways
+    # axes of the occluder, whose front (x) is towards the camera before it is turned
     turn = torch.deg2rad(values["turn"])
     x = -torch.cos(turn) * to_occluder + torch.sin(turn) * right
     y = torch.sin(turn) * to_occluder + torch.cos(turn) * right
+    # a sensor's own x axis points to the left
     to_world = camera[:3, :3] * torch.tensor([-1.0, 1.0, 1.0]).to(camera)
-    linear = placed.size * to_world @ torch.stack([x, y, up], dim=1)
-    center = camera[:3, 3] + placed.distance * (to_world @ to_occluder)
+    linear = placement.size * to_world @ torch.stack([x, y, up], dim=1)
+    center = camera[:3, 3] + placement.distance * (to_world @ to_occluder)
     return geometry.make_affine(linear, center)

@@ -133,59 +133,68 @@ def _find_window(
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """A thing that moves sideways past another, both as the camera sees them."""
+    """An occluder that moves sideways past a target, both as the camera sees them.
 
-    hidden: (
-        assets.Float64Array
-    )  # directions (N, 3) in which what is to be hidden is seen
-    cover: Silhouette  # of the moving thing, straight ahead of the camera
-    # (3, 3) rows: where its right, up and forward point when it is in the middle of the
-    # other
+    Attributes:
+        hidden: (N, 3) unit directions in which the target is visible.
+        cover: silhouette of the occluder, straight ahead of the camera.
+        axes: (3, 3) rows right, up and forward of a camera that looks at the center of
+            the target.
+        direction: side that the occluder comes from, degrees: 0 is the right of the
+            image, 90 the top.
+    """
+
+    hidden: assets.Float64Array
+    cover: Silhouette
     axes: assets.Float64Array
-    # from which side it comes: degrees, 0 from the right of the picture, 90 from above
     direction: float
 
     def compute_coverage(self, angles: assets.Float64Array) -> assets.Float64Array:
-        """Return the hidden fraction (K,) at angles (K,) in radians from the middle."""
+        """Return the hidden fraction (K,) at angles (K,) in radians from the center.
+
+        The directions of the target are turned by each angle instead of the occluder,
+        and looked up in its silhouette.
+        """
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
         outwards = math.cos(turn) * right + math.sin(turn) * up
         sideways = -math.sin(turn) * right + math.cos(turn) * up
         fractions = []
         for angle in angles:
-            moved = outwards * math.cos(angle) - forward * math.sin(angle)
+            turned_outwards = outwards * math.cos(angle) - forward * math.sin(angle)
             depth = outwards * math.sin(angle) + forward * math.cos(angle)
-            x = math.cos(turn) * moved - math.sin(turn) * sideways
-            y = math.sin(turn) * moved + math.cos(turn) * sideways
+            x = math.cos(turn) * turned_outwards - math.sin(turn) * sideways
+            y = math.sin(turn) * turned_outwards + math.cos(turn) * sideways
             fractions.append(float(self.cover.contains(x, y, depth).mean()))
         return np.array(fractions)
 
     def find_angle(self, fraction: float, outside: float) -> float:
         """Find the largest angle at which a fraction is hidden, by bisection.
 
-        The thing comes in from outside, and stops where it first hides as much. If it
-        never does, the angle at which it hides most is returned.
+        The occluder comes in from outside, and stops where it first hides as much. If
+        it never does, the angle at which it hides most is returned.
 
         Args:
-            fraction: the fraction.
-            outside: angle at which it is outside of the image, radians.
+            fraction: of the target.
+            outside: angle at which the occluder is outside of the image, radians.
         """
         angles = np.linspace(outside, 0.0, N_SCAN_ANGLES)
         fractions = self.compute_coverage(angles)
-        enough = np.nonzero(fractions >= fraction)[0]
-        if len(enough) == 0:
+        sufficient = np.nonzero(fractions >= fraction)[0]
+        if len(sufficient) == 0:
             return float(angles[int(np.argmax(fractions))])
-        if enough[0] == 0:
+        first = int(sufficient[0])
+        if first == 0:
             return float(angles[0])
-        too_far = float(angles[enough[0] - 1])
-        close_enough = float(angles[enough[0]])
+        outer_angle = float(angles[first - 1])  # hides too little
+        inner_angle = float(angles[first])  # hides enough
         for _ in range(N_BISECTIONS):
-            middle = 0.5 * (too_far + close_enough)
+            middle = 0.5 * (outer_angle + inner_angle)
             if float(self.compute_coverage(np.array([middle]))[0]) >= fraction:
-                close_enough = middle
+                inner_angle = middle
             else:
-                too_far = middle
-        return 0.5 * (too_far + close_enough)
+                outer_angle = middle
+        return 0.5 * (outer_angle + inner_angle)
 
 
 def spread_directions(frame: geometry.Frame) -> assets.Float64Array:
@@ -215,25 +224,30 @@ def find_angle_outside(
     axes: assets.Float64Array,
     direction: float,
 ) -> float:
-    """Return the angle in radians beyond which a thing is out of the image on its side.
+    """Return the angle in radians beyond which an occluder is out of the image on its
+    side.
+
+    Angles are scanned from outside; the result is the last before the occluder covers
+    any direction of the image.
 
     Args:
         directions: (N, 3) directions spread over the full image.
         rim: (M, 3) directions at the edge of the image.
-        cover: the thing, as of `Passage`.
+        cover: silhouette of the occluder, as of `Passage`.
         axes: as of `Passage`.
-        direction: from which it comes, as of `Passage`.
+        direction: side that it comes from, as of `Passage`.
     """
     corners = cover.window.corners()
-    radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
-    reach = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
-    farthest = min(reach + radius + 0.02, 0.9 * math.pi)
-    angles = np.linspace(farthest, 0.0, 2 * N_SCAN_ANGLES)
-    covered = Passage(directions, cover, axes, direction).compute_coverage(angles)
-    inside = np.nonzero(covered > 0.0)[0]
-    if not len(inside):
+    occluder_radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
+    image_radius = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
+    # a little beyond the edge; never behind the camera
+    max_angle = min(image_radius + occluder_radius + 0.02, 0.9 * math.pi)
+    angles = np.linspace(max_angle, 0.0, 2 * N_SCAN_ANGLES)
+    coverage = Passage(directions, cover, axes, direction).compute_coverage(angles)
+    is_inside = np.nonzero(coverage > 0.0)[0]
+    if not len(is_inside):
         return float(angles[0])
-    return float(angles[max(int(inside[0]) - 1, 0)])
+    return float(angles[max(int(is_inside[0]) - 1, 0)])
 
 
 def _unit(vectors: assets.Float64Array) -> assets.Float64Array:

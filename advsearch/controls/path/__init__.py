@@ -68,8 +68,7 @@ DEFAULT_REACH = 4.0
 DEFAULT_SECONDS = 10.0
 MIN_SECONDS = 1e-3  # seconds between waypoints at least, and of a path at most
 MAX_SECONDS = 3600.0
-# share of the least time between waypoints that may be lost where times are written in
-# decimals
+# tolerance of `MIN_SECONDS`, as a fraction, for times that were rounded to decimals
 ROUNDING_FRACTION = 1e-3
 # object sizes from the camera to what it looks at, at least: nearer, it looks nowhere
 MIN_TARGET_DISTANCE = 1e-3
@@ -138,7 +137,7 @@ class Waypoints:
         quaternion = self.interpolate(time, self.rotations)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         entries = torch.stack(
-            geometry.rotation_entries(*quaternion.unbind(dim=-1)), dim=-1
+            geometry.compute_rotation_entries(*quaternion.unbind(dim=-1)), dim=-1
         )
         return entries.reshape(*entries.shape[:-1], 3, 3)
 
@@ -161,7 +160,14 @@ MovementByMover = Mapping[
 
 
 class PathControl(Control):
-    """The camera, the object or both travel along a path; a frame is a time."""
+    """The camera, the object or both travel along a path; a frame is a time.
+
+    Attributes:
+        seconds: how long the path takes; of several, the longest.
+        _paths: of each path, what each mover does.
+        _movers: what moves on any path: camera, object or both.
+        _files: the movements that were read from files.
+    """
 
     kind = "path"
     travels = True
@@ -251,7 +257,7 @@ class PathControl(Control):
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the time, and of several paths which it is."""
+        """Return the time, and if there are several paths, the choice among them."""
         if not isinstance(settings, Mapping):
             return cls.parameters
         names = _split_paths(settings.get("path", APPROACH))
@@ -263,7 +269,11 @@ class PathControl(Control):
         return (*cls.parameters, choice)
 
     def check_choices(self) -> None:
-        """Read the paths, and check the choices that go with them."""
+        """Read the paths, and check the choices that go with them.
+
+        Files state their times; so `seconds` must not be set beside one with times, nor
+        `reach` if all paths are files.
+        """
         names = _split_paths(self.chosen["path"])
         if len(set(names)) < len(names) or len(names) > MAX_PATHS:
             raise InputError(
@@ -308,13 +318,16 @@ class PathControl(Control):
             )
 
     def _read_path(self, name: str) -> MovementByMover:
-        """Return what the path of a name makes of camera and object."""
+        """Return what camera and object do on the path of a name.
+
+        A name with a "+" has a path for each; any other is one for what `moves`.
+        """
         names = [name]
         both = name.split(MOVER_SEPARATOR)
         if len(both) == 2 and all(map(_is_path, both)):
             names = both
-        alone = len(names) == 1
-        if alone and not _is_path(name):
+        is_single = len(names) == 1
+        if is_single and not _is_path(name):
             raise InputError(
                 f"{self.name}.path: expected {', '.join(PATHS)}, a "
                 f"{' or '.join(PATH_ENDINGS)} file, or two of them as "
@@ -322,13 +335,14 @@ class PathControl(Control):
                 "object's, got "
                 f"{name!r}"
             )
-        movers = [str(self.chosen["moves"])] if alone else MOVERS
+        movers = [str(self.chosen["moves"])] if is_single else MOVERS
         movements: dict[str, Movement] = {}
         for mover, path_name in zip(movers, names, strict=True):
             if path_name in PATHS:
                 movements[mover] = path_name
             else:
-                movements |= self._read_file(Path(path_name), mover, alone)
+                # a file about the camera may have the object's movement too
+                movements |= self._read_file(Path(path_name), mover, is_single)
         return movements
 
     def _check_needless(self) -> None:
@@ -357,12 +371,15 @@ class PathControl(Control):
                 f"[20, 0, 0], got {position!r}"
             )
 
-    def _read_file(self, path: Path, mover: str, alone: bool) -> MovementByMover:
-        """Read the file of a path: a trajectory, or a table of waypoints."""
+    def _read_file(self, path: Path, mover: str, is_single: bool) -> MovementByMover:
+        """Read the file of a path: a trajectory, or a table of waypoints.
+
+        `is_single` is whether the file may also state what the object does.
+        """
         text = _read_text(path)
         trajectory = read_trajectory(path, text)
         if trajectory is None:
-            return read_waypoints(path, mover, text=text, is_single_path=alone)
+            return read_waypoints(path, mover, text=text, is_single_path=is_single)
         if mover != CAMERA:
             raise errors.FileFormatError(
                 f"{path}: {trajectory.format.value} is about the camera, and here the "
@@ -417,7 +434,11 @@ class PathControl(Control):
     def _times_of(
         self, trajectory: Trajectory, assumed: dict[str, str]
     ) -> assets.Float64Array:
-        """Return the times (n,) of a trajectory, in seconds; note what is assumed."""
+        """Return the times (n,) of a trajectory, in seconds.
+
+        KITTI's poses have none: they are spread evenly over `seconds`, or come at
+        KITTI's rate, which is added to `assumed`.
+        """
         if trajectory.times is not None:
             return trajectory.times
         count = len(trajectory.positions)
@@ -433,7 +454,9 @@ class PathControl(Control):
     def _orient(
         self, path: Path, trajectory: Trajectory, assumed: dict[str, str]
     ) -> tuple[assets.Float64Array, Rotation | None]:
-        """Return positions and rotations as `Trajectory.orient`; note what is assumed.
+        """Return positions and rotations as `Trajectory.orient` does.
+
+        Choices that the user left out are added to `assumed`, with their values.
 
         Raises:
             InputError: axes are set for a file without rotations.
@@ -463,11 +486,11 @@ class PathControl(Control):
         return positions, rotations
 
     def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        # whatever else is asked for
-        if (
-            parameter.name == Control.PATH_PARAMETER
-            and Control.PATH_PARAMETER not in self.specs
-        ):
+        """Return the spec of a parameter; the choice among paths is always searched,
+        unless the user fixed it.
+        """
+        is_path_choice = parameter.name == Control.PATH_PARAMETER
+        if is_path_choice and parameter.name not in self.specs:
             return OneOf(parameter.options)
         return super().get_spec(parameter)
 
@@ -500,12 +523,19 @@ class PathControl(Control):
                 f"its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by 'orbit'"
             )
+        photograph = scene.backdrop_photograph
+        if CAMERA in self._movers and photograph is not None:
+            raise InputError(
+                f"`controls` {self.name} and `backdrop={photograph.spec}` contradict "
+                "each other: the photograph was taken from one place; give "
+                "moves=object, or leave one of the two out"
+            )
         self._check_needless()
         in_scene = self.with_scene(scene)
         names = _split_paths(self.chosen["path"])
         for name, movements in zip(names, self._paths, strict=True):
             if CAMERA in movements:
-                in_scene._check_looks(name, movements)
+                in_scene._check_camera_off_target(name, movements)
         notes = [note for waypoints in self._files for note in waypoints.notes]
         durations = [float(waypoints.times[-1]) for waypoints in self._files]
         shortest = min(durations, default=self.seconds)
@@ -521,38 +551,34 @@ class PathControl(Control):
         remarks = tuple(dict.fromkeys((*scene.remarks, *notes)))
         return replace(scene, remarks=remarks)
 
-    def _check_looks(self, name: str, movements: MovementByMover) -> None:
+    def _check_camera_off_target(self, name: str, movements: MovementByMover) -> None:
         """Check that the camera is never at what it looks at, also between waypoints.
 
-        Raises InputError: it is.
+        The way is taken as straight between the checked times.
+
+        Raises:
+            InputError: it is at some time.
         """
-        files = [
+        waypoint_times = [
             movement.times
             for movement in movements.values()
             if isinstance(movement, Waypoints)
         ]
-        time = torch.cat(
-            [torch.linspace(0.0, self.seconds, N_CHECKED_TIMES), *files]
-        ).unique()
-        begin = get_start_poses(self.scene, time.device)
-        shift, _ = self._shift_object(movements, begin, time)
-        position, target = self._position_camera(movements, begin, time, shift)
-        gap = (target - position).expand(len(time), 3).double()
-        step = gap[1:] - gap[:-1]
-        # of each step, where the gap is smallest
-        fraction = -(gap[:-1] * step).sum(dim=1) / step.square().sum(dim=1).clamp_min(
-            1e-300
-        )
-        fraction = fraction.clamp(0.0, 1.0)
-        distance = (gap[:-1] + fraction[:, None] * step).norm(dim=1)
+        even_times = torch.linspace(0.0, self.seconds, N_CHECKED_TIMES)
+        times = torch.cat([even_times, *waypoint_times]).unique()  # (n,) ascending
+        start = get_start_poses(self.scene, times.device)
+        shift, _ = self._shift_object(movements, start, times)
+        position, target = self._position_camera(movements, start, times, shift)
+        to_target = (target - position).expand(len(times), 3).double()
+        fraction, distance = _find_closest_to_origin(to_target)
         if float(distance.min()) < MIN_TARGET_DISTANCE:
             index = int(distance.argmin())
-            seconds = float(
-                torch.lerp(time[index], time[index + 1], fraction[index].float())
+            collision_time = float(
+                torch.lerp(times[index], times[index + 1], fraction[index].float())
             )
             raise InputError(
-                f"`controls` {self.name}: {name}: {seconds:.4g} s after its start the "
-                "camera is where it "
+                f"`controls` {self.name}: {name}: {collision_time:.4g} s after its "
+                "start the camera is where it "
                 "looks, so that it has no direction; lead it past that place, or say "
                 "what it looks at (look_x, look_y, "
                 "look_z)"
@@ -562,14 +588,14 @@ class PathControl(Control):
         """Return the time, with the path's range, and the clean time as its default."""
         if parameter.name == Control.PATH_PARAMETER:
             return parameter
-        first, *last = self._paths[0].values()
-        # who goes around is back at the end
-        movement = last[0] if last and first == ORBIT else first
-        clean_time = (
-            CLEAN_TIME_FRACTION.get(movement, 0.0) * self.seconds
-            if isinstance(movement, str)
-            else 0.0
-        )
+        # The clean time is that of the first path's first movement. If that is an
+        # orbit, it is that of the second: after an orbit the first is where it began.
+        movement, *other_movements = self._paths[0].values()
+        if other_movements and movement == ORBIT:
+            movement = other_movements[0]
+        clean_time = 0.0
+        if isinstance(movement, str):
+            clean_time = CLEAN_TIME_FRACTION.get(movement, 0.0) * self.seconds
         estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
         return replace(
             parameter,
@@ -627,6 +653,9 @@ class PathControl(Control):
         )
 
     def _camera_distance(self, movements: MovementByMover, time: Tensor) -> Tensor:
+        """Return the distance of the camera from the object, in metres if the object's
+        size is known, at times (...,).
+        """
         start = get_start_poses(self.scene, time.device)
         shift, _ = self._shift_object(movements, start, time)
         position, _ = self._position_camera(movements, start, time, shift)
@@ -635,6 +664,7 @@ class PathControl(Control):
         return distance
 
     def _select_movements(self, values: Values) -> MovementByMover:
+        """Return what camera and object do on the path of a configuration."""
         if Control.PATH_PARAMETER in values:
             return self._paths[int(values[Control.PATH_PARAMETER])]
         return self._paths[0]
@@ -650,9 +680,12 @@ class PathControl(Control):
 
         That is the object, which is shifted, unless a file says something else.
 
+        A named path: approach comes straight ahead to where the camera stands, pass
+        goes straight past it from left to right, orbit goes once around the object.
+
         Args:
-            ways: what camera and object do.
-            begin: the scene as it is described.
+            movements: what camera and object do.
+            scene_start: the scene as it is described.
             time: (...,) seconds.
             shift: (..., 3) of the object.
 
@@ -699,8 +732,12 @@ class PathControl(Control):
     def _shift_object(
         self, movements: MovementByMover, scene_start: Start, time: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return how far the object is shifted, and the degrees that it is turned
-        by.
+        """Return how far the object is shifted, (..., 3) object sizes, and the degrees
+        (...,) that it is turned by.
+
+        A named path: approach comes level towards the camera to where the object
+        stands, pass goes past that place from right to left, orbit turns the object
+        once on the spot.
         """
         camera = scene_start.camera
         movement = movements.get(OBJECT)
@@ -737,9 +774,28 @@ def get_start_poses(scene: SceneDescription, device: torch.device) -> Start:
 
 
 def _level_direction(direction: Tensor) -> Tensor:
-    """Return the level direction (3,) of one: what travels keeps its height."""
-    flat = torch.stack([direction[0], direction[1], direction.new_zeros(())])
-    return torch.as_tensor(flat / flat.norm().clamp_min(1e-6))
+    """Return the unit vector (3,) of a direction without its vertical part; zero for a
+    vertical one.
+    """
+    level = torch.stack([direction[0], direction[1], direction.new_zeros(())])
+    return torch.as_tensor(level / level.norm().clamp_min(1e-6))
+
+
+def _find_closest_to_origin(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Find where the segments of a polyline are closest to the origin.
+
+    Args:
+        points: (n, 3) of the polyline.
+
+    Returns:
+        Of each segment the position from 0 to 1 along it, and the distance there, both
+            (n - 1,).
+    """
+    delta = points[1:] - points[:-1]
+    # not 0, for segments without a length
+    squared_length = delta.square().sum(dim=1).clamp_min(1e-300)
+    fraction = (-(points[:-1] * delta).sum(dim=1) / squared_length).clamp(0.0, 1.0)
+    return fraction, (points[:-1] + fraction[:, None] * delta).norm(dim=1)
 
 
 def _turn_about_vertical(offset: Tensor, turns: Tensor) -> Tensor:
@@ -762,10 +818,11 @@ def make_look_at_pose(position: Tensor, target: Tensor, roll: float) -> Tensor:
         roll: degrees.
     """
     ahead = (target - position) / (target - position).norm().clamp_min(1e-9)
-    level = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
-    # where it looks straight up or down
-    aside = torch.tensor([0.0, 1.0, 0.0]).to(ahead)
-    left = torch.where(level.norm() > 1e-6, level / level.norm().clamp_min(1e-6), aside)
+    level_left = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
+    length = level_left.norm()
+    # for a camera that looks straight up or down, every level direction is to the left
+    default_left = torch.tensor([0.0, 1.0, 0.0]).to(ahead)
+    left = torch.where(length > 1e-6, level_left / length.clamp_min(1e-6), default_left)
     return _roll_camera(position, left, torch.linalg.cross(ahead, left), ahead, roll)
 
 
@@ -784,6 +841,10 @@ def make_camera_pose(position: Tensor, rotation: Tensor, roll: float) -> Tensor:
 def _roll_camera(
     position: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float
 ) -> Tensor:
+    """Return the pose (4, 4) of a camera turned by degrees about where it looks.
+
+    All others are (3,), three unit vectors at right angles among them.
+    """
     cos = math.cos(math.radians(roll))
     sin = math.sin(math.radians(roll))
     return geometry.make_affine(
@@ -799,12 +860,15 @@ def measure_tilt(rotations: Rotation) -> float:
 
 
 def align_quaternions(quaternions: assets.Float64Array) -> assets.Float64Array:
-    """Return quaternions (n, 4) whose signs do not change from one to the next.
+    """Return quaternions (n, 4) with signs by which each is nearer to the one before
+    than its negative is, so that they can be interpolated.
 
-    Each is nearer to the one before than its opposite is.
+    A quaternion and its negative are the same rotation.
     """
-    turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
-    signs = np.where(np.cumsum(np.concatenate([[False], turns_back])) % 2, -1.0, 1.0)
+    is_opposite = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
+    # the sign changes at each opposite pair, and stays changed
+    n_changes = np.cumsum(np.concatenate([[False], is_opposite]))
+    signs = np.where(n_changes % 2, -1.0, 1.0)
     return np.asarray(quaternions * signs[:, None])
 
 
@@ -847,10 +911,12 @@ def make_object_pose(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
 def unwrap_headings(
     degrees: assets.Float64Array,
 ) -> tuple[assets.Float64Array, str | None]:
-    """Return headings (n,) that go to the next one the shorter way round, and a note.
+    """Return headings (n,) of which each goes to the next the shorter way round, and a
+    note.
 
-    Only where all are within one turn, from 0 to 360 or from -180 to 180: others count
-    on, as 0 to 360 does for a whole turn. The note is None where nothing changes.
+    Only headings within one turn are changed, those all in [0, 360] or in [-180, 180]
+    that do not span a full turn: others are counted on by the file itself. The note is
+    None if nothing changes.
     """
     low = float(degrees.min())
     high = float(degrees.max())

@@ -123,30 +123,37 @@ class Trajectory:
 def read_trajectory(path: Path, text: str) -> Trajectory | None:
     """Read the poses in the text of a file; None if it is in none of the formats.
 
-    Raises FileFormatError: rows of different lengths, numbers that are not finite,
-    quaternions that are not of length 1, matrices that are no rotations, or a table of
-    numbers whose columns are not known.
+    The lines before the first row of numbers may be headers, also as comments ("#");
+    the last one with the columns of a trajectory counts. Without a header, rows of 8
+    numbers are TUM's and rows of 12 are KITTI's. A table with another header is None: a
+    table of waypoints, for example.
+
+    Raises:
+        FileFormatError: rows of different lengths, numbers that are not finite,
+            quaternions that are not of length 1, matrices that are no rotations, or a
+            table of numbers whose columns are not known.
     """
     lines = [line.strip() for line in text.splitlines()]
     lines = [line for line in lines if line]
-    first = next((row for row, line in enumerate(lines) if _is_row(line)), None)
-    if first is None:
+    first_row = next((index for index, line in enumerate(lines) if _is_row(line)), None)
+    if first_row is None:
         return None
-    leading = [_split(line.lstrip("#").strip()) for line in lines[:first]]
-    is_waypoint_table = any(
-        WAYPOINT_COLUMNS <= set(names) for names in leading
-    ) and not any(map(_find_columns, leading))
-    rows = [_split(line) for line in lines[first:] if not line.startswith("#")]
+    has_commas = "," in lines[first_row]
+    leading = [_split(line.lstrip("#").strip()) for line in lines[:first_row]]
     headers = [names for names in leading if _find_columns(names)]
-    if is_waypoint_table or (not headers and "," in lines[first] and leading):
-        return None  # a table with a head of another kind
+    has_waypoint_header = any(WAYPOINT_COLUMNS <= set(names) for names in leading)
+    is_waypoint_table = has_waypoint_header and not headers
+    rows = [_split(line) for line in lines[first_row:] if not line.startswith("#")]
+    has_unknown_header = not headers and has_commas and bool(leading)
+    if is_waypoint_table or has_unknown_header:
+        return None
     if len(rows) > MAX_ROWS:
         raise errors.FileFormatError(
             f"{path}: expected 2 to {MAX_ROWS} waypoints, got {len(rows)}"
         )
     if headers:
-        return _read_named_columns(path, headers[-1], rows, "," in lines[first])
-    if "," in lines[first]:
+        return _read_named_columns(path, headers[-1], rows, has_commas)
+    if has_commas:
         raise errors.FileFormatError(
             f"{path}: expected a first line that names the columns, got numbers; add "
             "time,x,y,z, or that of EuRoC's "
@@ -181,10 +188,11 @@ def _is_row(line: str) -> bool:
 
 
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Return the columns by our names for them; nothing if it is no such table.
+    """Return the index of each column of a trajectory by our names for them.
 
-    It needs a time, a position, and either a quaternion or a name that only these
-    formats have.
+    These are time, x, y, z, and perhaps qx, qy, qz and qw. Empty if it is no such
+    table: one that lacks a time, a position or a part of a quaternion, has a column
+    twice, or is a table of waypoints.
     """
     if not 4 <= len(names) <= MAX_COLUMNS:
         return {}
@@ -203,9 +211,8 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
             return {}
         columns[column] = index
     has_quaternion = set(QUATERNION) <= set(columns)
-    if not {"time", *POSITION} <= set(columns) or (
-        not has_quaternion and set(QUATERNION) & set(columns)
-    ):
+    has_part_of_quaternion = not has_quaternion and set(QUATERNION) & set(columns)
+    if has_part_of_quaternion or not {"time", *POSITION} <= set(columns):
         return {}
     is_waypoint_table = not has_quaternion and WAYPOINT_COLUMNS <= set(names)
     return {} if is_waypoint_table else columns

@@ -215,11 +215,10 @@ class ProjectorControl(PictureControl):
         """Check that pattern, picture and ball go together. Raises InputError."""
         pattern = self._settings.get("pattern")
         picture = self.chosen["picture"]
-        if (
-            pattern is not None and [*pattern] != [0.0, 1.0]
-            if isinstance(pattern, (list, tuple))
-            else pattern
-        ):
+        # a pattern may be left out, be False or 0, or be its full range
+        is_full_range = isinstance(pattern, (list, tuple)) and [*pattern] == [0.0, 1.0]
+        is_empty_list = isinstance(pattern, (list, tuple)) and not pattern
+        if is_empty_list or (pattern and not is_full_range):
             raise InputError(
                 f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; "
                 f"a file is {self.name}.picture, "
@@ -247,94 +246,74 @@ class ProjectorControl(PictureControl):
     # ---- in a scene
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Add the projector, with an angle that covers the object."""
+        """Add the projector, and a remark if the place's brightness has no unit.
+
+        By default its field of view covers the object from where the projector stands
+        at the start, 150 degrees at most.
+        """
         picture = self.read_picture()
-        rows = int(self.chosen["resolution"]) if picture is None else len(picture)
-        columns = (
-            max(2, round(rows * self.chosen["aspect"]))
-            if picture is None
-            else picture.shape[1]
-        )
+        if picture is None:
+            rows = int(self.chosen["resolution"])
+            columns = max(2, round(rows * self.chosen["aspect"]))
+        else:
+            rows, columns = picture.shape[:2]
         fov = self.chosen["fov"]
-        # with which the picture covers the object from where it stands at the start
         if fov is None:
-            farthest = float(
-                np.linalg.norm(
-                    scene.base_vertices - geometry.compute_center(scene), axis=1
-                ).max()
-            )
-            reach = farthest * max(1.0, columns / rows) * scene.metres
-            fov = min(
-                math.degrees(
-                    2.0 * math.atan(reach / self.with_scene(scene)._start_distance())
-                ),
-                150.0,
-            )
+            offsets = scene.base_vertices - geometry.compute_center(scene)
+            object_radius = float(np.linalg.norm(offsets, axis=1).max())
+            half_width = object_radius * max(1.0, columns / rows) * scene.metres
+            distance = self.with_scene(scene)._start_distance()
+            fov = min(math.degrees(2.0 * math.atan(half_width / distance)), 150.0)
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
-        if scene.environment is None or scene.environment.candelas is None:
+        has_unit = (
+            scene.environment is not None and scene.environment.candelas is not None
+        )
+        if not has_unit and "ambient" not in self.specs:
             note = (
                 "The place's brightness has no unit: its light is taken for "
                 f"{DEFAULT_AMBIENT_LUX:g} lux; "
                 f"{self.name}.ambient says otherwise."
             )
-            scene = (
-                scene
-                if "ambient" in self.specs
-                else replace(scene, remarks=(*scene.remarks, note))
-            )
+            scene = replace(scene, remarks=(*scene.remarks, note))
         return scene.with_part(part)
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter with its default beside the scene's camera, in its
-        light.
+        """Return a parameter with its default in this scene.
+
+        The projector stands beside the scene's camera, as far away and as high. The
+        ambient light is the environment's, if that has a unit. The light is
+        `DEFAULT_LUMENS`, or less if that is too bright for the ambient light.
         """
         parameter = super().resolve_parameter(parameter)
         scene = self.scene
-        camera_offset = geometry.camera_to_world(scene)[
-            :3, 3
-        ] - geometry.compute_center(scene)
+        camera_position = geometry.camera_to_world(scene)[:3, 3]
+        camera_offset = camera_position - geometry.compute_center(scene)
         camera_distance = float(np.linalg.norm(camera_offset))
         match parameter.name:
             case "pattern":
-                return replace(
-                    parameter,
-                    default=START_GREY if self.chosen["start"] == "grey" else 0.0,
-                )
+                grey = START_GREY if self.chosen["start"] == "grey" else 0.0
+                return replace(parameter, default=grey)
             case "ambient":
-                candelas = (
-                    None if scene.environment is None else scene.environment.candelas
-                )
-                lux = (
-                    DEFAULT_AMBIENT_LUX
-                    if candelas is None
-                    else min(max(candelas * scene.metered_irradiance, 1e-3), 2e5)
-                )
+                lux = DEFAULT_AMBIENT_LUX
+                environment = scene.environment
+                if environment is not None and environment.candelas is not None:
+                    lux = environment.candelas * scene.metered_irradiance
+                    lux = min(max(lux, 1e-3), 2e5)  # the parameter's range
                 return replace(parameter, default=lux)
             case "lumens":
-                bright = (
+                max_lumens = (
                     MAX_AMBIENT_FACTOR
                     * float(self.get_clean_value("ambient"))
                     * self.part.area
                     * self._start_distance() ** 2
                 )
-                return replace(parameter, default=min(DEFAULT_LUMENS, bright))
+                return replace(parameter, default=min(DEFAULT_LUMENS, max_lumens))
             case "azimuth":
-                return replace(
-                    parameter,
-                    default=math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
-                    + DEFAULT_CAMERA_ANGLE,
-                )
+                azimuth = math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
+                return replace(parameter, default=azimuth + DEFAULT_CAMERA_ANGLE)
             case "elevation":
-                return replace(
-                    parameter,
-                    default=min(
-                        max(
-                            math.degrees(math.asin(camera_offset[2] / camera_distance)),
-                            -89.0,
-                        ),
-                        89.0,
-                    ),
-                )
+                elevation = math.degrees(math.asin(camera_offset[2] / camera_distance))
+                return replace(parameter, default=min(max(elevation, -89.0), 89.0))
             case "distance":
                 unit = "object sizes" if scene.object.metres is None else "metres"
                 return replace(
@@ -347,11 +326,11 @@ class ProjectorControl(PictureControl):
         return self.part.sides
 
     def _start_distance(self) -> float:
-        """Return how far away it stands at the start."""
+        """Return its distance at the start, in the unit of the parameter."""
         spec = self.specs.get("distance")
-        return float(
-            spec.value if isinstance(spec, Fixed) else self.get_clean_value("distance")
-        )
+        if isinstance(spec, Fixed):
+            return float(spec.value)
+        return float(self.get_clean_value("distance"))
 
     def fit(self) -> None:
         """Find the projector in the scene, and how often it flashes."""
@@ -362,14 +341,13 @@ class ProjectorControl(PictureControl):
         )
         self._picture = self.read_picture()
         super().fit()
-        rate = next(
+        flicker = next(
             slot.spec for slot in self.slots if slot.parameter.name == "flicker"
         )
-        self.flashes = (
-            rate.high
-            if isinstance(rate, Range)
-            else max(map(float, self.list_allowed_values("flicker", 0.0)))
-        )
+        if isinstance(flicker, Range):
+            self.flashes = flicker.high
+        else:
+            self.flashes = max(map(float, self.list_allowed_values("flicker", 0.0)))
 
     def read_picture(self) -> Tensor | None:
         picture = super().read_picture()
@@ -401,16 +379,21 @@ class ProjectorControl(PictureControl):
     # ---- at a configuration
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the values by parameter; the pattern is rounded to 8 bits, with the
+        derivative of the identity.
+        """
         values = super().values(u)
         pattern = values["pattern"]
-        # a projector gets 8 bits
         rounded = pattern + (images.round_to_8_bit(pattern.detach()) - pattern.detach())
         return values | {"pattern": rounded}
 
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the projector's pose and its light."""
+        """Return the projector's pose and its light, which is 0 while it flashes off.
+
+        The light is radiance of the scene at a distance of one unit.
+        """
         pose_arguments = (
             float(values[name].detach())
             for name in ("azimuth", "elevation", "distance")
@@ -422,20 +405,20 @@ class ProjectorControl(PictureControl):
         rate = float(values["flicker"].detach())
         phase = float(values["phase"].detach()) / 360.0
         if rate and (rate * self._time_shift + phase) % 1.0 >= DUTY_CYCLE:
-            light = 0.0 * light
-        at_unit_distance = (
-            self._relative_to_ambient(values)
-            * (values["distance"].detach() / self.scene.metres) ** 2
-        )
-        white = at_unit_distance * self.scene.metered_irradiance / math.pi
+            light = 0.0 * light  # still depends on the pattern, for its derivative
+        distance_in_units = values["distance"].detach() / self.scene.metres
+        # times the ambient light, at a distance of one unit
+        brightness = self._relative_to_ambient(values) * distance_in_units**2
+        white = brightness * self.scene.metered_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
 
     def project_light(self, values: Values) -> Tensor:
-        """Return the picture (h, w, 3) as it is thrown, of white, linear."""
-        light = (
-            color.srgb_to_linear(values["pattern"]) * (1.0 - values["black"])
-            + values["black"]
-        )
+        """Return the image (h, w, 3) as it is thrown, linear, as fractions of white.
+
+        Black texels throw the light of `black`, and the image is out of focus.
+        """
+        pattern = color.srgb_to_linear(values["pattern"])
+        light = pattern * (1.0 - values["black"]) + values["black"]
         return blur_light(light, values["blur"])
 
     def _lux(self, values: Values) -> Tensor:
@@ -443,6 +426,7 @@ class ProjectorControl(PictureControl):
         return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
 
     def _relative_to_ambient(self, values: Values) -> Tensor:
+        """Return the illuminance () of white as a multiple of the ambient light's."""
         return self._lux(values) / values["ambient"]
 
     def measured(
@@ -466,33 +450,33 @@ class ProjectorControl(PictureControl):
     ) -> dict[str, Tensor]:
         """Return the pattern, and the pattern enlarged for printing."""
         pattern = values["pattern"]
+        print_scale = math.ceil(images.MIN_PRINT_SIDE / len(pattern))
         return {
             self.name: pattern,
-            f"{self.name}-large": images.enlarge(
-                pattern, -(-images.MIN_PRINT_SIDE // len(pattern))
-            ),
+            f"{self.name}-large": images.enlarge(pattern, print_scale),
         }
 
 
 def blur_light(light: Tensor, blur: Tensor) -> Tensor:
-    """Return a picture (h, w, 3) after a Gaussian blur of so many texels ().
+    """Return an image (h, w, 3) after a Gaussian blur; there is no light outside it.
 
-    Outside it there is no light.
+    `blur` () is the standard deviation in texels; differentiable in both.
     """
     sigma = float(blur.detach())
     if not sigma and not blur.requires_grad:
         return light
-    reach = math.ceil(3.0 * sigma) + 1
-    kernel = torch.exp(
-        -0.5 * (torch.arange(-reach, reach + 1).to(blur) / blur.clamp_min(0.1)) ** 2
-    )
+    radius = math.ceil(3.0 * sigma) + 1
+    offsets = torch.arange(-radius, radius + 1).to(blur)
+    # not 0, where the derivative is undefined; 0.1 texels blur nothing visible
+    kernel = torch.exp(-0.5 * (offsets / blur.clamp_min(0.1)) ** 2)
     kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
-    rows = functional.conv2d(
-        images.to_planes(light), kernel, padding=(0, reach), groups=3
+    blurred_rows = functional.conv2d(
+        images.to_planes(light), kernel, padding=(0, radius), groups=3
     )
-    return images.to_image(
-        functional.conv2d(rows, kernel.transpose(2, 3), padding=(reach, 0), groups=3)
+    blurred = functional.conv2d(
+        blurred_rows, kernel.transpose(2, 3), padding=(radius, 0), groups=3
     )
+    return images.to_image(blurred)
 
 
 @lru_cache(maxsize=64)

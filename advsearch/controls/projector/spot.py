@@ -139,32 +139,36 @@ class SpotControl(ProjectorControl):
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter; of the lumens, up to what is bright in the scene."""
+        """Return a parameter; lumens are searched up to what is bright in this scene.
+
+        That is `MAX_AMBIENT_FACTOR` times the ambient light, for a spot of the default
+        width. They are 0 by default; but as many if only other parameters are searched,
+        which would not show otherwise.
+        """
         if parameter.name != "lumens":
             return super().resolve_parameter(parameter)
+        std = DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.metres
         area = (
-            2.0
-            * math.pi
-            * (DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.metres) ** 2
-        )
-        # of a spot of the default width
-        bright = min(
+            2.0 * math.pi * std**2
+        )  # in which a Gaussian spot of peak 1 has its light
+        max_lumens = min(
             DEFAULT_LUMENS,
             MAX_AMBIENT_FACTOR * float(self.get_clean_value("ambient")) * area,
         )
-        return replace(
-            parameter,
-            search=(0.0, bright),
-            default=bright
-            if self.has_requested_search and not self.is_searched("lumens")
-            else 0.0,
-        )
+        default = 0.0
+        if self.has_requested_search and not self.is_searched("lumens"):
+            default = max_lumens
+        return replace(parameter, search=(0.0, max_lumens), default=default)
 
     def get_scene_value(self, parameter: Parameter) -> float | str:
         return 0.0  # of the lumens; see `amount`
 
     def project_light(self, values: Values) -> Tensor:
-        """Return the round spot (h, w, 3) as it is thrown, linear."""
+        """Return the round spot (h, w, 3) as it is thrown, linear.
+
+        It is a Gaussian in the plane through the object's center, scaled so that its
+        light does not depend on the width.
+        """
         half_width = (
             math.tan(math.radians(self.part.fov) / 2.0)
             * values["distance"].detach()
@@ -175,12 +179,13 @@ class SpotControl(ProjectorControl):
             torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half_width) * half_width
             for count in (columns, rows)
         )
-        deviation = values["width"] / WIDTH_PER_DEVIATION
+        std = values["width"] / WIDTH_PER_DEVIATION
+        # rows go downwards
         squared = (right[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
         spot = (
-            torch.exp(-0.5 * squared / deviation**2)
+            torch.exp(-0.5 * squared / std**2)
             * (2.0 * half_width) ** 2
-            / (2.0 * math.pi * deviation**2)
+            / (2.0 * math.pi * std**2)
         )
         return spot[..., None] * color.combine_channels(values)
 

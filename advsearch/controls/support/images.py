@@ -49,11 +49,10 @@ def enlarge(pixels: Tensor, factor: int) -> Tensor:
 def compress_jpeg(image: Tensor, quality: int) -> Tensor:
     """Save as a JPEG file and read it again, chroma subsampled.
 
-    The derivative is that of the unchanged picture.
-
-    For changes that are smooth over three pixels or more this is within about a third
-    of what the file does with them (measured at qualities of 7 to 25); of finer ones
-    the file keeps less than it says.
+    The derivative is that of the identity (a straight-through estimate). For changes
+    that are smooth over three pixels or more it is within about a third of what the
+    file does with them (measured at qualities of 7 to 25); of finer changes the file
+    keeps less than the derivative predicts.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
@@ -62,9 +61,9 @@ def compress_jpeg(image: Tensor, quality: int) -> Tensor:
     levels = to_uint8(image.clamp(0.0, 1.0)).cpu().numpy()
     file = io.BytesIO()
     Image.fromarray(levels).save(file, "JPEG", quality=quality)
-    with Image.open(file, formats=("JPEG",)) as read:
-        read_back = torch.from_numpy(np.asarray(read, dtype=np.float32) / 255.0)
-    return image + (read_back.to(image.device) - image).detach()
+    with Image.open(file, formats=("JPEG",)) as jpeg:
+        compressed = torch.from_numpy(np.asarray(jpeg, dtype=np.float32) / 255.0)
+    return image + (compressed.to(image.device) - image).detach()
 
 
 def to_planes(image: Tensor) -> Tensor:
@@ -90,9 +89,9 @@ def warp(image: Tensor, offsets: Tensor) -> Tensor:
     positions = torch.stack([columns, rows], dim=-1).to(image.device) + offsets.to(
         image.device
     )
-    grid = (
-        positions * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
-    )
+    # grid_sample wants positions in [-1, 1]
+    scale = torch.tensor([2.0 / width, 2.0 / height], device=image.device)
+    grid = positions * scale - 1.0
     return to_image(
         F.grid_sample(
             to_planes(image), grid[None], padding_mode="reflection", align_corners=False
@@ -126,6 +125,5 @@ def draw_noise(
     Standard normal, or uniform in [0, 1).
     """
     generator = torch.Generator().manual_seed(seeds.stream(seed, stream_name))
-    return (torch.randn if normal else torch.rand)(
-        height, width, 3, generator=generator
-    )
+    sample = torch.randn if normal else torch.rand
+    return sample(height, width, 3, generator=generator)

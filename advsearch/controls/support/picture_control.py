@@ -28,73 +28,83 @@ from advsearch.scene.settings import Parameter
 
 
 class PictureControl(Control):
-    """A control of a picture, searched or from a file, and of numbers, which are fixed
-    where they are not given.
+    """A control of an image, searched or from a file, and of numbers, which are fixed
+    at their defaults if they are not set.
 
-    Its choices are `resolution`, `picture`, `norm` ("box" for any color, "linf" or
-    "l2") and `epsilon`.
+    Its choices are `resolution`, `picture` (an image file), `norm` ("box" for any
+    color, "linf" or "l2") and `epsilon`.
+
+    Attributes:
+        image_parameter: name of the parameter that is the image.
+        default_epsilon: radius of the ball of colors if `epsilon` is not set.
+        _picture: image (H, W, 3) sRGB from the file; None if the image is searched or
+            a constant color. A subclass sets it in `fit`.
     """
 
     MAX_EPSILON: ClassVar[float] = MAX_EPSILON
-    image_parameter: ClassVar[str]  # the parameter that is the picture
-    # of colors, where none is chosen
+    image_parameter: ClassVar[str]
     default_epsilon: ClassVar[float] = DEFAULT_EPSILON
     _picture: Tensor | None
 
     @property
     def sides(self) -> tuple[int, int]:
-        """Rows and columns of the picture."""
+        """Rows and columns of the image."""
         return (int(self.chosen["resolution"]),) * 2
 
     @property
     def is_searched_image(self) -> bool:
-        """Whether the picture is searched."""
+        """Whether the image is searched: no file is set, and no constant color."""
         return self.chosen["picture"] is None and not isinstance(
             self.specs.get(self.image_parameter), Fixed
         )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        return (
-            replace(parameter, shape=(*self.sides, 3), default=0.0)
-            if parameter.name == self.image_parameter
-            else parameter
-        )
+        if parameter.name != self.image_parameter:
+            return parameter
+        return replace(parameter, shape=(*self.sides, 3), default=0.0)
 
     def get_spec(self, parameter: Parameter) -> Spec:
-        picture = Range(0.0, 1.0) if self.is_searched_image else Fixed(0.0)
-        return self.specs.get(
-            parameter.name,
-            picture
-            if parameter.name == self.image_parameter
-            else Fixed(parameter.default),
-        )
+        """Return the spec that the user set for a parameter, or the default one.
+
+        By default a searched image takes all colors, an image from a file is no
+        coordinate of the search, and a number is fixed at its default.
+        """
+        if parameter.name in self.specs:
+            return self.specs[parameter.name]
+        if parameter.name != self.image_parameter:
+            return Fixed(parameter.default)
+        return Range(0.0, 1.0) if self.is_searched_image else Fixed(0.0)
 
     def get_budget(self, parameter: Parameter) -> Budget:
+        """Return the ball that the image stays in; no limit for other parameters.
+
+        Its radius is converted from colors to fractions of the range.
+        """
         norm = self.chosen["norm"]
         if parameter.name != self.image_parameter or norm == "box":
             return FULL_RANGE
         spec = self.get_spec(parameter)
         assert isinstance(spec, Range)
         n_colors = 3 * math.prod(self.sides)
-        reach = compute_radius(
+        radius = compute_radius(
             norm, self.chosen["epsilon"], n_colors, self.default_epsilon
         )
-        return Budget(norm, reach / (spec.high - spec.low))
+        return Budget(norm, radius / (spec.high - spec.low))
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
+        """Return the values of the parameters by name; the image is (H, W, 3)."""
         values = super().values(u)
-        picture = self._picture
-        image = (
-            values[self.image_parameter].reshape(*self.sides, 3)
-            if picture is None
-            else picture.to(u.device, copy=True)
-        )
+        if self._picture is None:
+            image = values[self.image_parameter].reshape(*self.sides, 3)
+        else:
+            image = self._picture.to(u.device, copy=True)
         return values | {self.image_parameter: image}
 
     def read_picture(self) -> Tensor | None:
-        """Return the picture (h, w, 3) sRGB that was chosen; None where none was.
+        """Return the image (h, w, 3) sRGB of the `picture` file; None if none is set.
 
-        Raises FileFormatError: it cannot be read.
+        Raises:
+            FileFormatError: it cannot be read.
         """
         if self.chosen["picture"] is None:
             return None

@@ -122,22 +122,30 @@ def compare_with_reference(
     probe: Probe | None = None,
     spp: int = 0,
 ) -> Measured:
-    """Say how good an estimate is along a probe, from so many samples a pixel:
-    "reference unusable" where the reference's noise exceeds `MAX_NOISE` and doubt
-    (`N_STANDARD_ERRORS` standard errors of both) covers the error; "biased" where the
-    error of the mean exceeds `MAX_BIAS` beyond doubt; "noisy" where the noise exceeds
-    `MAX_NOISE`; otherwise "ok".
+    """Return how good an estimate is along a probe.
 
-    The size that this is relative to is the reference's, or `MIN_SIZE_FRACTION` of the
-    largest of the `others` of its control: a derivative that happens to be near zero
-    has no size of its own to speak of.
+    Its status is the first of these that holds; doubt is `N_STANDARD_ERRORS` standard
+    errors of both values together:
+
+    - "reference unusable": the reference's noise exceeds `MAX_NOISE`, and the error of
+      the mean is within doubt;
+    - "biased": the error of the mean exceeds `MAX_BIAS` by more than doubt;
+    - "noisy": the estimate's noise exceeds `MAX_NOISE`;
+    - "ok".
+
+    All are relative to a size: that of the reference, but at least `MIN_SIZE_FRACTION`
+    of the largest of `others`, since a derivative that happens to be near zero says
+    nothing about the size of errors that matter.
+
+    Args:
+        estimate: to rate.
+        reference: of the same probe.
+        others: references of the other probes of its control.
+        probe: for the names in the row; None leaves them empty.
+        spp: samples per pixel of the estimate, for the row.
     """
-    size = max(
-        [
-            abs(reference.value),
-            *(MIN_SIZE_FRACTION * abs(other.value) for other in others),
-        ]
-    )
+    min_sizes = [MIN_SIZE_FRACTION * abs(other.value) for other in others]
+    size = max([abs(reference.value), *min_sizes])
     difference = abs(estimate.value - reference.value)
     doubt = N_STANDARD_ERRORS * math.hypot(
         estimate.noise / math.sqrt(max(1, estimate.repeats)), reference.noise
@@ -177,35 +185,40 @@ def compare_with_reference(
 
 
 def list_planned(group: Group) -> list[tuple[str, float]]:
+    """Return the planned estimator of a group, with the factor 1 on its step."""
     return [(group.estimator, 1.0)]
 
 
 def list_attempts(group: Group) -> list[tuple[str, float]]:
-    """Return every estimator to measure on a group, with the multiple of the step; then
-    other steps.
+    """Return every estimator to measure on a group, with a factor on its step.
 
-    Differences of the loss and of the picture are the same for a linear loss, so that
-    wider steps are tried with one.
+    First come the estimators with the planned step, only one if it is forced. Then one
+    that takes differences, if there is any, with wider steps, as far as these differ:
+    differences of the loss and of the image are the same for a linear loss.
     """
-    forced = group.is_forced
+    if group.is_forced:
+        attempts = list_planned(group)
+    else:
+        names = select_compared(group.valid, group.size)
+        attempts = [(name, 1.0) for name in names]
+    difference_estimators = [
+        name for name in ("differences", "secant") if (name, 1.0) in attempts
+    ]
     steps = {group.step}
-    tries = (
-        list_planned(group)
-        if forced
-        else [(name, 1.0) for name in select_compared(group.valid, group.size)]
-    )
-    wide = [name for name in ("differences", "secant") if (name, 1.0) in tries][:1]
     for factor in FACTORS[1:]:
         step = min(factor * group.step, STEP_RANGE[1])
         if step not in steps:
             steps.add(step)
-            tries += [(name, factor) for name in wide]
-    return tries
+            attempts += [(name, factor) for name in difference_estimators[:1]]
+    return attempts
 
 
 def find_probes(bench: Bench) -> list[Probe]:
-    """Return what is worth measuring in a renderer's space: every continuous
-    coordinate, or a direction in many.
+    """Return the directions to measure derivatives along, for each group of coordinates
+    that is differentiated.
+
+    A small group has one for each coordinate, with its planned step; a group of more
+    than `MAX_SINGLE_PROBES` has a single direction through all of them.
     """
     probes = []
     for group in bench.renderer.plan.groups:
@@ -226,9 +239,9 @@ def find_probes(bench: Bench) -> list[Probe]:
 
 
 def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
-    """Return a direction (d,) in a group: mostly the signs of the estimator's own
-    gradient, so that there is something to see, and a share of random signs, so that
-    what the estimator leaves out shows too.
+    """Return a direction (d,) in a group: the signs of the estimator's own gradient,
+    along which the derivative is large, plus half of random signs, so that what the
+    estimator leaves out counts too. The largest element is 1.
     """
     plan = restrict_plan(bench.renderer.plan, [group.name])
     gradient = bench.compute_gradient(plan, seeds.stream(bench.seed, "probe"))[

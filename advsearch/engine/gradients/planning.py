@@ -1,8 +1,9 @@
 """Choose how gradients are computed, by measurements on the scene.
 
 - Estimators: those with the least squared error x time.
-- Steps and sample counts: the cheapest whose gradients have a cosine of `GOAL_COSINE`
-  with the converged gradient of the model's own loss (docs/gradients.md).
+- Steps (widths of finite differences) and sample counts: the cheapest whose gradients
+  have a cosine similarity of `GOAL_COSINE` with the converged gradient of the model's
+  own loss (docs/gradients.md).
 - Bounces of light: as many as change the image. Paths of other lengths with one seed
   are the same, cut off earlier.
 """
@@ -32,19 +33,20 @@ from advsearch.scene.gradients import (
 )
 from advsearch.scene.renderer import Renderer
 
-GOAL_COSINE = (
-    0.9  # cosine with the converged gradient that a working gradient should have
-)
+# Cosine similarity with the converged gradient that a gradient with a search's sample
+# count ("working gradient") should have.
+GOAL_COSINE = 0.9
 FACTORS = (1.0, 3.0, 9.0)
-"""Steps that are tried, as multiples of the plan's; the last only where no other will
-do: it smooths away all but the coarse shape of the loss.
+"""Widths of the differences that are tried, as multiples of the plan's. The last is
+tried only if no other reaches the goal: it smooths away all but the coarse shape of the
+loss.
 """
 SAMPLE_COUNTS = (8, 16, 32, 64, 128)
 ADJOINT_RENDERS = 3.0  # renders that take about as long as an adjoint
 CONVERGED_SPP = 128
 CONVERGED_SPP_FACTOR = 4
-"""Samples a pixel of a gradient that counts as converged, and times as many where these
-do not agree, or where a working gradient has more.
+"""Samples per pixel of a gradient that counts as converged; times the factor if such
+gradients do not agree, or a working gradient has more samples than they.
 """
 # converged gradients that are taken. Two of a few numbers can agree by luck.
 N_CONVERGED = 3
@@ -59,8 +61,10 @@ of the working one's, only makes the measured cosine smaller: what is called `ok
 def rate_cosine(cosine: float, agreement: float) -> GradientStatus:
     """Return whether a cosine with the converged gradient is good enough.
 
-    It is "reference unusable" where `agreement`, the smallest cosine of two converged
-    gradients, is too small to tell.
+    "ok" if it reaches the goal, "noisy" if it does not. `agreement` is the smallest
+    cosine of two converged gradients. If it is below `MIN_AGREEMENT`, or below the goal
+    where the cosine is too, the answer is "reference unusable": the fault may be the
+    converged gradient's.
     """
     if not agreement >= MIN_AGREEMENT:
         return "reference unusable"
@@ -72,9 +76,9 @@ def rate_cosine(cosine: float, agreement: float) -> GradientStatus:
 def list_comparable_sets(
     groups: Iterable[Group],
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
-    """Return sets of groups of one control that have the same valid estimators.
+    """Return sets of groups, each of one control and with the same valid estimators.
 
-    With each set come those of the estimators that are worth comparing on it.
+    With each set come those of its estimators that are worth comparing.
     """
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in groups:
@@ -166,8 +170,9 @@ def _score_estimators(
 ) -> dict[str, float]:
     """Return squared error x seconds of each estimator on groups of one control.
 
-    The reference is the mean of the differences among the estimators, whose own noise
-    is subtracted from the errors of the others.
+    The reference is the mean gradient of the estimator that takes finite differences,
+    whose own noise is subtracted from the errors of the others. If `counted`, the
+    number of renders stands for the seconds.
     """
     group_names = {group.name for group in groups}
     gradients_of = dict[str, Tensor]()
@@ -182,11 +187,12 @@ def _score_estimators(
             adjoint_renders = (
                 ADJOINT_RENDERS if estimator in ADJOINT_ESTIMATORS else 0.0
             )
+            # the image itself, the renders of the differences, and the adjoint
             seconds = 1.0 + single_plan.renders + adjoint_renders
-        deviation = gradients - gradients.mean(dim=0)
+        residual = gradients - gradients.mean(dim=0)  # (repeats, d)
         gradients_of[estimator] = gradients
         seconds_of[estimator] = seconds
-        noise_of[estimator] = float(deviation.square().sum() / max(1, repeats - 1))
+        noise_of[estimator] = float(residual.square().sum() / max(1, repeats - 1))
     errors = _compute_squared_errors(gradients_of, noise_of, repeats)
     return {name: error * seconds_of[name] for name, error in errors.items()}
 
@@ -195,6 +201,8 @@ def _compute_squared_errors(
     gradients_of: Mapping[str, Tensor], noise_of: Mapping[str, float], repeats: int
 ) -> dict[str, float]:
     """Return the mean squared error of each estimator, at least its own noise.
+
+    The reference's error is its noise: it counts as unbiased.
 
     Args:
         gradients_of: (repeats, d) of each estimator; one of them takes differences.
@@ -237,13 +245,13 @@ def _explain_scores(
 def count_cosine_samples(
     plan: GradientPlan, *, counts: Sequence[int] = SAMPLE_COUNTS
 ) -> int:
-    """Return how many samples per pixel the gradients of `measure_cosines` take at
-    most, in all.
+    """Return the maximum number of samples per pixel that the gradients of
+    `measure_cosines` take, in all.
     """
-    each = (
-        REPEATS * sum(counts) + N_CONVERGED * (1 + CONVERGED_SPP_FACTOR) * CONVERGED_SPP
-    )
-    return each * sum(len(factors) for _, factors in _list_controls(plan))
+    working_samples = REPEATS * sum(counts)
+    converged_samples = N_CONVERGED * (1 + CONVERGED_SPP_FACTOR) * CONVERGED_SPP
+    n_steps = sum(len(factors) for _, factors in _list_controls(plan))
+    return (working_samples + converged_samples) * n_steps
 
 
 def _list_controls(plan: GradientPlan) -> list[tuple[list[Group], Sequence[float]]]:
@@ -264,9 +272,18 @@ def measure_cosines(
 ) -> Iterator[Measured]:
     """Measure the cosine of working gradients with the converged one, for each control.
 
-    Both have the same step. Sample counts are tried in their order until one reaches
-    the goal at a step; then the next step follows. `count_cosine_samples` bounds the
-    samples of all gradients.
+    For each of `FACTORS` the differences are that many times as wide as planned, in the
+    working gradients and in the converged ones alike. At each width the sample counts
+    are tried in their order, until one reaches the goal; then the next width follows.
+    The last width is a fallback, tried only if no other has reached the goal. A control
+    without finite differences has only the factor 1.
+
+    Args:
+        bench: computes the gradients; its renderer has the plan.
+        counts: samples per pixel, ascending.
+
+    Yields:
+        A row for each control, width and sample count that was measured.
     """
     base_plan = bench.renderer.plan
     for groups, factors in _list_controls(base_plan):
@@ -274,10 +291,12 @@ def measure_cosines(
         is_reached = False
         tried_plans = list[GradientPlan]()
         for factor in factors:
-            if factor == FACTORS[-1] and is_reached:
+            is_fallback = factor == FACTORS[-1]
+            if is_fallback and is_reached:
                 break
             plan = restrict_plan(base_plan.scale_steps(factor), group_names)
-            if plan in tried_plans:  # no step can be wider
+            # Widths are limited, so that a larger factor can give the same plan.
+            if plan in tried_plans:
                 continue
             tried_plans.append(plan)
             for row in _measure_cosines(bench, plan, groups, factor, counts):
@@ -292,15 +311,20 @@ def _measure_cosines(
     factor: float,
     counts: Sequence[int],
 ) -> Iterator[Measured]:
-    """Measure the cosine of one control at one step, by sample count up to the goal."""
+    """Measure the cosine of one control at one width of its differences.
+
+    Sample counts are tried until one reaches the goal. The converged gradient is
+    computed again with more samples, once, if it is noisy or a working gradient has
+    more samples.
+    """
     control = groups[0].control
     estimators = ", ".join(dict.fromkeys(group.estimator for group in groups))
     label = f"{control} x {factor:g}"
     converged_spp = CONVERGED_SPP
     converged, agreement = _converged_gradient(bench, plan, label, converged_spp)
     for spp in counts:
-        is_short = agreement < GOAL_COSINE or spp > CONVERGED_SPP
-        if converged_spp == CONVERGED_SPP and is_short:
+        needs_samples = agreement < GOAL_COSINE or spp > CONVERGED_SPP
+        if needs_samples and converged_spp == CONVERGED_SPP:
             converged_spp = CONVERGED_SPP_FACTOR * CONVERGED_SPP
             converged, agreement = _converged_gradient(
                 bench, plan, label, converged_spp
@@ -336,18 +360,18 @@ def _converged_gradient(
     )
     agreements = torch.tensor(
         [
-            _cosine(first, second)
-            for first, second in itertools.combinations(gradients, 2)
+            _cosine(gradient_a, gradient_b)
+            for gradient_a, gradient_b in itertools.combinations(gradients, 2)
         ]
     )
-    # the minimum of a tensor is NaN if a value is
+    # Unlike Python's, the minimum of a tensor is NaN if a value is.
     return gradients.mean(dim=0), float(agreements.min())
 
 
-def _cosine(first: Tensor, second: Tensor) -> float:
-    """Return the cosine of two gradients (d,); NaN if one is zero."""
-    norms = float(first.norm() * second.norm())
-    return float(first @ second) / norms if norms > 0.0 else float("nan")
+def _cosine(gradient_a: Tensor, gradient_b: Tensor) -> float:
+    """Return the cosine similarity of two gradients (d,); NaN if one is zero."""
+    norms = float(gradient_a.norm() * gradient_b.norm())
+    return float(gradient_a @ gradient_b) / norms if norms > 0.0 else float("nan")
 
 
 def choose_steps(
@@ -355,9 +379,10 @@ def choose_steps(
 ) -> tuple[GradientPlan, int | None]:
     """Return the plan with each control's step chosen from measured cosines.
 
-    Of the settings that reach the goal, the one with the fewest samples wins (all take
-    as many renders), of equal ones that with the greatest cosine; where none does, the
-    one with the greatest cosine, and the reason says so.
+    Of the settings (width and sample count) that reach the goal, the one with the
+    fewest samples wins, since all take as many renders; of equal ones, that with the
+    greatest cosine. If none reaches it, the one with the greatest cosine wins, and the
+    reason of the group says so.
 
     Returns:
         The plan, and the sample count that all controls then need; None where nothing
@@ -391,7 +416,10 @@ def choose_steps(
 def _choose_setting(
     rows: Sequence[tuple[Measured, float]],
 ) -> tuple[Measured, float]:
-    """Return the cheapest setting that reaches the goal, or the one nearest to it."""
+    """Return the cheapest setting that reaches the goal, or the one nearest to it.
+
+    Rows come with their cosines, which are numbers.
+    """
     good_rows = [(row, cosine) for row, cosine in rows if row.status == "ok"]
     if good_rows:
         return min(good_rows, key=lambda pair: (pair[0].spp, -pair[1]))
@@ -441,25 +469,26 @@ def measure_path_length(
     full_depth = renderer.scene.max_depth
     noise_seeds = [seeds.stream(seed, "half", half) for half in range(2)]
 
-    def render(u: Tensor, depth: int) -> list[_Rendering]:
+    def render_twice(u: Tensor, depth: int) -> list[_Rendering]:
         renderings = []
         for noise_seed in noise_seeds:
             renderings.append(_render_with_depth(renderer, u, noise_seed, spp, depth))
             tick()
         return renderings
 
-    full_renderings = [render(u, full_depth) for u in configurations]
+    full_renderings = [render_twice(u, full_depth) for u in configurations]
     cuts = []
     chosen_depth = full_depth
     for depth in range(full_depth - 1, MIN_DEPTH - 1, -1):
-        light = 0.0
-        levels = 0.0
+        # largest of all configurations
+        lost_light = 0.0
+        changed_levels = 0.0
         for u, full in zip(configurations, full_renderings, strict=True):
-            lost_light, changed_levels = _compare_depths(full, render(u, depth))
-            light = max(light, lost_light)
-            levels = max(levels, changed_levels)
-        cuts.append(PathCut(depth=depth, light=light, levels=levels))
-        if not levels <= bound:
+            light, levels = _compare_depths(full, render_twice(u, depth))
+            lost_light = max(lost_light, light)
+            changed_levels = max(changed_levels, levels)
+        cuts.append(PathCut(depth=depth, light=lost_light, levels=changed_levels))
+        if not changed_levels <= bound:
             break
         chosen_depth = depth
     return PathLength(
@@ -491,20 +520,22 @@ def _render_with_depth(
 def _compare_depths(
     full: Sequence[_Rendering], shorter: Sequence[_Rendering]
 ) -> tuple[float, float]:
-    """Return the fraction of light that shorter paths lose, and the change in levels.
+    """Return the fraction of light that shorter paths lose, and the change of the image.
 
-    Each has two renderings with independent noise.
+    The change is a root mean square in 8-bit levels. `full` and `shorter` have two
+    renderings each, with the same two seeds; noise does not count as a change.
     """
-    first, second = (
+    difference_a, difference_b = (
         full_rendering.image - shorter_rendering.image
         for full_rendering, shorter_rendering in zip(full, shorter, strict=True)
     )
-    # The product of two independent differences has no noise in its mean.
-    bias = float((first * second).mean().clamp_min(0.0).sqrt())
+    # The product of two independent differences has no noise in its mean; so that mean
+    # is that of the squared change, but can be below 0 by chance.
+    rms_change = float((difference_a * difference_b).mean().clamp_min(0.0).sqrt())
     full_light = sum(float(rendering.radiance.mean()) for rendering in full)
     light = sum(float(rendering.radiance.mean()) for rendering in shorter)
     lost_light = 1.0 - light / full_light if full_light > 0.0 else 0.0
-    return lost_light, 255.0 * bias
+    return lost_light, 255.0 * rms_change
 
 
 def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
@@ -525,9 +556,8 @@ def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
     return "; ".join(texts) or f"all {full_depth} segments"
 
 
-N_RANDOM_CONFIGURATIONS = (
-    2  # random configurations that are measured beside the clean one
-)
+# random configurations that are measured besides the clean one
+N_RANDOM_CONFIGURATIONS = 2
 BOUNCE_SPP = 4  # samples per pixel: the same paths are compared, so that few suffice
 # renders of a search from which on the measurement pays; each path length costs a
 # compilation
@@ -537,7 +567,8 @@ MIN_RENDERS_FOR_BOUNCES = 200
 def count_bounce_images(problem: Problem) -> int:
     """Return how many images `measure_problem_bounces` renders at most."""
     n_depths = 1 + problem.renderer.scene.max_depth - MIN_DEPTH
-    return (1 + N_RANDOM_CONFIGURATIONS) * 2 * n_depths
+    images_per_depth = 2  # with independent noise
+    return (1 + N_RANDOM_CONFIGURATIONS) * images_per_depth * n_depths
 
 
 def measure_problem_bounces(
@@ -551,8 +582,8 @@ def measure_problem_bounces(
     for index in range(N_RANDOM_CONFIGURATIONS):
         generator = torch.Generator().manual_seed(seeds.stream(seed, "bounces", index))
         u = problem.domain.sample(generator)[0]
-        draw = seeds.stream(seed, "conditions of bounces", index)
-        full_configurations.append(problem.add_conditions(u, draw))
+        condition_seed = seeds.stream(seed, "conditions of bounces", index)
+        full_configurations.append(problem.add_conditions(u, condition_seed))
     return measure_path_length(
         problem.renderer,
         full_configurations,

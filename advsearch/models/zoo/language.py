@@ -384,8 +384,9 @@ class _NameClassifier(nn.Module):
         self.tokens = [list(name_tokens) for name_tokens in tokens]
         stems = _find_stems(self.tokens)
         stem_length = max(map(len, stems), default=0)
-        # For each token of a name: the row of likelihoods after the tokens before it,
-        # the token, and whether there is one.
+        # All (names, longest name). For each token of a name: the row of the table of
+        # likelihoods that follows the tokens before it, the token, which is the column,
+        # and whether there is one (1 or 0). See `forward` for the table.
         rows = torch.zeros((len(tokens), max(map(len, tokens))), dtype=torch.long)
         columns = torch.zeros_like(rows)
         counts = torch.zeros_like(rows)
@@ -393,7 +394,8 @@ class _NameClassifier(nn.Module):
             # Row 0 is after the prompt, the others are after each token of a stem.
             stem_row = 1 + _find_stem(stems, name_tokens[:-1]) * stem_length
             for position, token in enumerate(name_tokens):
-                rows[index, position] = stem_row + position - 1 if position else 0
+                if position > 0:
+                    rows[index, position] = stem_row + position - 1
                 columns[index, position] = token
                 counts[index, position] = 1
         padded_stems = torch.tensor(
@@ -409,6 +411,8 @@ class _NameClassifier(nn.Module):
         scores = []
         for image in images:
             logits, past = self.reader.read_prompt(image)
+            # (1 + stems * stem length, tokens) log-likelihoods of the next token, after
+            # the prompt and after each token of each stem
             likelihoods = logits.log_softmax(dim=-1)[None]
             if len(stems):
                 stem_logits = self.reader.continue_with(stems, past)
@@ -446,18 +450,22 @@ class _FreeAnswerer(nn.Module):
     The outputs are `advsearch.tasks.answers.AnswerWithLogits`.
     """
 
-    def __init__(self, reader: _LanguageModel, most: int) -> None:
+    def __init__(self, reader: _LanguageModel, max_tokens: int) -> None:
         super().__init__()
         self.reader = reader
         self.tokenizer = reader.processor.tokenizer
-        self.max_tokens = most
-        ends = reader.network.generation_config.eos_token_id
-        self.end_tokens = frozenset(
-            ends if isinstance(ends, (list, tuple)) else [ends]
-        ) - {None}
+        self.max_tokens = max_tokens
+        # a token, several, or None
+        end_tokens = reader.network.generation_config.eos_token_id
+        if not isinstance(end_tokens, (list, tuple)):
+            end_tokens = [end_tokens]
+        self.end_tokens = frozenset(end_tokens) - {None}
 
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
-        """Return the answer about each of images (N, 3, H, W)."""
+        """Return the answer about each of images (N, 3, H, W).
+
+        It ends after an end token, or after `max_tokens`.
+        """
         answers = []
         for image in images:
             logits, past = self.reader.read_prompt(image)

@@ -210,13 +210,13 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
 
     def ask(network: Any, images: Tensor) -> Tensor:
         size = (images.shape[2], images.shape[3])
-        given = (
-            {}
-            if sentence is None
-            else {"task_inputs": sentence.to(images.device).expand(len(images), -1)}
-        )
-        returned = network(pixel_values=images, **given)
-        masks = returned.masks_queries_logits
+        task_inputs = {}
+        if sentence is not None:
+            tokens = sentence.to(images.device).expand(len(images), -1)
+            task_inputs = {"task_inputs": tokens}
+        returned = network(pixel_values=images, **task_inputs)
+        masks = returned.masks_queries_logits  # (N, queries, h, w)
+        # (N, queries, classes) without the last class, which means no object
         classes = returned.class_queries_logits.softmax(dim=-1)[..., :-1]
         if family == "mask2former":
             masks = functional.interpolate(masks, size=MASK_SIZE, mode="bilinear")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 
 from torch import Tensor
 
@@ -27,7 +27,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     It is tried in twice the ambient light of the scene, and twice that, and so on.
     Nothing else changes: exposure follows the ambient light, so that the projector is
     the darker one. All points have the same seeds, which nothing else has. The results
-    are in `verifier.findings`.
+    are in `verifier.state.ambient_verifications`, by lux.
 
     Args:
         verifier: of the attack.
@@ -41,14 +41,17 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     findings.ambient_verifications[scene_lux] = findings.verification
 
     def holds(lux: float) -> bool:
+        """Verify the configuration in an ambient light, and store the result."""
         title = f"trying it in ambient light of {lux:.3g} lux"
         verifier.begin_stage(title, 2 * verifier.n_trials, name="ambient", at_most=True)
         factor = lux / scene_lux
-        traced = verifier.journal.evaluator
-        traced_in_light = ParallelEvaluator(
-            with_ambient_light(problem, factor), traced.executor, factor
+        # The factor is the key by which workers find the problem in that light.
+        evaluator = ParallelEvaluator(
+            with_ambient_light(problem, factor),
+            verifier.journal.evaluator.executor,
+            factor,
         )
-        journal = replace(verifier.journal, evaluator=traced_in_light)
+        journal = replace(verifier.journal, evaluator=evaluator)
         verification = verify(
             replace(verifier, journal=journal).evaluate_all,
             problem.domain,
@@ -64,23 +67,23 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         findings.ambient_verifications[lux] = verification
         return verification.ending is Ending.FOUND
 
-    good_lux = scene_lux
-    bad_lux = 2.0 * scene_lux
-    while bad_lux <= MAX_LUX and holds(bad_lux):
-        good_lux = bad_lux
-        bad_lux = 2.0 * bad_lux
-    if bad_lux not in findings.ambient_verifications:
+    holding_lux = scene_lux
+    failing_lux = 2.0 * scene_lux
+    while failing_lux <= MAX_LUX and holds(failing_lux):
+        holding_lux = failing_lux
+        failing_lux = 2.0 * failing_lux
+    if failing_lux not in findings.ambient_verifications:
         return  # it holds in direct sun
     for _ in range(N_BISECTIONS):
-        middle_lux = (good_lux * bad_lux) ** 0.5
+        middle_lux = (holding_lux * failing_lux) ** 0.5
         if holds(middle_lux):
-            good_lux = middle_lux
+            holding_lux = middle_lux
         else:
-            bad_lux = middle_lux
+            failing_lux = middle_lux
 
 
 def _find_scene_lux(problem: Problem) -> float | None:
-    """Return the ambient light that a searched control competes with.
+    """Return the ambient light in lux that a searched control competes with.
 
     None if no control does, or if the ambient light is searched too.
     """
@@ -96,10 +99,15 @@ def make_problem_finder(problem: Problem) -> Callable[[ProblemKey], Problem]:
     A number as the key is a factor on the ambient light; any other key is the problem
     of the run.
     """
-    in_other_light = lru_cache(maxsize=2)(partial(with_ambient_light, problem))
+
+    @lru_cache(maxsize=2)
+    def make_problem_in_light(factor: float) -> Problem:
+        return with_ambient_light(problem, factor)
 
     def find_problem(key: ProblemKey) -> Problem:
-        return in_other_light(key) if isinstance(key, float) else problem
+        if isinstance(key, float):
+            return make_problem_in_light(key)
+        return problem
 
     return find_problem
 

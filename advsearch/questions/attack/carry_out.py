@@ -1,8 +1,7 @@
 """Load the parts of an attack from its settings, and make its problem of these.
 
- Everything that renders and judges single
-configurations begins with `problem_from_config` or `make_problem_on`;
-`advsearch.questions.attack.run` attacks.
+Everything that renders and judges single configurations begins with
+`problem_from_config` or `make_problem_on`; `advsearch.questions.attack.run` attacks.
 """
 
 from __future__ import annotations
@@ -132,15 +131,24 @@ def load_parts(
     searched, sampled = make_attack_controls(config, config.controls, config.over)
     task, objective = make_task_and_objective(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **config.policy_options)
-    keep = scene is None or model is None
+    is_stored = scene is None or model is None
     scene = scene or naming.load_configured_scene(config)
     if model is None:
         loaded = load_ensemble(config.model, config, task)
     else:
         loaded = (model, [])
-    metrics = judging.load_metrics(config.metrics) if keep else {}
+    metrics = judging.load_metrics(config.metrics) if is_stored else {}
     return AttackParts(
-        config, scene, loaded, task, searched, sampled, objective, policy, keep, metrics
+        config=config,
+        scene=scene,
+        model_and_warnings=loaded,
+        task=task,
+        controls=searched,
+        random_controls=sampled,
+        objective=objective,
+        policy=policy,
+        is_stored=is_stored,
+        metrics=metrics,
     )
 
 
@@ -202,14 +210,15 @@ def make_task_and_objective(
         InputError: the objective does not fit the task or the goal.
     """
     new_task = make_task(task)
-    chosen = new_task.objective if objective is None else objective
+    if objective is None:
+        objective = new_task.objective
     check_objective(
-        chosen,
+        objective,
         new_task.name,
         targeted=config.target is not None,
         minimise=config.minimise,
     )
-    return new_task, chosen
+    return new_task, objective
 
 
 def load_ensemble(
@@ -304,18 +313,19 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
     """
     config = parts.config
     model, warnings = parts.model_and_warnings
-    task, facts = _bind_task(parts)
+    task, make_scene_facts = _bind_task(parts)
     resolution = config.resolution or model.input_size
     description = fit_camera(parts.scene.description, resolution)
     space = make_space((*parts.controls, *parts.random_controls), description)
+    omissions = ALL_OMISSIONS if config.specialise else NO_OMISSIONS
     renderer = loading.make_renderer(
         description,
         space,
         resolution,
-        config.denoise,
-        config.seed,
-        config.estimators,
-        leave_out=ALL_OMISSIONS if config.specialise else NO_OMISSIONS,
+        denoise=config.denoise,
+        seed=config.seed,
+        estimators=config.estimators,
+        leave_out=omissions,
         sampler=config.pixel_sampler,
         differentiated=differentiated,
     )
@@ -327,14 +337,14 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         warnings.append(note)
     _check_printable(parts, config, description)
     problem = Problem(
-        renderer,
-        space,
-        model,
-        task,
-        facts,
-        objective,
-        round_sample_count(config.pixel_sampler, config.search_spp),
-        config.seed,
+        renderer=renderer,
+        space=space,
+        model=model,
+        task=task,
+        make_facts=make_scene_facts,
+        objective=objective,
+        spp=round_sample_count(config.pixel_sampler, config.search_spp),
+        seed=config.seed,
         n_searched=len(parts.controls),
         aovs=parse_aovs(config.aov),
         metrics=parts.metrics,
@@ -368,6 +378,9 @@ def _bind_task(
 ) -> tuple[Task, Callable[[DescribeConfiguration, RenderSurfaces], Facts]]:
     """Bind the task of an attack to its model.
 
+    Each member of an ensemble is checked and calibrated on its own model. Remarks of
+    tasks are added to the warnings of loading the model.
+
     Args:
         parts: the parts of the attack.
         shows: whether a clean image is rendered for a task that needs one.
@@ -383,23 +396,27 @@ def _bind_task(
     task = judging.make_ensemble_task(task, model).on(
         model, target=config.target, minimise=config.minimise
     )
-    facts = partial(
+    make_scene_facts = partial(
         make_facts,
         parts.scene.description,
         config.object,
         config.label,
         judge=config.judge,
     )
+    # `dict` describes no parameter: all have the values of the scene.
+    scene_facts = make_scene_facts(dict)
     ensemble = task if isinstance(task, EnsembleTask) else None
     members = [(task, model)]
     if ensemble is not None:
         members = list(zip(ensemble.tasks, ensemble.models, strict=True))
     member_tasks = list[Task]()
     for member, network in members:
-        known = facts(dict)
+        member_facts = scene_facts
         if ensemble is not None:
-            known = ensemble.select_facts(member, known)
-        judging.check_truth(member, network, parts.scene, known, config.image_settings)
+            member_facts = ensemble.select_facts(member, scene_facts)
+        judging.check_truth(
+            member, network, parts.scene, member_facts, config.image_settings
+        )
         if shows:
             member = judging.calibrate_task(
                 member,
@@ -417,11 +434,15 @@ def _bind_task(
         task = replace(ensemble, tasks=tuple(member_tasks))
     if config.judge == ALL_THINGS:
         task = make_each_thing_task(task)
-    return task, facts
+    return task, make_scene_facts
 
 
 def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
-    """Return the steps of a search, and the conditions that each evaluates."""
+    """Return the steps of a search, and the conditions that each evaluates.
+
+    The settings decide. Defaults over conditions depend on how many numbers vary by
+    chance, and whether their images can be predicted.
+    """
     if problem.conditions is None:
         return config.steps or STEPS, 1
     default = SIZE_OVER_PREDICTED

@@ -347,6 +347,7 @@ def _ambient_light(findings: RunState) -> AmbientLight | None:
         )
         for lux, verification in sorted(findings.ambient_verifications.items())
     ]
+    # The first point is the scene's own light, in which the scene was verified.
     n_holding = 0
     while n_holding < len(points) and points[n_holding].holds:
         n_holding += 1
@@ -509,13 +510,14 @@ def _printability(problem: Problem, findings: RunState) -> Printability:
 def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
     """Return the adversarial configuration, with clean values and ranges.
 
-    A range has what is a single number.
+    A range has what is a single number: its values where its coordinate is 0 and 1.
 
     Args:
         problem: of the attack.
         u: (d,) the configuration.
     """
     start = problem.domain.start
+    # of the searched parameters that are single numbers
     column_of_number = {
         group.name: group.begin
         for group in problem.space.groups
@@ -560,7 +562,10 @@ def _value_of(values: Mapping[str, Value], name: str) -> Any:
 
 
 def _conditions(problem: Problem) -> dict[str, VariedValue]:
-    """Return the ranges of the single numbers that vary by chance, by name."""
+    """Return the ranges of the single numbers that vary by chance, by name.
+
+    Each is described at the ends of its range, and a choice at each of its options.
+    """
     ranges: dict[str, VariedValue] = {}
     if problem.conditions is None:
         return ranges
@@ -569,6 +574,7 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
     for group, (block, _) in zip(
         problem.space.groups, domain.list_block_slices(), strict=True
     ):
+        # The searched controls come first in the space.
         is_random = group.begin >= len(problem.domain.start)
         if group.size != 1 or not is_random:
             continue
@@ -601,8 +607,12 @@ def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
 
 
 def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
-    """Count the images that were rendered, by what for, and those predicted instead."""
-    transport = findings.predictor
+    """Count the images that were rendered, by what for, and those predicted instead.
+
+    "products" are those that were predicted; what was rendered for the predictor counts
+    for the search.
+    """
+    predictor = findings.predictor
     counts = dict.fromkeys(
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
@@ -616,8 +626,8 @@ def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
         if search is None:
             continue
         n_predicted = 0
-        if transport:
-            n_steps = transport.count_predicted(kind, len(search.history))
+        if predictor:
+            n_steps = predictor.count_predicted(kind, len(search.history))
             n_predicted = n_steps * problem.n_draws
         n_rendered = search.renders * problem.n_draws - n_predicted
         n_gradients = max(0, search.gradients - n_predicted)
@@ -628,8 +638,8 @@ def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
             counts[kind] = n_rendered
             if kind == "search":
                 counts["gradient"] += n_gradients
-    if transport:
-        counts["search"] += transport.n_traced
+    if predictor:
+        counts["search"] += predictor.n_traced
     return counts
 
 
@@ -660,7 +670,7 @@ def _remarks(findings: RunState, problem: Problem, journal: Journal) -> list[str
         for search in (findings.search, findings.baseline)
         if search is not None
     )
-    # What predicts images has no such count.
+    # The renderer counts those of the searches too, unless they were predicted.
     n_non_finite = max(problem.renderer.non_finite, n_in_searches)
     if n_non_finite:
         remarks.append(
@@ -743,10 +753,10 @@ def _describe_failure(
 def _ranges_of(
     problem: Problem, failure: FoundFailure
 ) -> dict[str, tuple[float, float] | str]:
-    """Return the ranges of a failure.
+    """Return the ranges of a failure by the name of the coordinate.
 
-    They are in the parameter's unit, or in u if that has none; of a discrete choice its
-    option.
+    They are in the parameter's unit, or in u where the parameter is described by other
+    numbers than its coordinates; of a discrete choice its option.
     """
     ranges: dict[str, tuple[float, float] | str] = {}
     for column, bounds in failure.ranges.items():

@@ -223,7 +223,10 @@ def _find_trial_images(images: Path) -> list[Picture]:
 
 
 def _changes_part(summary: AttackSummary) -> ResultPart:
-    """Return the table of the parameters that were changed."""
+    """Return the table of the parameters that were changed.
+
+    Columns that are empty in all rows are left out; then there are no bars either.
+    """
     rows = []
     bars = []
     for name, changed in (summary.configuration or {}).items():

@@ -162,10 +162,7 @@ def attack(
 
 def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
     """Return the settings that are not None."""
-    options: dict[str, Any] = {
-        name: value for name, value in settings.items() if value is not None
-    }
-    return options
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _check_can_use_workers(

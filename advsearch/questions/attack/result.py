@@ -337,15 +337,13 @@ class StoredImage:
         with torch.no_grad():
             radiance = problem.renderer.radiance(configuration, seed, spp)
             display = problem.renderer.formation.display(radiance)
-            picture = round_to_8_bit(
-                problem.space.apply_to_image(configuration, display)
-            )
+            image = round_to_8_bit(problem.space.apply_to_image(configuration, display))
         return cls(
-            configuration,
-            radiance,
-            picture,
-            problem.judge(picture, configuration),
-            trial,
+            full_configuration=configuration,
+            radiance=radiance,
+            image=image,
+            judgement=problem.judge(image, configuration),
+            trial=trial,
         )
 
 
@@ -363,18 +361,21 @@ def choose_stored_trial(findings: RunState) -> int | None:
         return clean_labels.index(mode(clean_labels)) if clean_labels else None
     clean_labels = _labels(verification.clean_trials)
     has_successes = bool(verification.successful_trials)
-    usual = mode(_labels(verification.successful_trials or verification.valid_trials))
-    usual_clean = mode(clean_labels)
+    usual_label = mode(
+        _labels(verification.successful_trials or verification.valid_trials)
+    )
+    usual_clean_label = mode(clean_labels)
     ranks = []
-    for label, outcome, clean_label in zip(
+    for label, is_success, clean_label in zip(
         _labels(verification.adversarial_trials),
         verification.outcomes,
         clean_labels,
-        strict=False,
+        strict=False,  # trials of one scene may have ended earlier
     ):
-        is_usual = label == usual
-        is_counted = is_usual and outcome is has_successes
-        ranks.append((is_counted, is_usual, clean_label == usual_clean))
+        is_usual = label == usual_label
+        # a success, if there are any; else a trial that counts and fails
+        is_counted = is_usual and is_success is has_successes
+        ranks.append((is_counted, is_usual, clean_label == usual_clean_label))
     return verification.first_index + ranks.index(max(ranks))
 
 
@@ -389,6 +390,9 @@ def save_images(
     scene_images: Mapping[str, StoredImage],
 ) -> None:
     """Save the images of an attack: of both scenes, of trials, and of the search.
+
+    These are both scenes and their difference, the first `MAX_STORED_IMAGES` trials,
+    and an animation of the search that ends with the adversarial scene.
 
     Args:
         run: where they are saved.
@@ -482,7 +486,8 @@ def save_with_marks(
 def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     """Write the object before and after, to turn in a browser.
 
-    Meshes near it that controls move or paint are written, too.
+    Meshes near it that controls move or paint are written, too. Meshes with many faces
+    are simplified, so that all together have `MAX_FACES` at most, which a note says.
 
     Args:
         run: where it is written.
@@ -523,10 +528,8 @@ def _find_camera_pose(
     """Return the camera's pose (4, 4): the one that a control set, or the scene's."""
     camera_pose = adversarial.get("camera.to_world")
     if camera_pose is None:
-        to_world = camera_to_world(scene)
-    else:
-        to_world = camera_pose.double().numpy()
-    return to_world
+        return camera_to_world(scene)
+    return camera_pose.double().numpy()
 
 
 def _describe_simplified(meshes: Sequence[Any], simplify: Mapping[str, object]) -> str:
@@ -536,10 +539,9 @@ def _describe_simplified(meshes: Sequence[Any], simplify: Mapping[str, object]) 
         for part in meshes
         if simplify[part.name]
     ]
-    note = ""
-    if simplified:
-        note = f"It is shown with fewer faces than it has ({', '.join(simplified)})."
-    return note
+    if not simplified:
+        return ""
+    return f"It is shown with fewer faces than it has ({', '.join(simplified)})."
 
 
 def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:
@@ -612,7 +614,8 @@ def evaluate_drive(
 def _find_path(problem: Problem) -> tuple[Any, int]:
     """Return the control that travels at random times, and the column of its time.
 
-    None if there is none.
+    Time is its first coordinate in a full configuration. None if there is no such
+    control.
     """
     n_searched = len(problem.searched_space.controls)
     column = len(problem.domain.start)
@@ -651,10 +654,10 @@ def _make_frames(
     names = list(dict.fromkeys(choices))
     frames = start.repeat(max(1, len(names)), FRAMES, 1)
     frames[..., time_column] = torch.linspace(0.0, 1.0, FRAMES)
-    # The coordinate behind the time selects the path.
+    # The coordinate behind the time selects the path: the center of its part of [0, 1].
     for index, name in enumerate(names):
-        share = (choices.index(name) + 0.5) / len(choices)
-        frames[index, :, time_column + 1] = share
+        coordinate = (choices.index(name) + 0.5) / len(choices)
+        frames[index, :, time_column + 1] = coordinate
     return names, frames.flatten(0, 1)
 
 
@@ -675,7 +678,8 @@ def _render_frames(
         with torch.no_grad():
             image = round_to_8_bit(problem.renderer(configuration, seed=seed, spp=spp))
         is_right, marks = problem.predict_with_marks(image, configuration)
-        n_right += is_right
+        if is_right:
+            n_right += 1
         images.append(np.asarray(draw_marks(image.numpy(), marks), dtype=np.float32))
     return images, n_right
 

@@ -362,8 +362,10 @@ class AttackConfig(DerivativeConfig):
     @model_validator(mode="before")
     @classmethod
     def _policy_with_steps(cls, data: Any) -> Any:
-        """Accept ``policy: {name: pgd, steps: 80, momentum: 0.9}``, ``pgd={momentum:
-        0.9}`` and a name.
+        """Accept a policy with options, and with the steps of the search among them.
+
+        ``policy: {name: pgd, steps: 80, momentum: 0.9}`` sets `steps`, too; also
+        ``pgd={momentum: 0.9}`` and a name.
         """
         policy = read_named(data.get("policy"), "policy", "auto")
         if not isinstance(policy, Mapping):

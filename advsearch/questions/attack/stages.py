@@ -58,7 +58,8 @@ from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
-MAX_FRAMES = 60
+MAX_FRAMES = 60  # of the animation of a search
+N_RANKED = 4  # best configurations of a search that are rendered again
 UNPRINTED = "search without print terms"
 """The kind of the search without print terms: compared with one that has them, it
 measures what they cost.
@@ -218,12 +219,15 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     """Return whether the clean scene is wrong, so that there is nothing to search for.
 
     The full trials decide. They are made if it was wrong in every first look, or
-    `in_any_case`.
+    `in_any_case`. It never is wrong for a rule that does not compare with the clean
+    scene.
     """
     problem = verifier.problem
     findings = verifier.state
-    looks_right = any(trial.right for trial in findings.first_look)
-    if not problem.rule.has_control or (looks_right and not in_any_case):
+    if not problem.rule.has_control:
+        return False
+    was_right_once = any(trial.right for trial in findings.first_look)
+    if was_right_once and not in_any_case:
         return False
     verifier.choose_spp({"clean": problem.domain.start})
     verifier.begin_stage(
@@ -247,22 +251,31 @@ def choose_predictor(
     """Prepare and return the cheapest predictor that is accurate here.
 
     None if there is none: then every step is rendered. Light on surfaces is compared
-    with traced images first. Why it is another predictor, or none, is in `findings`.
+    with traced images first. One that takes too much memory ends the choice. Why it is
+    another predictor, or none, is in `findings`, and reported.
+
+    Args:
+        policy: what searches.
+        journal: of the run.
+        stages: reports the preparation.
+        findings: of the attack.
+        specialise: whether images may be predicted.
+        clean: the matrix of the clean scene, of attacks that share it.
     """
     problem = journal.problem
     steps = problem.steps
-    matrix = find_matrix_refusal(problem, steps, specialise)
-    surface = surface_light.find_surface_light_refusal(
+    matrix_refusal = find_matrix_refusal(problem, steps, specialise)
+    surface_refusal = surface_light.find_surface_light_refusal(
         problem, steps, policy, specialise
     )
 
     candidates: list[Callable[[], PredictedSearch]] = []  # cheapest first
-    if matrix is None and problem.conditions is None:
+    if matrix_refusal is None and problem.conditions is None:
         candidates.append(lambda: Transport(problem, steps, clean_matrix=clean))
     else:
-        if surface is None:
+        if surface_refusal is None:
             candidates.append(lambda: SurfaceLight(problem, steps))
-        if matrix is None:
+        if matrix_refusal is None:
             candidates.append(lambda: Bank(problem, steps, journal.evaluator))
 
     for make_predictor in candidates:
@@ -272,17 +285,21 @@ def choose_predictor(
             return predictor
         if refusal.cause is RefusalCause.TOO_LARGE:
             return _crop_search(problem, refusal, stages, findings)
-        surface = findings.surface_light_refusal = refusal
-        instead = "rendered" if matrix else "predicted by matrices"
+        # Only light on surfaces is refused for its accuracy.
+        surface_refusal = refusal
+        findings.surface_light_refusal = refusal
+        instead = "rendered" if matrix_refusal else "predicted by matrices"
         stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
-    assert matrix is not None and surface is not None
+    assert matrix_refusal is not None and surface_refusal is not None
+    # The user is told the reason that is easier to change: more steps, if matrices pay
+    # then; or that of matrices where no camera moves.
     is_too_short = (
         not findings.surface_light_refusal
         and find_matrix_refusal(problem, None, specialise) is None
     )
-    is_about_matrices = is_too_short or surface.cause is RefusalCause.NO_CAMERA
-    refusal = matrix if is_about_matrices else surface
+    is_about_matrices = is_too_short or surface_refusal.cause is RefusalCause.NO_CAMERA
+    refusal = matrix_refusal if is_about_matrices else surface_refusal
     if not specialise:
         _report_rendering(refusal, stages, findings)
         return None
@@ -335,9 +352,9 @@ class Searches:
     Attributes:
         journal: replays stored evaluations, and stores the others.
         stages: reports the progress.
-        findings: so far; their `transport` predicts images.
+        findings: so far; their `predictor` predicts images.
         printable: whether objectives include print terms.
-        close_looks: further renders of candidates that are close to the best.
+        close_looks: further renders of candidates that are close to the best, at most.
     """
 
     journal: Journal
@@ -387,7 +404,8 @@ class Searches:
             policy: proposes configurations.
             steps: evaluations.
             seed: of the policy.
-            frames: gets images on the way, (H, W, 3) 8-bit values in [0, 1].
+            frames: is filled with images on the way, (H, W, 3) 8-bit values in [0, 1],
+                at most `MAX_FRAMES` and evenly spaced; None for none.
             seconds: that it may take; None for no limit.
             domain: to search; None for the problem's.
             ranked: whether the best configurations are rendered again.
@@ -398,9 +416,10 @@ class Searches:
         """
         renders_before = 0
         frame_interval = max(1, math.ceil(steps / MAX_FRAMES))
-        transport = self.findings.predictor
+        predictor = self.findings.predictor
 
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            """Keep the image of a step, if it has one, and report its renders."""
             nonlocal renders_before
             if evaluation.picture is not None and frames is not None:
                 frames.append(evaluation.picture.numpy())
@@ -410,27 +429,27 @@ class Searches:
             )
             renders_before = record.renders
 
+        def request_image(query: Query) -> Query:
+            is_due = query.phase == "search" and query.number % frame_interval == 0
+            return replace(query, with_image=is_due)
+
+        def ignore_replay(query: Query) -> None:
+            """Do nothing: rendering has no state that stored evaluations change."""
+
         def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
             if frames is not None:
-                queries = [
-                    replace(
-                        query,
-                        with_image=query.phase == "search"
-                        and query.number % frame_interval == 0,
-                    )
-                    for query in queries
-                ]
-            on_replay = (lambda query: None) if transport is None else transport.replay
+                queries = [request_image(query) for query in queries]
+            on_replay = ignore_replay if predictor is None else predictor.replay
             return self.journal.evaluate_all(queries, self._evaluate, on_replay)
 
         domain = domain or self.problem.domain
-        if transport is None:
+        if predictor is None:
             domain = replace(domain, exact=False, draws_conditions=False)
         else:
             domain = replace(
                 domain,
-                exact=transport.is_exact,
-                draws_conditions=transport.draws_conditions and policy.uses_gradient,
+                exact=predictor.is_exact,
+                draws_conditions=predictor.draws_conditions and policy.uses_gradient,
             )
         result = search(
             evaluate,
@@ -438,7 +457,7 @@ class Searches:
             policy,
             steps=steps,
             seed=seed,
-            candidates=4 if ranked else 0,
+            candidates=N_RANKED if ranked else 0,
             max_extra_repeats=self.close_looks,
             is_out_of_time=self.journal.make_time_check(kind, seconds),
             on_step=on_step,
@@ -446,6 +465,7 @@ class Searches:
             render_seed=self.problem.seed,
         )
         if result.ending is Ending.INTERRUPTED:
+            # The main search is the first: an interrupted one after it is dropped.
             self.findings.search = self.findings.search or result
             raise KeyboardInterrupt
         return result
@@ -453,7 +473,11 @@ class Searches:
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries with predicted or rendered images.
 
-        Print terms are subtracted from the objective.
+        Only steps of a search are predicted; its ranking, and what verifies, is
+        rendered. Print terms are subtracted from the objective.
+
+        Args:
+            queries: all of one phase.
         """
         traced = self.journal.evaluator
         predictor = self.findings.predictor
@@ -495,7 +519,9 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         )
         configurations = {"adversarial": adversarial, "clean": problem.domain.start}
         verifier.choose_spp(configurations, search_samples=n_images * problem.spp)
-    n_groups = len(results) + (not verifier.has_clean_trials)
+    n_groups = len(results)
+    if not verifier.has_clean_trials:
+        n_groups += 1
     verifier.begin_stage(
         "checking what was found with fresh renders",
         n_groups * verifier.n_trials,
@@ -584,6 +610,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         transport = findings.predictor
 
     def search_inside(domain: Domain, number: int) -> Tensor:
+        """Search a smaller domain, and return the best configuration (d,)."""
         title = f"search {number + 1} of at most {MAX_SEARCHES}"
         searches.begin("search", title, problem.steps, "`steps` shortens each search")
         result = searches.search(
@@ -603,16 +630,22 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         return result.best_u
 
     def passes(u: Tensor, check: int, min_trials: int = n_trials) -> bool:
-        """Return whether a configuration (d,) passes a check, as many as it needs."""
+        """Return whether a configuration (d,) passes a check.
+
+        It ends when too many trials have failed, or `min_trials` were made and none
+        failed, or after all trials. A configuration that passes becomes the search's
+        result so far.
+        """
         max_failures = problem.rule.count_allowed_failures(n_trials)
         scores = list[float]()
         n_failures = 0
         while len(scores) < n_trials and n_failures <= max_failures:
-            if not n_failures and len(scores) >= min_trials:
+            if n_failures == 0 and len(scores) >= min_trials:
                 break
             (trial,) = verifier.try_configurations(f"check {check}", {len(scores): u})
             scores.append(trial.score)
-            n_failures += not trial.success
+            if not trial.success:
+                n_failures += 1
         if transport is not None:
             transport.update_score_bias(u, scores)
         has_passed = n_failures <= max_failures
@@ -651,7 +684,11 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
 
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
-    """Return how bad a verified configuration is for the model; larger is worse."""
+    """Return how bad a verified configuration is for the model; larger is worse.
+
+    What is verified comes first, then the success rate, then the mean score; a score
+    that is not a number counts as the lowest.
+    """
     scores = [trial.score for trial in verification.valid_trials]
     mean_score = sum(scores) / len(scores)
     return (

@@ -145,7 +145,8 @@ def attacks_of(settings: JsonObject) -> BatchFunction:
     """
     chains = make_chains(AttackConfig(**settings))
 
-    def call(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
+    def make_chain(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
+        """Make the attacks of the chain with the only one of these numbers."""
         finished = []
         clean = CleanMatrix()
         with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
@@ -160,7 +161,7 @@ def attacks_of(settings: JsonObject) -> BatchFunction:
                     break
         return finished
 
-    return call
+    return make_chain
 
 
 def _read_files(directory: Path) -> dict[str, bytes]:
@@ -365,7 +366,11 @@ def curve(context: RunContext[AttackConfig]) -> CurveResult:
 
 
 def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
-    """Attack an object with growing epsilons, until one of them settles it."""
+    """Attack an object with growing epsilons, until one of them settles it.
+
+    The row is that of the last attack, with the renders of all. After an interrupt
+    before the first attack, it says nothing but the object's name.
+    """
     row = ObjectRow(object=chain[0].subject, clean=None, flips_at=None)
     clean = CleanMatrix()
     renders: Counter[str] = Counter()
@@ -375,12 +380,13 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
             break
         renders.update(summary.renders)
         epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
+        flips_at = epsilon if summary.ending == "found" else None
         row = ObjectRow(
             object=attack.subject,
             clean=summary.clean.control,
             ending=summary.ending,
             epsilon=epsilon,
-            flips_at=epsilon if summary.ending == "found" else None,
+            flips_at=flips_at,
             verified=summary.verified,
             margin=summary.verified and summary.verified.margin,
             run=summary.run,
@@ -413,27 +419,42 @@ def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
 
 
 def _compute_accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
-    """Compute the robust accuracy at an epsilon, with its Clopper-Pearson interval."""
+    """Compute the robust accuracy at an epsilon, with its Clopper-Pearson interval.
+
+    Without an object about which anything is known there, the accuracy is None, and the
+    interval all of [0, 1].
+    """
     known = [row for row in rows if _is_known(row, epsilon)]
     n_objects = len(known)
     n_wrong = sum(row.ending == "already wrong" for row in known)
-    n_found = 0
-    for row in known:
-        if row.ending == "found":
-            flips_at = row.flips_at
-            n_found += epsilon is None or (
-                isinstance(flips_at, float) and flips_at <= epsilon
-            )
+    n_found = sum(_has_flipped(row, epsilon) for row in known)
     n_robust = n_objects - n_wrong - n_found
+    accuracy = None
+    interval = (0.0, 1.0)
+    if known:
+        accuracy = n_robust / n_objects
+        interval = clopper_pearson(n_robust, n_objects)
     return CurvePoint(
         epsilon=epsilon,
         objects=n_objects,
         robust=n_robust,
         found=n_found,
         already_wrong=n_wrong,
-        accuracy=n_robust / n_objects if known else None,
-        interval=clopper_pearson(n_robust, n_objects) if known else (0.0, 1.0),
+        accuracy=accuracy,
+        interval=interval,
     )
+
+
+def _has_flipped(row: ObjectRow, epsilon: float | None) -> bool:
+    """Return whether a wrong prediction was found within an epsilon.
+
+    Without one, controls have their own epsilons, at which the object was attacked.
+    """
+    if row.ending != "found":
+        return False
+    if epsilon is None:
+        return True
+    return isinstance(row.flips_at, float) and row.flips_at <= epsilon
 
 
 # samples per pixel of the trials, unless an attack needed more or a setting is given
@@ -446,7 +467,8 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     Trial k has the same seed for every scene and every model, and none that a search or
     its verification has used. Models of one input size get the same image; for another
     size the same configuration is rendered anew. A success needs the model to be right
-    on the clean scene with the same seed, as everywhere.
+    on the clean scene with the same seed, as everywhere. Samples per pixel are those of
+    `verify_spp`, else the most that an attack needed, at least `MIN_TRIAL_SPP`.
     """
     config = context.config
     names = check_distinct(config.models, "model")

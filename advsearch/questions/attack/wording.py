@@ -97,8 +97,8 @@ def _random_search_remark(summary: AttackSummary, verified: VerifiedRate) -> str
     """Return what the random search says about a found scene; empty if nothing."""
     if summary.answer_from == "random":
         return " Random search found it, and the policy nothing as bad."
-    random = summary.baseline.verified if summary.baseline else None
-    if random is not None and random.rate >= verified.rate > 0:
+    random_rate = summary.baseline.verified if summary.baseline else None
+    if random_rate is not None and random_rate.rate >= verified.rate > 0:
         return " Random search finds as much."
     return ""
 
@@ -152,7 +152,7 @@ def _baseline_remark(summary: AttackSummary) -> str:
     """Return whether the random search did as well as the policy; empty if not."""
     verified = summary.verified
     policy_rate = summary.policy_verified
-    random = summary.baseline.verified if summary.baseline else None
+    random_rate = summary.baseline.verified if summary.baseline else None
     if summary.answer_from == "random" and policy_rate:
         return (
             "The random search beside it found a worse configuration than the policy "
@@ -161,13 +161,13 @@ def _baseline_remark(summary: AttackSummary) -> str:
             "random search is the scene. The margin is "
             f"{words.get_margin_meaning(summary.task)}."
         )
-    if verified is None or random is None:
+    if verified is None or random_rate is None:
         return ""
-    if random.rate < verified.rate or random.rate <= 0:
+    if random_rate.rate < verified.rate or random_rate.rate <= 0:
         return ""
-    successes = f"{random.successes} of {random.trials}"
+    successes = f"{random_rate.successes} of {random_rate.trials}"
     comparison = f"as well: {successes}. The policy adds nothing here."
-    if random.rate > verified.rate:
+    if random_rate.rate > verified.rate:
         comparison = f"better: {successes}."
     return f"Random search with as many renders does {comparison}"
 
@@ -305,7 +305,10 @@ def _error_clause(
 ) -> str:
     """Return "The model calls this mug a vase" if that is known of every trial.
 
-    Otherwise a weaker clause.
+    Else it names the most frequent prediction; of detectors with different outcomes,
+    these. Without labels of the trials, it is the prediction in the stored image, and
+    of other tasks than classification no prediction at all. Of a commanded action, or
+    an easier scene, it is the claim, with the direction of the action.
 
     Args:
         summary: of the attack.
@@ -348,7 +351,8 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
     """Return what a trial counts as, and the goal of the search.
 
     "the model is wrong about this mug", "makes the model miss this mug". Of a commanded
-    action no more is stated: nothing has moved.
+    action no more is stated: nothing has moved. The claim is "it is wrong" where the
+    goal comes before it in a sentence.
 
     Args:
         summary: of the attack.

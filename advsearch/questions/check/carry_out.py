@@ -137,6 +137,7 @@ class GradientCheck:
         """Return the result of what is measured so far."""
 
         def select(kind: type[Any]) -> list[Any]:
+            """Return the findings of a type."""
             return [finding for finding in findings if isinstance(finding, kind)]
 
         configs = [part.config for part in self.parts]
@@ -158,6 +159,7 @@ class GradientCheck:
         )
 
     def _measure_parts(self) -> Iterator[Finding]:
+        """Yield what is stored of each part, or else measure it."""
         for part in self.parts:
             stored = self.measurements.read(part.key)
             if stored is not None:  # measured before: nothing is loaded
@@ -184,9 +186,9 @@ class GradientCheck:
 
     def _report_row(self, row: CheckedRow) -> None:
         """Report a measurement."""
-        value = (
-            f"cosine {row.cosine:.2f}" if row.cosine is not None else f"{row.value:.3g}"
-        )
+        value = f"{row.value:.3g}"
+        if row.cosine is not None:
+            value = f"cosine {row.cosine:.2f}"
         self.progress.message(
             f"{row.object}, {row.name} by {row.estimator}: {value}, {row.status}"
         )
@@ -217,8 +219,11 @@ class GradientCheck:
             yield part.make_row(row)
 
     def _measure_model(self, part: CheckedPart, title: str) -> Iterator[Finding]:
-        """Plan a search by the model's own loss, and measure its derivatives as
-        planned.
+        """Plan a search by the model's own loss, and measure its derivatives as planned.
+
+        First come the cosines of gradients, by which steps and samples are chosen; then
+        the plan of the search, except in a check of all controls; then the derivatives,
+        with the factor by which each step was changed.
 
         Args:
             part: what is measured.
@@ -270,6 +275,7 @@ class GradientCheck:
     ) -> Iterator[results.Measured]:
         """Yield the cosines of gradients with converged ones, by samples per pixel."""
         plan = problem.renderer.plan
+        # not fewer samples than the search has
         counts = tuple(
             count
             for count in (*planning.SAMPLE_COUNTS, MAX_SPP)
@@ -301,7 +307,8 @@ class GradientCheck:
             spp: samples per pixel.
         """
 
-        def store(name: str, measure: Callable[[], Any]) -> Any:
+        def get_or_measure(name: str, measure: Callable[[], Any]) -> Any:
+            """Return what is stored under a name, or else measure and store it."""
             return self.measurements.get(f"{part.key} {name}", measure)
 
         return gradients.Bench(
@@ -310,8 +317,8 @@ class GradientCheck:
             gradients.find_interior_point(renderer),
             seeds.stream(part.config.seed, "check"),
             spp,
-            store,
-            lambda samples: self.progress.advance(1),
+            get_or_measure,
+            tick=lambda samples: self.progress.advance(1),
         )
 
     def _begin_stage(self, title: str, name: str, max_steps: int) -> None:
@@ -321,6 +328,9 @@ class GradientCheck:
         self, problem: Problem, part: CheckedPart, spp: int
     ) -> Iterator[Finding]:
         """Yield the plan of a search, its longest light paths, and what it saves.
+
+        What it saves are the gains of each thing that is left out, and how many texels
+        are visible; nothing where nothing is left out.
 
         Args:
             problem: of the scene.
@@ -342,6 +352,7 @@ class GradientCheck:
         tick = self.progress.advance
 
         def measure_length() -> results.PathLength:
+            """Measure the longest light paths that matter, at the problem's start."""
             title = "finding how many bounces of light matter"
             max_images = planning.count_bounce_images(problem)
             self.progress.stage(title, max_images, hint=hint, at_most=True)
@@ -353,6 +364,7 @@ class GradientCheck:
         yield length
 
         def measure_part_gains() -> list[GainRow]:
+            """Measure what each thing that is left out saves."""
             title = "measuring what leaving things out saves"
             self.progress.stage(title, MAX_GRADIENTS, hint=hint, at_most=True)
             return measure_gains(

@@ -57,6 +57,8 @@ def measure_gains(
     """Measure what a renderer saves by each item that it leaves out.
 
     Each item is put back, and then all at once, and a gradient is timed and compared.
+    Images and gradients are compared at two seeds, so that it is known what noise
+    changes; then gradients are timed in rounds over all variants.
 
     Args:
         renderer: of a search.
@@ -72,10 +74,11 @@ def measure_gains(
         A row for each item, one for the bounces if these are limited, and one for all.
     """
     variants = _make_variants(renderer, depth)
+    # by item; "" is the renderer of the search
     images = defaultdict[str, list[Tensor]](list)
     slopes = defaultdict[str, list[Tensor]](list)
     times = defaultdict[str, list[float]](list)
-    # The first gradient of each compiles.
+    # The first gradient of each compiles, so that these are not timed.
     for noise_seed in (seed, seeds.stream(seed, "another")):
         for item, variant in variants.items():
             with torch.no_grad():
@@ -127,6 +130,9 @@ def _compare_item(
 ) -> GainRow:
     """Compare the renderer with an item and that without, whose name is "".
 
+    The gain in time is for equal noise of the images: the ratio of the seconds times
+    that of the variances.
+
     Args:
         item: its name.
         images: at two seeds.
@@ -158,12 +164,15 @@ def _difference(pair: list[Tensor]) -> float:
     return float((other - first).norm())
 
 
-def _relative_difference(without: list[Tensor], having: list[Tensor]) -> float:
-    """Return the difference at one seed over the RMS difference that seeds make."""
+def _relative_difference(without: list[Tensor], with_item: list[Tensor]) -> float:
+    """Return the difference at one seed over the RMS difference that seeds make.
+
+    Where seeds make no difference, it is the difference itself.
+    """
     noise = math.sqrt(
-        statistics.fmean(_difference(pair) ** 2 for pair in (without, having))
+        statistics.fmean(_difference(pair) ** 2 for pair in (without, with_item))
     )
-    difference = float((having[0] - without[0]).norm())
+    difference = float((with_item[0] - without[0]).norm())
     return difference / noise if noise > 0.0 else difference
 
 
@@ -187,7 +196,7 @@ def measure_texels(
             n_pixels = _count_pixels(renderer, inputs, name, seed, spp)
             n_visible = _count_visible_texels(renderer, inputs, name, seed, spp)
             size = max(inputs[name].shape[:2])
-            # halved as often as the pixels still resolve as much
+            # Halved as long as enough texels per pixel would still be visible.
             enough = size
             while enough > 2:
                 n_visible_of_half = n_visible * (enough / 2 / size) ** 2
@@ -233,7 +242,7 @@ def _count_visible_texels(
 ) -> int:
     """Count the texels that reach the camera directly: they have a derivative."""
     scene = renderer.scene
-    with scene.limit_depth(2):
+    with scene.limit_depth(2):  # light, surface, camera
         ones = torch.ones(*scene.resolution, 3)
         gradient = scene.render_adjoint(inputs, ones, seed, spp, wrt=[name])[name]
     return int((gradient.abs().amax(dim=-1) > 0.0).sum())

@@ -45,18 +45,21 @@ class PairImages:
     def list_examples(
         self, first: Side, second: Side, pair: int
     ) -> Iterator[PairPicture]:
-        """Yield pairs that only one side gets right, those with the largest margin gap
-        first.
+        """Yield pairs that only one side gets right, the largest margin gaps first.
 
         There are at most as many of each side as the settings say, with images as far
-        as these are available; `pair` is the number of the two sides.
+        as all of a pair are available. Two models of one sweep have one image.
+
+        Args:
+            first, second: the sides.
+            pair: the number of the two sides.
         """
         run = self.context.run
         rows = select_examples(first, second, self.context.config.pictures)
-        shares_images = first.sweep.folder == second.sweep.folder and first.rows[
-            "number"
-        ].equals(second.rows["number"])
-        sides = {"a": first} if shares_images else {"a": first, "b": second}
+        is_same_sweep = first.sweep.folder == second.sweep.folder
+        sides = {"a": first, "b": second}
+        if is_same_sweep and first.rows["number"].equals(second.rows["number"]):
+            sides = {"a": first}
         files = {
             row: [f"images/pair-{pair}-{row}-{letter}.jpg" for letter in sides]
             for row in rows
@@ -64,14 +67,16 @@ class PairImages:
         self._save_images(rows, sides, files, run)
         for row in rows:
             values = first.rows.loc[row, first.varying_parameters].items()
+            rounded_values = {
+                name: value if isinstance(value, str) else float(f"{value:.6g}")
+                for name, value in values
+            }
+            right_side = first if first.is_right[row] else second
             is_complete = all((run.path / file).is_file() for file in files[row])
             yield PairPicture(
                 number=row,
-                values={
-                    name: value if isinstance(value, str) else float(f"{value:.6g}")
-                    for name, value in values
-                },
-                right=(first if first.is_right[row] else second).name,
+                values=rounded_values,
+                right=right_side.name,
                 answers=(first.rows["label"][row], second.rows["label"][row]),
                 pictures=files[row] if is_complete else [],
             )
@@ -83,7 +88,14 @@ class PairImages:
         files: Mapping[int, Sequence[str]],
         run: Any,
     ) -> None:
-        """Store the images of rows: thumbnails of the sweeps, or else renderings."""
+        """Store the images of rows: thumbnails of the sweeps, or else renderings.
+
+        Args:
+            rows: indices of the pairs.
+            sides: those with images of their own, by the letter in the file's name.
+            files: of each row, one for each of these sides.
+            run: the run directory.
+        """
         missing = []
         with self.context.until_interrupted():
             for row in rows:

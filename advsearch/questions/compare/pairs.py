@@ -27,6 +27,9 @@ def compare_sides(
 ) -> ComparedPair:
     """Count the pairs of two sides; images are added later.
 
+    `worse` has rules under which only the first side is right, `better` those for the
+    second; None without rules.
+
     Args:
         first, second: sides with the same draws.
         seed: chooses which half of the pairs chooses rules, and which counts them.
@@ -45,7 +48,11 @@ def compare_sides(
     n_units = len(np.unique(units))
     only_first = first.is_right & ~second.is_right
     only_second = ~first.is_right & second.is_right
-    worse = better = None
+    _, _, p_value = statistics.clustered.compare_paired(
+        first.is_right, second.is_right, units
+    )
+    worse = None
+    better = None
     if with_rules:
         table = rules.make_table(first.rows, shared)
         worse = find_pair_rules(table.assign(correct=~only_first), seed)
@@ -56,9 +63,7 @@ def compare_sides(
         units=None if n_units == len(units) else n_units,
         unit=first.rows.attrs["unit name"],
         **count_pairs(first.is_right, second.is_right, units),
-        p=statistics.clustered.compare_paired(first.is_right, second.is_right, units)[
-            2
-        ],
+        p=p_value,
         worse=worse,
         better=better,
         parts=[
@@ -114,16 +119,22 @@ def count_pairs(
 def split_by_value(
     column: pd.Series, edges: Sequence[float] | None
 ) -> Iterator[tuple[Any, BoolArray]]:
-    """Yield each value of a parameter, or part of its range, and the mask (n,) of its
-    rows.
+    """Yield each value of a parameter, or part of its range, and the mask of its rows.
+
+    Names and few different numbers are values; many numbers without edges yield
+    nothing. A mask is (n,).
+
+    Args:
+        column: (n,) of the parameter.
+        edges: bounds of the parts, ascending, as the sweep says; None if it does not.
     """
     if column.dtype == "category":
         for name in column.cat.categories:
             yield name, np.asarray(column == name)
     elif edges is not None:
-        bins = np.clip(
-            np.searchsorted(edges, column, side="right") - 1, 0, len(edges) - 2
-        )
+        bins = np.searchsorted(edges, column, side="right") - 1
+        # Values at the last edge, or beyond one by rounding, are in the part next to it.
+        bins = np.clip(bins, 0, len(edges) - 2)
         for index, bounds in enumerate(pairwise(edges)):
             yield bounds, bins == index
     elif column.nunique() <= MAX_VALUES:

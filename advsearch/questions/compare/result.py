@@ -280,11 +280,9 @@ def describe_exclusive_pairs(pair: ComparedPair) -> str:
 
 def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPart]:
     """Yield the sections about one pair of sides."""
-    sentences = (
-        [summarize_difference(pair), describe_exclusive_pairs(pair)]
-        if has_others
-        else [describe_exclusive_pairs(pair)]
-    )
+    sentences = [describe_exclusive_pairs(pair)]
+    if has_others:
+        sentences.insert(0, summarize_difference(pair))
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
     rows = [
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
@@ -294,7 +292,11 @@ def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPa
         MCNEMAR_NOTE if pair.units is None else UNITS_NOTE.format(units=f"{pair.unit}s")
     )
     yield ResultPart(
-        f"{pair.first} and {pair.second}, pair by pair", sentences, heads, rows, note
+        f"{pair.first} and {pair.second}, pair by pair",
+        text=sentences,
+        heads=heads,
+        rows=rows,
+        note=note,
     )
     yield ResultPart("Where one is worse", [*_rule_texts(pair)])
     yield from _parameter_tables(pair)
@@ -321,9 +323,8 @@ def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
     heads += [f"{pair.first} alone", f"{pair.second} alone"]
     for name, parts in tables.items():
         rows = [_part_cells(part) for part in parts]
-        yield ResultPart(
-            name, heads=heads, rows=rows, only="" if name in in_terminal else "page"
-        )
+        only = "" if name in in_terminal else "page"
+        yield ResultPart(name, heads=heads, rows=rows, only=only)
     if len(in_terminal) < len(tables):
         more = (
             "The difference varies most over these; the page has all "
@@ -400,7 +401,13 @@ def _captions(example: PairPicture, pair: ComparedPair) -> list[str]:
 def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     """Yield the images of pairs that only one side gets right.
 
-    One part is for a terminal, and one for a page.
+    One part is for a terminal: a line with the files of the first pairs. One is for a
+    page: a group of images for each pair, all in one group if each pair has a single
+    image; and lines of pairs without images.
+
+    Args:
+        name: of the side.
+        pair: of both sides.
     """
     title = f"Only {name} gets right:"
     lines: list[list[str]] = []
@@ -416,7 +423,7 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
         if not example.pictures:
             without_pictures.append(line)
             continue
-        if len(example.pictures) != 2:
+        if len(example.pictures) != 2:  # both sides have the same image
             captions = ["; ".join(captions)]
         captions[0] += f"; {values}"
         groups.append(
@@ -426,7 +433,7 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
             ]
         )
     if groups and all(len(group) == 1 for group in groups):
-        groups = [[picture for group in groups for picture in group]]
+        groups = [[group[0] for group in groups]]
     yield ResultPart(title, rows=lines[:MAX_PICTURES], only="text")
     yield ResultPart(title, without_pictures, pictures=groups, only="page")
 

@@ -147,6 +147,9 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
 def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     """Yield the sides of one sweep, without names.
 
+    There is one for each model, of the clean scene and then of the adversarial one, if
+    there is one; next to another sweep only the adversarial scene counts.
+
     Args:
         path: the run directory of the sweep.
         is_only_sweep: whether no other sweep is compared.
@@ -169,12 +172,13 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
     model_index = rows["step"] % len(models)
     rows["number"] = rows["step"] // len(models)
     rows["correct"] = rows["correct"] == 1
-    scene_masks = [rows["number"] >= 0]
+    scene_masks = [rows["number"] >= 0]  # all rows
     if sweep.config.adversarial_of:
+        # The second half of the images are of the adversarial scene.
         is_adversarial = rows["number"] >= summary.planned // len(models) // 2
-        scene_masks = (
-            [~is_adversarial, is_adversarial] if is_only_sweep else [is_adversarial]
-        )
+        scene_masks = [is_adversarial]
+        if is_only_sweep:
+            scene_masks = [~is_adversarial, is_adversarial]
     for is_of_scene in scene_masks:
         for index, model in enumerate(models):
             side_rows = rows[is_of_scene & (model_index == index)].reset_index(
@@ -184,11 +188,14 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
             for column in SIDE_COLUMNS:
                 if column in side_rows:
                     labels[column] = ",".join(side_rows[column].unique())
-            yield Side("", sweep, labels, side_rows)
+            yield Side(name="", sweep=sweep, labels=labels, rows=side_rows)
 
 
 def check_same_draws(first: Side, second: Side) -> None:
     """Check that the sweeps of two sides have the same draws.
+
+    That is the same settings of the draws, as many images, and, of one object, the same
+    values of all sampled parameters that both have.
 
     Raises:
         InputError: they have not.
@@ -244,15 +251,18 @@ def find_different_settings(sides: Sequence[Side]) -> list[str]:
     sides.
     """
     first, *others = (side.sweep.config.get_deciding_settings() for side in sides)
-    names = {name for other in others for name in other if other[name] != first[name]}
-    names |= {
+    deciding = {
+        name for other in others for name in other if other[name] != first[name]
+    }
+    differing_columns = {
         column
         for column in SIDE_COLUMNS
         if len({side.labels[column] for side in sides}) > 1
     }
-    names |= {
+    differing_settings = {
         name
         for name in SIDE_SETTINGS
         if len({getattr(side.sweep.config, name) for side in sides}) > 1
     }
+    names = deciding | differing_columns | differing_settings
     return sorted(names - set(SECONDARY_SETTINGS))

@@ -48,9 +48,10 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
         InputError: scikit-learn is missing.
     """
     lengths = np.linalg.norm(features, axis=1, keepdims=True)
-    directions = features / np.maximum(lengths, 1e-12)
+    directions = features / np.maximum(lengths, 1e-12)  # not divided by 0
     if len(directions) < MIN_FAILURES:
-        return Clusters((tuple(range(len(directions))),), None, False)
+        all_failures = tuple(range(len(directions)))
+        return Clusters((all_failures,), silhouette=None, apart=False)
     decomposition = rules.import_library("sklearn.decomposition")
     n_components = min(N_COMPONENTS, *directions.shape)
     points = decomposition.PCA(n_components, random_state=0).fit_transform(directions)
@@ -64,13 +65,15 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     ]
     members.sort(key=len, reverse=True)
     if len(members) < 2:
-        return Clusters(tuple(members), None, False)
-    return Clusters(tuple(members), silhouette, is_apart)
+        return Clusters(tuple(members), silhouette=None, apart=False)
+    return Clusters(tuple(members), silhouette=silhouette, apart=is_apart)
 
 
 def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> bool:
-    """Return whether points have a higher silhouette than each reference of random
-    points.
+    """Return whether points have a higher silhouette than each reference.
+
+    A reference has as many points (n, d), normal with the same deviation in each
+    dimension.
     """
     generator = np.random.default_rng(seed)
     spread = points.std(axis=0)
@@ -98,8 +101,11 @@ def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
     compute_silhouette = rules.import_library("sklearn.metrics").silhouette_score
     best_silhouette = -1.0
     best_cluster = np.zeros(len(points), dtype=np.int64)
+    # The silhouette needs fewer clusters than points, and k-means that many different
+    # ones.
     n_distinct = len(np.unique(points.round(9), axis=0))
-    for k in range(2, min(MAX_CLUSTERS, n_distinct - 1) + 1):
+    max_clusters = min(MAX_CLUSTERS, n_distinct - 1)
+    for k in range(2, max_clusters + 1):
         cluster = k_means(k, n_init=4, random_state=0).fit_predict(points)
         silhouette = float(compute_silhouette(points, cluster))
         if silhouette > best_silhouette:

@@ -33,7 +33,9 @@ def find_envelope(
 ) -> EnvelopeRow | None:
     """Find the largest box of values inside which a model has an accuracy.
 
-    None if no box of enough rows has it.
+    A box is peeled until the lower bound of its accuracy among the choosing rows is
+    large enough; it holds if that among the counting rows is. None if no box of enough
+    rows has it.
 
     Args:
         choosing: rows that choose the box.
@@ -62,9 +64,9 @@ def find_envelope(
 def find_best_peel(
     box: rules.RuleConditions, inside: pd.DataFrame, choosing: pd.DataFrame
 ) -> rules.RuleConditions | None:
-    """Return the slightly smaller box with the highest accuracy.
+    """Return the slightly smaller box with the highest accuracy, the first of several.
 
-    None if too few rows are left in each.
+    None if too few rows, or draws, are left in each.
     """
     is_independent = choosing["unit"].is_unique
     best_box = None
@@ -103,7 +105,16 @@ def list_peels(
 def list_factor_peels(
     condition: rules.RuleCondition, column: pd.Series
 ) -> Iterator[rules.RuleCondition]:
-    """Yield conditions without one name, or without the lowest or highest values."""
+    """Yield conditions without one name, or without the lowest or highest values.
+
+    A condition on numbers is low < value <= high. A peel takes `PEELED_FRACTION` of the
+    values, up to a bound that is rounded to three digits; where that would take none of
+    them, or all, it takes just the lowest or the highest value.
+
+    Args:
+        condition: of the box.
+        column: values of the rows inside the box.
+    """
     if column.dtype == "category":
         names = condition.options or frozenset(column.cat.categories)
         if len(names) > 1:
@@ -113,15 +124,21 @@ def list_factor_peels(
         return
 
     values = column.to_numpy()
-    low = float(f"{np.quantile(values, PEELED_FRACTION):.3g}")
-    high = float(f"{np.quantile(values, 1.0 - PEELED_FRACTION):.3g}")
-    # With few different values the smallest one is removed.
-    if low < values.min() or low >= values.max():
-        low = float(values.min())
+    lowest = values.min()
+    highest = values.max()
+    low = _round_to_3_digits(np.quantile(values, PEELED_FRACTION))
+    if not lowest <= low < highest:
+        low = float(lowest)
     yield replace(condition, low=low)
-    if high < values.max():
-        yield replace(condition, high=high)
-    else:
-        lower_values = values[values < values.max()]
-        if len(lower_values):
-            yield replace(condition, high=float(lower_values.max()))
+
+    high = _round_to_3_digits(np.quantile(values, 1.0 - PEELED_FRACTION))
+    if not lowest <= high < highest:
+        lower_values = values[values < highest]
+        if not len(lower_values):
+            return
+        high = float(lower_values.max())
+    yield replace(condition, high=high)
+
+
+def _round_to_3_digits(value: float) -> float:
+    return float(f"{value:.3g}")

@@ -17,12 +17,13 @@ from advsearch.questions.explain.result import (
 
 
 def count_right(rows: pd.DataFrame) -> RightCounts:
-    """Count right rows; the fraction is the mean over units."""
+    """Count right rows; the fraction is the mean over units, None without rows."""
+    right_fraction = None if rows.empty else rules.estimate_rate(rows)
     return RightCounts(
         right=int(rows["correct"].sum()),
         total=len(rows),
         interval=rules.estimate_interval(rows),
-        share=None if rows.empty else rules.estimate_rate(rows),
+        share=right_fraction,
         outcomes=rules.count_wrong_outcomes(rows),
     )
 
@@ -40,11 +41,14 @@ def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
 def make_rejected_rule(
     rule: rules.CountedRule | None, n_rows: int
 ) -> RejectedRule | None:
-    """Return the result of a rule that is not significant among `n_rows` rows."""
+    """Return the result of a rule that is not significant among `n_rows` rows.
+
+    It states how many rows it would take, or None if no number makes it significant.
+    """
     if rule is None:
         return None
-    factor = rule.find_needed_factor()
-    n_needed = None if factor is None else round_up(factor * n_rows)
+    needed_multiple = rule.find_needed_factor()
+    n_needed = None if needed_multiple is None else round_up(needed_multiple * n_rows)
     return RejectedRule(
         **describe_rule(rule),
         chance=rule.p_value,

@@ -52,6 +52,9 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
     """Estimate how much each factor, and each interacting pair, decides the
     predictions.
 
+    Numbers are cut into about as many groups as the cube root of the clusters; those of
+    pairs more coarsely, so that a cell has `MIN_ROWS_PER_CELL` rows on average.
+
     Returns:
         The factors by falling share, without what chance adds to it; then the pairs,
         likewise. Nothing where all predictions are the same.
@@ -74,13 +77,15 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
     }
     pairs = list(combinations(factors, 2))
     pair_weights = []
-    for first, second in pairs:
-        joint_group = cross_groups(coarse_groups[first], coarse_groups[second])
+    for factor_a, factor_b in pairs:
+        joint_group = cross_groups(coarse_groups[factor_a], coarse_groups[factor_b])
         p_value = sample.interaction_p_value(
-            joint_group, coarse_groups[first], coarse_groups[second]
+            joint_group, coarse_groups[factor_a], coarse_groups[factor_b]
         )
         if p_value < SIGNIFICANCE / len(pairs):
-            pair_weights.append(sample.estimate_weight([first, second], joint_group))
+            pair_weights.append(
+                sample.estimate_weight([factor_a, factor_b], joint_group)
+            )
     return [*sort_by_fraction(single_weights), *sort_by_fraction(pair_weights)]
 
 
@@ -120,6 +125,7 @@ class ClusteredPredictions:
         n_clusters: how many there are.
         is_independent: whether each prediction is a cluster by itself.
         weight: of each prediction (n,), 1 on average.
+        mean: weighted fraction of right predictions.
         variance: of the predictions.
     """
 
@@ -134,8 +140,11 @@ class ClusteredPredictions:
         self.variance = self.mean * (1.0 - self.mean)
 
     def explained_fraction(self, group: IntArray) -> tuple[float, int]:
-        """Return the fraction of the variance between groups, and the number of used
-        groups.
+        """Return the fraction of the variance between groups, and how many are used.
+
+        Args:
+            group: (n,) the group of each prediction; an index that no prediction has is
+                no group.
         """
         group_weight = np.bincount(group, self.weight)
         is_used = group_weight > 0
@@ -149,7 +158,13 @@ class ClusteredPredictions:
     def estimate_weight(self, factors: list[str], group: IntArray) -> ParameterWeight:
         """Estimate the fraction of the variance between groups with its 95 % interval.
 
-        What chance adds to the fraction is subtracted.
+        What chance adds to the fraction is subtracted: of independent rows as in the
+        adjusted R squared, of clusters as the expected statistic. Where that is not
+        known, or there is one group, nothing is: 0, from 0 to 1.
+
+        Args:
+            factors: their names.
+            group: (n,) the group of each prediction.
         """
         share, n_groups = self.explained_fraction(group)
         expected_statistic = self.expected_statistic(group)
@@ -197,11 +212,11 @@ class ClusteredPredictions:
 
         residual = self._weighted_residual(group, group_weight, is_used)
 
-        # A cell is a cluster inside a group.
+        # A cell is a cluster inside a group; `cell` (n,) is that of each prediction.
         cell_id, cell = np.unique(
             group * self.n_clusters + self.cluster, return_inverse=True
         )
-        cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)
+        cell_group, cell_cluster = np.divmod(cell_id, self.n_clusters)  # (cells,) each
         cell_residual = np.bincount(cell.reshape(-1), residual)
         clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))[
             is_used
@@ -256,7 +271,9 @@ class ClusteredPredictions:
     ) -> float:
         """Return the p-value of the interaction of two factors.
 
-        The statistic of both factors is compared with the sum of each factor's.
+        The statistic of both factors is compared with the sum of each factor's: the
+        difference is chi-squared, or with clusters one of F, if they do not interact. 1
+        if the clusters are too few to tell.
         """
         joint_share, n_cells = self.explained_fraction(joint_group)
         first_share, n_first = self.explained_fraction(first_group)
@@ -280,7 +297,13 @@ def within_group_variance(
     clusters_per_group: IntArray,
     group_weight: npt.NDArray[Any],
 ) -> float:
-    """Return the variance of clusters inside their groups, summed over groups (k,)."""
+    """Return the variance of clusters inside their groups, summed over groups.
+
+    Args:
+        squared_residual: (k,) sum of the squared residuals of the clusters.
+        clusters_per_group: (k,) at least 2 each.
+        group_weight: (k,) sum of the weights.
+    """
     variance_of_group = (
         squared_residual * clusters_per_group / (clusters_per_group - 1) / group_weight
     )
@@ -331,7 +354,7 @@ def find_noncentrality(
 
     if excess_probability(0.0) <= 0.0:
         return 0.0
-    upper_bound = statistic + 20.0
+    upper_bound = statistic + 20.0  # a first guess, doubled until it is one
     while excess_probability(upper_bound) > 0.0:
         upper_bound *= 2.0
     return float(brentq(excess_probability, 0.0, upper_bound, xtol=1e-6))

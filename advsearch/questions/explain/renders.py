@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import islice, zip_longest
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -119,22 +119,26 @@ class Renders:
     ) -> Confirmation | None:
         """Confirm a rule by fresh configurations that no earlier rule covers.
 
-        They are rendered in the scene of each sweep.
+        They are rendered in the scene of each sweep. They confirm it if they alone,
+        with the rows elsewhere, make it significant. None where nothing was rendered.
 
-        They confirm it if they alone, with the rows elsewhere, tell it. None where
-        nothing was rendered.
+        Args:
+            counted_rules: all of them, in their order.
+            index: of the rule.
         """
         if not self.config.confirm:
             return None
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
         covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
-        rest = max(
+        uncovered_fraction = max(
             float(is_outside(earlier_conditions, covered_rows).mean()),
             MIN_UNCOVERED_FRACTION,
         )
 
-        fresh_frames = self._render_inside(index, rule, rest, earlier_conditions)
+        fresh_frames = self._render_inside(
+            index, rule, uncovered_fraction, earlier_conditions
+        )
 
         fresh_rows = pd.concat(fresh_frames) if fresh_frames else self.rows[:0]
         if fresh_rows.empty:
@@ -147,15 +151,30 @@ class Renders:
         self,
         index: int,
         rule: rules.CountedRule,
-        rest: float,
+        uncovered_fraction: float,
         earlier_conditions: Sequence[rules.RuleConditions],
     ) -> list[pd.DataFrame]:
-        """Render fresh configurations inside a rule in the scene of each sweep."""
+        """Render fresh configurations inside a rule in the scene of each sweep.
+
+        Where a condition on an angle has two arcs, each has a sweep of its own.
+
+        Args:
+            index: of the rule.
+            rule: the rule.
+            uncovered_fraction: of its rows, that no earlier rule covers.
+            earlier_conditions: of the rules before it.
+
+        Returns:
+            A frame for each sweep, whose units are distinct from those of others.
+        """
         fresh_frames = []
         for sweep_index, sweep in enumerate(self.sweeps):
             n_arcs = count_arcs(sweep.config, rule.conditions)
-            samples = math.ceil(self.config.confirm / len(self.sweeps) / n_arcs / rest)
+            samples = math.ceil(
+                self.config.confirm / len(self.sweeps) / n_arcs / uncovered_fraction
+            )
             for arc in range(n_arcs):
+                # a number of its own, for the seed
                 part = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
                 seed = seeds.stream(self.config.seed, "confirm", part)
                 self.progress.message(
@@ -184,18 +203,21 @@ class Renders:
     ) -> Iterator[NearestRight]:
         """Yield the nearest right configurations to typical failures.
 
-        They lie along the parameters of the failure's rule, or else the others. A
-        failure that no parameter by itself puts right has none.
+        They lie along the parameters of the failure's rule, of which the one with the
+        smallest relative change is taken; or else along the first other parameter that
+        has one. A failure that no parameter by itself puts right has none.
         """
         failures = find_typical_failures(self.table, counted_rules, self.config.pairs)
         for number, (index, conditions) in enumerate(failures, start=1):
-            of_rule = [condition.factor for condition in conditions]
+            rule_factors = [condition.factor for condition in conditions]
             other_factors = [
-                factor for factor in self.table.attrs["units"] if factor not in of_rule
+                factor
+                for factor in self.table.attrs["units"]
+                if factor not in rule_factors
             ]
-            for factors in (of_rule, *([factor] for factor in other_factors)):
+            for factors in (rule_factors, *([factor] for factor in other_factors)):
                 attempts = [
-                    self._find_nearest(f"pair-{number}", index, factor)
+                    self._find_nearest_right(f"pair-{number}", index, factor)
                     for factor in factors
                 ]
                 pairs = [pair for pair in attempts if pair is not None]
@@ -210,57 +232,84 @@ class Renders:
         column = self.table[pair.parameter]
         if column.dtype == "category":
             return 1.0
-        return abs(float(pair.right_at) - float(pair.wrong_at)) / float(
-            column.max() - column.min()
-        )
+        value_range = float(column.max() - column.min())
+        return abs(float(pair.right_at) - float(pair.wrong_at)) / value_range
 
-    def _find_nearest(self, name: str, index: int, factor: str) -> NearestRight | None:
-        """Go along one factor until the prediction is right.
+    def _find_nearest_right(
+        self, name: str, index: int, factor: str
+    ) -> NearestRight | None:
+        """Find the nearest value of a factor at which a failure is predicted right.
 
-        This is done twice with different noise, and the failure has to fail in both.
-        None where it does not, or where no value puts it right.
+        Values along the factor are rendered twice with different noise, and predictions
+        have to be right in both. None if the failure itself is right in either, if no
+        value puts it right, or if nothing could be rendered.
+
+        Args:
+            name: of the pair.
+            index: of the failure among the rows.
+            factor: which is varied; everything else is as in the failure.
         """
         config = self.sweeps[self.rows["sweep"][index]].config
-        row = read_values(self.rows, index)
         if not is_settable(config, factor):
             return None
+        failure = read_values(self.rows, index)
         self.progress.message(f"{name}: the nearest right prediction along {factor}")
-        label = f"{name}-{factor.replace('.', '_')}"
-        frames = []
-        for repeat in range(2):
-            seed = seeds.stream(self.config.seed, f"{label} {repeat}")
-            rows = self.render_rows(
-                f"{label}-{repeat}",
-                make_sweep_along(config, row, factor, self.table, seed),
-            )
-            if rows is None:
-                return None
-            frames.append(rows)
+        run_name = f"{name}-{factor.replace('.', '_')}"
+        frames = self._render_twice(run_name, config, failure, factor)
+        if frames is None:
+            return None
         self._tried_failures.add(index)
 
-        first, second = frames
-        wrong_value = row[factor]
-        values = first[factor].tolist()
-        start = values.index(wrong_value)
-        is_right = np.asarray(first["correct"] & second["correct"])
-        if not is_right.any() or first["correct"][start] or second["correct"][start]:
+        frame_a, frame_b = frames
+        wrong_value = failure[factor]
+        values = frame_a[factor].tolist()  # the failure's own value is among them
+        failure_row = values.index(wrong_value)
+        is_right = np.asarray(frame_a["correct"] & frame_b["correct"])
+        is_failure = not (
+            frame_a["correct"][failure_row] or frame_b["correct"][failure_row]
+        )
+        if not is_failure or not is_right.any():
             return None
-        nearest = self._find_nearest_value(factor, is_right, values, wrong_value)
+        nearest_row = self._find_nearest_value(factor, is_right, values, wrong_value)
         return NearestRight(
-            values=row,
+            values=failure,
             parameter=factor,
             unit=self.table.attrs["units"][factor],
             wrong_at=wrong_value,
-            right_at=values[nearest],
-            answered=first["label"][start],
-            answered_there=first["label"][nearest],
-            pictures=self._list_thumbnails(f"{label}-0", (start, nearest)),
+            right_at=values[nearest_row],
+            answered=frame_a["label"][failure_row],
+            answered_there=frame_a["label"][nearest_row],
+            pictures=self._list_thumbnails(f"{run_name}-0", (failure_row, nearest_row)),
         )
+
+    def _render_twice(
+        self,
+        run_name: str,
+        config: SweepConfig,
+        failure: dict[str, float | str],
+        factor: str,
+    ) -> list[pd.DataFrame] | None:
+        """Render a failure along a factor, twice with different noise.
+
+        None if it was interrupted, or nothing could be rendered.
+        """
+        frames = []
+        for repeat in range(2):
+            seed = seeds.stream(self.config.seed, f"{run_name} {repeat}")
+            sweep = make_sweep_along(config, failure, factor, self.table, seed)
+            rows = self.render_rows(f"{run_name}-{repeat}", sweep)
+            if rows is None:
+                return None
+            frames.append(rows)
+        return frames
 
     def _find_nearest_value(
         self, factor: str, is_right: rules.Mask, values: Sequence[Any], wrong_value: Any
     ) -> int:
-        """Return the index of the right value that is nearest to the wrong one."""
+        """Return the index of the right value that is nearest to the wrong one.
+
+        Names are all as near; then it is the first.
+        """
         right_indices = np.flatnonzero(is_right).tolist()
         if self.table[factor].dtype == "category":
             return int(right_indices[0])
@@ -288,23 +337,25 @@ class Renders:
     # ------------------------------------------------------------------------------
 
     def find_clusters(self) -> FailureClusters | None:
-        """Render failures of one model again, and cluster them by the model's
-        features.
+        """Render failures of one model again, and cluster them by its features.
+
+        None if none were requested, there are none, or they could not be rendered, of
+        which there is a warning.
         """
         selected = self._select_sweeps()
         failing = self.rows[~self.rows["correct"] & self.rows["sweep"].isin(selected)]
         if self.interrupted or not self.config.clusters or failing.empty:
             return None
         self._warn_about_selection(selected)
-        picked = self._pick_failures(failing)
+        sampled = self._sample_failures(failing)
         self.progress.stage(
-            "rendering failures again", len(picked), hint="`clusters` says how many"
+            "rendering failures again", len(sampled), hint="`clusters` says how many"
         )
         try:
             with self.context.until_interrupted():
                 batches = [
                     self.render_again(self.sweeps[index], rows["step"].tolist())
-                    for index, rows in picked.groupby("sweep")
+                    for index, rows in sampled.groupby("sweep")
                 ]
         except (InputError, errors.ModelError) as error:
             self.warnings.append(f"No failures were grouped: {error}")
@@ -312,20 +363,23 @@ class Renders:
         if self.context.ending == results.INTERRUPTED:
             self.interrupted = True
             return None
-        self.n_renders += len(picked)
+        self.n_renders += len(sampled)
 
+        # Rows are sorted by sweep, so that images are in their order.
         images = torch.cat([batch_images for batch_images, _ in batches])
-        features = batches[0][1]
-        clusters = find_clusters(features(images).double().numpy(), self.config.seed)
+        compute_features = batches[0][1]  # the same in all: there is one model
+        clusters = find_clusters(
+            compute_features(images).double().numpy(), self.config.seed
+        )
         described_clusters = [
             self._describe_cluster(
-                number, picked.iloc[list(members)], images[members[0]]
+                number, sampled.iloc[list(members)], images[members[0]]
             )
             for number, members in enumerate(clusters.members, start=1)
         ]
         return FailureClusters(
-            features=features.source,
-            failures=len(picked),
+            features=compute_features.source,
+            failures=len(sampled),
             silhouette=clusters.silhouette,
             apart=clusters.apart,
             listed=described_clusters,
@@ -340,12 +394,11 @@ class Renders:
                 "where it was swept by itself."
             )
 
-    def _pick_failures(self, failing: pd.DataFrame) -> pd.DataFrame:
-        """Pick failures at random, in their order."""
+    def _sample_failures(self, failing: pd.DataFrame) -> pd.DataFrame:
+        """Sample at most `clusters` failures at random, in their order."""
         generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
-        return failing.iloc[
-            np.sort(generator.permutation(len(failing))[: self.config.clusters])
-        ]
+        sampled = generator.permutation(len(failing))[: self.config.clusters]
+        return failing.iloc[np.sort(sampled)]
 
     def _describe_cluster(
         self, number: int, rows: pd.DataFrame, image: torch.Tensor
@@ -438,31 +491,31 @@ def find_typical_failures(
     """Return the indices of failures, the most typical first, each with its rule.
 
     Rules take turns, a row belongs to the first that covers it, and what fails under
-    none of them is the last to take a turn. The most typical failure of a rule is the
-    one nearest to the mean of its failures, by ranks.
+    none of them, with no conditions, is the last to take a turn. The most typical
+    failure of a rule is the one nearest to the mean of its failures, by ranks.
+
+    Args:
+        table: the rows.
+        counted_rules: the rules.
+        limit: failures that are returned, at most.
     """
-    ranks = _rank_rows(table)
+    ranks = _rank_rows(table)  # (n, parameters)
     is_left: rules.Mask = ~table["correct"].to_numpy()
     queues = []
-    for conditions in (*(rule.conditions for rule in counted_rules), ()):
+    no_conditions: rules.RuleConditions = ()  # cover every row
+    for conditions in (*(rule.conditions for rule in counted_rules), no_conditions):
         indices = np.flatnonzero(is_left & rules.find_covered(conditions, table))
         is_left[indices] = False
         if not len(indices):
             continue
         distance = np.abs(ranks[indices] - ranks[indices].mean(axis=0)).sum(axis=1)
-        queues.append(
-            [
-                (int(index), conditions)
-                for index in indices[np.argsort(distance, kind="stable")]
-            ]
-        )
-    turns = (
-        failure
-        for turn in zip_longest(*queues)
-        for failure in turn
-        if failure is not None
-    )
-    return list(islice(turns, limit))
+        most_typical_first = indices[np.argsort(distance, kind="stable")].tolist()
+        queues.append([(index, conditions) for index in most_typical_first])
+    failures = []
+    for turn in zip_longest(*queues):
+        # None: the queue of a rule has ended
+        failures += [failure for failure in turn if failure is not None]
+    return failures[:limit]
 
 
 def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
@@ -471,6 +524,6 @@ def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
     values = [
         column.cat.codes if column.dtype == "category" else column for column in columns
     ]
-    return np.stack(values, axis=1).astype(np.float64).argsort(axis=0).argsort(
-        axis=0
-    ) / len(table)
+    # Sorting the order of the values gives their ranks.
+    order = np.stack(values, axis=1).astype(np.float64).argsort(axis=0)
+    return order.argsort(axis=0) / len(table)

@@ -82,7 +82,7 @@ def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
 def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of each row (n,), equal for the same prediction of the same image.
 
-    It consists of settings, number, values and model.
+    It consists of settings, number, values, model, and whether the prediction is right.
     """
     deciding = {
         name: value

@@ -27,8 +27,9 @@ def make_sweep_inside(
     """Return the settings of a sweep whose configurations mostly lie under conditions.
 
     Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of
-    a grid to the values that the rows have there; names to those that are left. The
-    caller has to leave out what cannot be cut.
+    a grid to the values that the rows have there; names to those that are left. If that
+    leaves more than twice as many configurations, every second value of the longest
+    axis is left out, again and again. The caller has to leave out what cannot be cut.
 
     Args:
         config: settings of the sweep that it is like.
@@ -96,7 +97,9 @@ def cut_controls(
 ) -> dict[str, dict[str, Any]]:
     """Return the controls of a sweep with their sampled ranges cut to conditions.
 
-    See `make_sweep_inside`.
+    See `make_sweep_inside`. A range beyond the parameter's upper limit, as of an angle
+    that passes 360 degrees, is not cut. Where a control had no ranges, its other
+    parameters get those that the rows have, else they would not vary any more.
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
@@ -149,7 +152,15 @@ def make_sweep_along(
 ) -> SweepConfig:
     """Return the settings of a sweep along one factor, everything else as in a row.
 
-    The row's own value comes first.
+    The row's own value comes first. Then come all names, or `N_VALUES_ALONG` evenly
+    spaced numbers.
+
+    Args:
+        config: settings of the sweep that it is like.
+        row: the values of the row.
+        factor: which varies.
+        table: the rows, whose values the factor has.
+        seed: of the noise.
     """
     column = table[factor]
     if column.dtype == "category":

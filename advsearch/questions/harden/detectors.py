@@ -87,19 +87,27 @@ class Example(NamedTuple):
 
     @classmethod
     def render(cls, problem: Problem, seed: int, u: Tensor | None = None) -> Example:
-        """Render a configuration, or the plain scene, under conditions of a seed."""
+        """Render a configuration, or the plain scene, under conditions of a seed.
+
+        Args:
+            problem: of the scene.
+            seed: of the conditions and the noise.
+            u: (d,) the configuration that a search has found; None for the plain scene.
+        """
         configuration = problem.domain.start if u is None else u
         truth: Any = problem.find_truth(problem.add_conditions(configuration, seed))
+        # A region of segmentation has no box, nor has an object out of view.
         box = getattr(truth, "box", None)
-        boxes = torch.tensor([box] if box else [], dtype=torch.float32).reshape(-1, 4)
+        box_list = [box] if box else []
+        boxes = torch.tensor(box_list, dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
         return cls(
-            color.to_uint8(problem.picture(configuration, seed, SPP)),
-            boxes,
-            labels,
-            problem.task,
-            truth,
-            u is not None,
+            levels=color.to_uint8(problem.picture(configuration, seed, SPP)),
+            boxes=boxes,
+            labels=labels,
+            task=problem.task,
+            truth=truth,
+            is_adversarial=u is not None,
         )
 
     def is_right(self, model: Model) -> bool:
@@ -332,7 +340,11 @@ class DetectorTrainer(Trainer):
 
     @contextmanager
     def gradient_context(self, new: Sequence[Example]) -> Iterator[ComputeGradient]:
-        """Return a context in which gradients are computed in training mode."""
+        """Return a context in which gradients are computed in training mode.
+
+        Batch normalization and dropout stay in evaluation mode. Afterwards the network
+        is in evaluation mode.
+        """
         network = self.student.network.train()
         for module in network.modules():
             if isinstance(module, (_BatchNorm, nn.Dropout)):
@@ -341,6 +353,7 @@ class DetectorTrainer(Trainer):
         def compute_gradient(
             batch: Sequence[Example], rng: np.random.Generator
         ) -> None:
+            """Compute the gradient of a batch, half of it mirrored at random."""
             inputs = list[Tensor]()
             targets = list[Target]()
             for item in batch:
@@ -355,7 +368,10 @@ class DetectorTrainer(Trainer):
         network.eval()
 
     def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
-        """Return the network's input for an image, and the target in its pixels."""
+        """Return the network's input for an image, and the target in its pixels.
+
+        The target has "boxes" (K, 4), x0, y0, x1, y1, and "labels" (K,).
+        """
         levels = item.levels
         boxes = item.boxes
         height, width = item.levels.shape[:2]
@@ -508,8 +524,9 @@ def compute_pixel_loss(
 ) -> Tensor:
     """Return the loss of a segmenter.
 
-    Networks of transformers compute it from `labels`. Of others it is the mean of the
-    cross-entropy of the object's pixels and that of all others.
+    Networks of transformers compute it from `labels`. Of others it is half the sum of
+    the mean cross-entropy of the object's pixels and that of all others, over all
+    images; without such pixels that is 0.
 
     Args:
         task: reads the network's output.

@@ -171,26 +171,30 @@ def make_lessons(
         shares_texture: whether the views have one adversarial texture.
     """
     has_matrix = bool(n_views) and problem.is_linear
-    right = tuple(int(index) for index in problem.find_truth())
-    render = problem.renderer.copy_with(quick=True)
-    all_lessons = list[Lesson]()
+    lessons = list[Lesson]()
     with torch.no_grad(), problem.renderer.scene.limit_depth(MAX_DEPTH):
         if has_matrix:
-            all_lessons += _texture_lessons(
-                problem, n_views, seed, right, shares_texture
-            )
+            lessons += _make_texture_lessons(problem, n_views, seed, shares_texture)
         else:
-            all_lessons += _rendered_lessons(
-                problem, render, n_views, seed, right, n_tries
-            )
-        all_lessons += _plain_lessons(problem, render, n_plain, seed, right)
-    return all_lessons
+            lessons += _make_rendered_lessons(problem, n_views, seed, n_tries)
+        lessons += _make_plain_lessons(problem, n_plain, seed)
+    return lessons
 
 
-def _texture_lessons(
-    problem: Problem, views: int, seed: int, right: tuple[int, ...], shared: bool
+def _find_right_classes(problem: Problem) -> tuple[int, ...]:
+    """Return the indices of the right classes of a scene."""
+    return tuple(int(index) for index in problem.find_truth())
+
+
+def _make_texture_lessons(
+    problem: Problem, views: int, seed: int, shares_texture: bool
 ) -> list[TextureLesson]:
-    """Make a lesson with a matrix of light transport for each view."""
+    """Make a lesson with a matrix of light transport for each view.
+
+    Each has conditions of its own. Its texture begins at a random extreme
+    configuration, which is one object for all of them with `shares_texture`.
+    """
+    right_classes = _find_right_classes(problem)
     domain = problem.domain
     # Lessons do not hold the scene, which takes much memory.
     space = replace(problem.searched_space, scene=None)
@@ -205,11 +209,19 @@ def _texture_lessons(
         linear = problem.make_linear_renderer(configuration, view_seed, MATRIX_SPP)
         levels = color.to_uint8(linear(configuration))
         texture = shared_texture
-        if not shared:
+        if not shares_texture:
             texture = _sample_texture(domain, view_seed)
         linear.release_scene(full_space)
         texture_lessons.append(
-            TextureLesson(right, levels, space, domain, linear, conditions, texture)
+            TextureLesson(
+                right_classes=right_classes,
+                levels=levels,
+                space=space,
+                domain=domain,
+                linear=linear,
+                conditions=conditions,
+                texture=texture,
+            )
         )
     return texture_lessons
 
@@ -220,55 +232,61 @@ def _sample_texture(domain: policies.Domain, seed: int) -> Tensor:
     return domain.sample(generator, extreme=True)[0].clone()
 
 
-def _rendered_lessons(
-    problem: Problem,
-    render: Renderer,
-    views: int,
-    seed: int,
-    right: tuple[int, ...],
-    tries: int | None,
+def _make_rendered_lessons(
+    problem: Problem, views: int, seed: int, n_tries: int | None
 ) -> list[RenderedLesson]:
-    """Make a lesson with renders of random configurations for each view."""
+    """Make a lesson with renders of random configurations for each view.
+
+    The plain image is that of the start; without `n_tries` that of a random control
+    changed by itself, and the only other image has all of them changed.
+    """
+    right_classes = _find_right_classes(problem)
+    render = problem.renderer.copy_with(quick=True)
     domain = problem.domain
     rendered_lessons = []
     for number in range(views):
         view_seed = seeds.stream(seed, "lesson", number)
-        conditions = problem.add_conditions(domain.start, view_seed)[
-            domain.dim :
-        ].clone()
-        generator = torch.Generator().manual_seed(view_seed)
-        if tries is None:
-            n_controls = len(problem.searched_space.controls)
-            *single_changes, joint_change = sample_configurations(
-                domain, generator, 1 + n_controls
-            )
-            index = torch.randint(len(single_changes), (), generator=generator)
-            configurations = [single_changes[index], joint_change]
-        else:
-            configurations = [
-                domain.start,
-                *sample_configurations(domain, generator, tries),
-            ]
+        full_configuration = problem.add_conditions(domain.start, view_seed)
+        conditions = full_configuration[domain.dim :].clone()
         plain_image, *images = (
             render(torch.cat([u, conditions]), seed=view_seed, spp=SPP)
-            for u in configurations
+            for u in _sample_lesson_configurations(problem, view_seed, n_tries)
         )
         rendered_lessons.append(
-            RenderedLesson.create(right, plain_image, torch.stack(images))
+            RenderedLesson.create(right_classes, plain_image, torch.stack(images))
         )
     return rendered_lessons
 
 
-def _plain_lessons(
-    problem: Problem, render: Renderer, views: int, seed: int, right: tuple[int, ...]
-) -> list[Lesson]:
+def _sample_lesson_configurations(
+    problem: Problem, seed: int, n_tries: int | None
+) -> list[Tensor]:
+    """Sample the configurations (d,) of a lesson, that of the plain image first.
+
+    See `_make_rendered_lessons`.
+    """
+    domain = problem.domain
+    generator = torch.Generator().manual_seed(seed)
+    if n_tries is not None:
+        return [domain.start, *sample_configurations(domain, generator, n_tries)]
+    n_controls = len(problem.searched_space.controls)
+    *single_changes, joint_change = sample_configurations(
+        domain, generator, 1 + n_controls
+    )
+    index = torch.randint(len(single_changes), (), generator=generator)
+    return [single_changes[index], joint_change]
+
+
+def _make_plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
     """Make a lesson with one plain render for each view."""
+    right_classes = _find_right_classes(problem)
+    render = problem.renderer.copy_with(quick=True)
     plain_lessons = []
     for number in range(views):
         view_seed = seeds.stream(seed, "plain lesson", number)
         configuration = problem.add_conditions(problem.domain.start, view_seed)
         image = render(configuration, seed=view_seed, spp=SPP)
-        plain_lessons.append(Lesson(right, color.to_uint8(image)))
+        plain_lessons.append(Lesson(right_classes, color.to_uint8(image)))
     return plain_lessons
 
 
@@ -279,16 +297,18 @@ def sample_configurations(
 
     In half of them each value is moved by chance to the nearer bound of its range, as
     searches end where several values are at bounds. Choices and periodic values have no
-    bounds. Of several controls each changes by itself in turn, then all together.
+    bounds. The controls change each by itself in turn, then all together, then the
+    first by itself again; a control that does not change is at its start.
     """
-    samples = domain.sample(generator, count)
-    is_at_bound = (torch.rand(samples.shape, generator=generator) < 0.5) & (
-        torch.rand(count, 1, generator=generator) < 0.5
-    )
+    samples = domain.sample(generator, count)  # (count, d)
+    is_at_bound = torch.rand(samples.shape, generator=generator) < 0.5
+    has_bounds = torch.rand(count, 1, generator=generator) < 0.5
+    is_at_bound = is_at_bound & has_bounds
     control_of_block = [
         block.name.rpartition(".")[0] for block, _ in domain.list_block_slices()
     ]
     controls = list(dict.fromkeys(control_of_block))
+    # (count,) the index of the control that changes; after the last one, all change
     turn = torch.arange(count) % (len(controls) + 1)
     for control, (block, columns) in zip(
         control_of_block, domain.list_block_slices(), strict=True
@@ -300,9 +320,8 @@ def sample_configurations(
         is_at_bound[is_unchanged, columns] = False
     is_lower_nearer = samples - domain.lower < domain.upper - samples
     nearer_bound = torch.where(is_lower_nearer, domain.lower, domain.upper)
-    return torch.stack(
-        [domain.project(u) for u in torch.where(is_at_bound, nearer_bound, samples)]
-    )
+    samples = torch.where(is_at_bound, nearer_bound, samples)
+    return torch.stack([domain.project(u) for u in samples])
 
 
 def negative_log_likelihood(
@@ -390,22 +409,21 @@ def ascend_textures(
     ]
     if not texture_lessons:
         return
+    # Views that share a texture have one tensor.
     lesson_of_texture = {id(lesson.texture): lesson for lesson in texture_lessons}
     for _ in range(steps):
         gradient_of_texture = dict[int, Tensor]()
         gradients = gradients_of(texture_lessons)
         for lesson, gradient in zip(texture_lessons, gradients, strict=True):
             texture_id = id(lesson.texture)
-            gradient_of_texture[texture_id] = gradient + gradient_of_texture.get(
-                texture_id, 0.0
-            )
+            earlier = gradient_of_texture.get(texture_id, 0.0)
+            gradient_of_texture[texture_id] = gradient + earlier
         for texture_id, lesson in lesson_of_texture.items():
             direction = lesson.domain.steepest(
                 lesson.texture, gradient_of_texture[texture_id]
             )
-            lesson.texture.copy_(
-                lesson.domain.project(lesson.texture + STEP_FRACTION * direction)
-            )
+            moved_texture = lesson.texture + STEP_FRACTION * direction
+            lesson.texture.copy_(lesson.domain.project(moved_texture))
 
 
 def compute_texture_gradients(
@@ -441,10 +459,9 @@ def save_lesson_images(
     make equal files.
     """
     for index, lesson in enumerate(selected):
-        label = re.sub(
-            r"[^a-z0-9]+", "-", labels[lesson.right_classes[0]].lower()
-        ).strip("-")
-        class_directory = f"{IMAGE_DIRECTORY}/{lesson.right_classes[0]:04d}-{label}"
+        class_index = lesson.right_classes[0]
+        label = re.sub(r"[^a-z0-9]+", "-", labels[class_index].lower()).strip("-")
+        class_directory = f"{IMAGE_DIRECTORY}/{class_index:04d}-{label}"
         (run.path / class_directory).mkdir(parents=True, exist_ok=True)
         name = f"{number:03d}-{index:05d}"
         run.save_image(f"{name}-plain", lesson.plain_image, class_directory)

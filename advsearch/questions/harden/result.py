@@ -64,7 +64,7 @@ class HardenConfig(AttackConfig):
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target",
         "minimise", "over", "draws", "path", "shutter", "rolling", "average",
         "baseline", "seconds", "camera", "up", "facing", "size", "unit", "label",
-        "measure", "estimators", "things", "judge",
+        "measure", "estimators", "things", "judge", "backdrop", "occluder",
     )
 
     object: str = setting_as_in(

@@ -141,6 +141,8 @@ class Trainer(ABC):
     ) -> None:
         """Train the student on items.
 
+        It ends with the running average of its weights.
+
         Args:
             number: of the round, which decides the order of the items.
             pool: all items.
@@ -180,8 +182,9 @@ class Trainer(ABC):
     def _update_average(
         self, n_steps: int, average: Sequence[Tensor], parameters: Sequence[Tensor]
     ) -> None:
-        """Move the running average of the parameters towards their values after a
-        step.
+        """Move the running average of the parameters towards their values after a step.
+
+        The decay is smaller in the first steps, so that the average forgets the start.
         """
         decay = min(self.average_decay, n_steps / (n_steps + 5))
         for mean, parameter in zip(average, parameters, strict=True):
@@ -220,7 +223,8 @@ def adjust_warm_up(fraction: float, n_rates: int) -> float:
     It is a little larger where that is a single step, since OneCycleLR divides by the
     steps of its rise less one.
     """
-    return fraction * 1.001 if math.isclose(fraction * n_rates, 1.0) else fraction
+    is_single_step = math.isclose(fraction * n_rates, 1.0)
+    return fraction * 1.001 if is_single_step else fraction
 
 
 class Rounds:
@@ -251,8 +255,9 @@ class Rounds:
 
     @property
     def best(self) -> int:
-        """The most robust round whose clean accuracy has fallen by no more than
-        allowed.
+        """The most robust round whose clean accuracy has fallen by no more than allowed.
+
+        The last of several; 0, the original model, if there is none.
         """
         allowed = [
             number
@@ -265,52 +270,59 @@ class Rounds:
 
     def is_allowed(self, clean: float) -> bool:
         """Return whether a clean accuracy has fallen by no more than allowed."""
+        # 1e-9: a fall by exactly as much may be more by rounding.
         return clean >= self.results[0].clean - self.config.clean_loss - 1e-9
 
     def execute(self) -> None:
         """Run the rounds that are left, and write the best weights.
 
-        Afterwards the student has the best weights.
+        Items of rounds that have ended are sampled again, since later rounds train on
+        them too. Afterwards the student has the best weights.
         """
-        course = self.trainer
+        trainer = self.trainer
         config = self.config
-        network = course.student.network
+        network = trainer.student.network
         if len(self.results) <= config.rounds:
-            pool = list(course.custom_items)
-            n_trained = 0
+            pool = list(trainer.custom_items)
+            n_trained = 0  # items of the pool that an earlier round has used
             title = "drawing scenes to choose weights by"
-            held_back = course.sample_items(
+            held_back = trainer.sample_items(
                 title, VALIDATION, range(self.n_validation_scenes)
             )
             if not self.results:
                 self.progress.stage("judging the model as it is")
-                self.store_round(0, [], course.score(held_back), 0, 0.0)
+                self.store_round(
+                    0, [], trainer.score(held_back), n_trained=0, interpolation=0.0
+                )
             for number in range(1, config.rounds + 1):
                 network.load_state_dict(self.read_weights(number - 1))
                 scene_numbers = range(
                     (number - 1) * config.scenes, number * config.scenes
                 )
                 title = f"round {number}: drawing scenes"
-                new_items = course.sample_items(title, TRAINING, scene_numbers)
+                new_items = trainer.sample_items(title, TRAINING, scene_numbers)
                 pool += new_items
                 if number < len(self.results):
                     continue  # it ended before this run was stopped
                 self.progress.stage(
-                    f"round {number}: training", course.count_steps(pool)
+                    f"round {number}: training", trainer.count_steps(pool)
                 )
                 with workbench.all_for_torch():
                     # Earlier items are as hard as their training left them.
-                    course.round(
-                        number, pool, pool[n_trained:], lambda: self.progress.advance(1)
+                    trainer.round(
+                        number,
+                        pool,
+                        new=pool[n_trained:],
+                        tick=lambda: self.progress.advance(1),
                     )
                     self.progress.stage(
                         f"round {number}: choosing weights",
                         len(INTERPOLATIONS),
                         at_most=True,
                     )
-                    score, part = self.select_interpolation(held_back)
+                    score, interpolation = self.select_interpolation(held_back)
                 n_trained = len(pool)
-                self.store_round(number, new_items, score, len(pool), part)
+                self.store_round(number, new_items, score, n_trained, interpolation)
         network.load_state_dict(self.read_weights(self.best))
         self.write_weights(WEIGHTS_FILE)
 
@@ -333,31 +345,33 @@ class Rounds:
             name: weight.clone() for name, weight in network.state_dict().items()
         }
 
-        def interpolate(part: float) -> None:
+        def load_interpolated(interpolation: float) -> None:
+            """Load weights between both; those that are no floats are the trained."""
             interpolated = {
-                name: torch.lerp(original[name], weight, part)
+                name: torch.lerp(original[name], weight, interpolation)
                 for name, weight in trained.items()
                 if weight.is_floating_point()
             }
             network.load_state_dict({**trained, **interpolated})
 
-        scores = dict[float, Score]()
-        allowed = dict[float, float]()
-        for part in INTERPOLATIONS:
-            interpolate(part)
+        scores = dict[float, Score]()  # by interpolation
+        robust_of_allowed = dict[float, float]()  # likewise
+        for interpolation in INTERPOLATIONS:
+            load_interpolated(interpolation)
             score = self.trainer.score(held_back)
-            scores[part] = score
+            scores[interpolation] = score
             self.progress.advance(1, worst=score.robust)
             if self.is_allowed(score.clean):
-                allowed[part] = score.robust
-            if allowed and list(allowed.values())[-1] < max(allowed.values()):
+                robust_of_allowed[interpolation] = score.robust
+            robust = list(robust_of_allowed.values())
+            if robust and robust[-1] < max(robust):
                 break
-        if allowed:
-            best_part = max(allowed, key=allowed.__getitem__)
+        if robust_of_allowed:
+            best = max(robust_of_allowed, key=robust_of_allowed.__getitem__)
         else:
-            best_part = max(scores, key=lambda part: scores[part].clean)
-        interpolate(best_part)
-        return scores[best_part], best_part
+            best = max(scores, key=lambda interpolation: scores[interpolation].clean)
+        load_interpolated(best)
+        return scores[best], best
 
     def store_round(
         self,
@@ -365,7 +379,7 @@ class Rounds:
         new_items: Sequence[Any],
         score: Score,
         n_trained: int,
-        part: float,
+        interpolation: float,
     ) -> None:
         """Store the weights of a round, its new images and its result.
 
@@ -374,12 +388,14 @@ class Rounds:
             new_items: its new items.
             score: the score of the weights.
             n_trained: number of items that it was trained on.
-            part: the interpolation of the weights; see `mixed`.
+            interpolation: of the weights; see `select_interpolation`.
         """
         self.write_weights(ROUND_FILE.format(number))
         self.trainer.save_images(self.run, number, new_items)
         self.results.append(
-            TrainingRound(lessons=n_trained, part=part, **score._asdict(), kept=False)
+            TrainingRound(
+                lessons=n_trained, part=interpolation, **score._asdict(), kept=False
+            )
         )
         fields = [training_round.model_dump() for training_round in self.results]
         self.run.store.write_note(ROUNDS_NOTE, json.dumps(fields))

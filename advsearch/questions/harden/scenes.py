@@ -115,10 +115,10 @@ class SceneJobs:
         for batch in executor.compute([job] for job in jobs):
             (job,) = batch.items
             (value,) = batch.require_value(f"harden, scene {job.keywords['number']}")
-            progress_facts = (
-                {} if executor.stats is None else executor.stats.progress_counts
-            )
-            self.progress.advance(1, **progress_facts)
+            worker_counts: dict[str, float | str] = {}
+            if executor.stats is not None:
+                worker_counts = executor.stats.progress_counts
+            self.progress.advance(1, **worker_counts)
             yield index_of_job[id(job)], value
 
     def sample_lessons(
@@ -267,6 +267,9 @@ class SceneJobs:
     ) -> tuple[Problem, int]:
         """Return the problem of a scene, and the root seed of its samples.
 
+        `RANDOM_RANGES` vary at random, unless a control of the same kind is among the
+        others. A scene that is not held out must not have an object that is.
+
         Args:
             split: the split.
             number: of the scene.
@@ -278,14 +281,13 @@ class SceneJobs:
         )
         if split.name != HELD_OUT:
             check_not_held_out(scene.description.object, self._held_out_fingerprints)
-        control_types = {
+        # the kind of "light:key" and of "camera.azimuth"
+        kinds = {
             control.partition(":")[0].partition(".")[0]
             for control in (*controls, *varying_controls)
         }
         over = {
-            control_type: ranges
-            for control_type, ranges in RANDOM_RANGES.items()
-            if control_type not in control_types
+            kind: ranges for kind, ranges in RANDOM_RANGES.items() if kind not in kinds
         }
         over |= {control: self.config.controls[control] for control in varying_controls}
         config = self.make_attack_config(controls, name, over=over)
@@ -349,7 +351,11 @@ def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
 
 
 def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
-    """Attack a scene, and return the status; see `SceneJobs.attacked`."""
+    """Attack a scene, and return the status; see `SceneJobs.attack_held_out`.
+
+    That is how the attack ended, if it found something or the scene is wrong already;
+    "unsteady" if the clean scene is right in too few trials to be called robust.
+    """
     summary = workbench.attack_on(config, scene, model).summary
     if summary.ending == results.INTERRUPTED:
         raise KeyboardInterrupt

@@ -76,6 +76,10 @@ class ClassifierTrainer(Trainer):
         optimiser: creates the optimizer; None for AdamW.
         beside: further batches, of which one is taken with each step. They are
             repeated from the start when they end.
+
+    Attributes:
+        n_views: views of a scene of the training, and of the validation, for controls
+            with a matrix of light transport.
     """
 
     batch_size = 24
@@ -120,7 +124,7 @@ class ClassifierTrainer(Trainer):
                 n_views = self.n_views[1]
                 n_plain = 0
             jobs += [
-                _lesson_job(split, number, rendered, n_views, n_plain)
+                _make_job(split, number, rendered, views=n_views, plain=n_plain)
                 for number in scene_numbers
             ]
         if split == TRAINING:
@@ -132,24 +136,29 @@ class ClassifierTrainer(Trainer):
         return sampled_lessons
 
     def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Job]:
-        """Return the jobs of the controls that have a matrix of light transport."""
+        """Return the jobs of the controls that have a matrix of light transport.
+
+        Only scenes of the training may share a texture, or have other controls vary.
+        """
         is_training = split == TRAINING
         n_views = self.n_views[0] if is_training else self.n_views[1]
         jobs = list[Job]()
         for control in self.work.linear_controls:
             for number in scene_numbers:
                 shares_texture = False
-                varies = False
+                varies_others = False
                 if is_training:
-                    shares_texture, varies = self.sample_scene_options(control, number)
-                varying_controls = self.work.random_controls if varies else ()
+                    shares_texture, varies_others = self.sample_scene_options(
+                        control, number
+                    )
+                varying_controls = self.work.random_controls if varies_others else ()
                 jobs.append(
-                    _lesson_job(
+                    _make_job(
                         split,
                         number,
                         (control,),
-                        n_views,
-                        1,
+                        views=n_views,
+                        plain=1,
                         shared=shares_texture,
                         varying_controls=varying_controls,
                     )
@@ -157,7 +166,10 @@ class ClassifierTrainer(Trainer):
         return jobs
 
     def _further_jobs(self, scene_numbers: range) -> list[Job]:
-        """Return the jobs of the further scenes of the training, of one view each."""
+        """Return the jobs of the further scenes of the training, of one view each.
+
+        The view is rendered with the rendered controls if there are any, else plain.
+        """
         first = self.n_further_scenes * scene_numbers[0]
         end = self.n_further_scenes * (scene_numbers[-1] + 1)
         controls = self.work.linear_controls[:1]
@@ -168,28 +180,29 @@ class ClassifierTrainer(Trainer):
             n_views = 1
             n_plain = 0
         return [
-            _lesson_job(FURTHER, number, controls, n_views, n_plain)
+            _make_job(FURTHER, number, controls, views=n_views, plain=n_plain)
             for number in range(first, end)
         ]
 
     def sample_scene_options(self, control: str, number: int) -> tuple[bool, bool]:
         """Return whether the views of a scene share a texture, and others vary too.
 
-        It is random, since objects take turns.
+        It is random, and not every fourth scene, since objects take turns.
         """
         seed = seeds.stream(self.config.seed, f"views of {control}", number)
-        shared, moved = np.random.default_rng(seed).random(2)
-        return bool(shared < SHARED_TEXTURE_PROBABILITY), bool(
-            moved < RANDOM_CONTROLS_PROBABILITY
-        )
+        shared_draw, varied_draw = np.random.default_rng(seed).random(2)
+        shares_texture = bool(shared_draw < SHARED_TEXTURE_PROBABILITY)
+        varies_others = bool(varied_draw < RANDOM_CONTROLS_PROBABILITY)
+        return shares_texture, varies_others
 
     def uses_per_epoch(self, item: Lesson) -> int:
-        return (
-            self.config.texture_uses_per_epoch if isinstance(item, TextureLesson) else 1
-        )
+        if isinstance(item, TextureLesson):
+            return self.config.texture_uses_per_epoch
+        return 1
 
     @contextmanager
     def gradient_context(self, new: Sequence[Lesson]) -> Iterator[ComputeGradient]:
+        """Search worse images of the new lessons, then open threads for gradients."""
         lessons.search_worse_images(new, self.student.model, N_FIRST_STEPS)
         with open_single_threaded_pool() as pool:
             gradients = GradientComputer(self.student, self.work.model, pool)
@@ -230,7 +243,7 @@ class ClassifierTrainer(Trainer):
         lessons.save_lesson_images(run, number, new, self.student.model.labels)
 
 
-def _lesson_job(
+def _make_job(
     split: str,
     number: int,
     controls: Sequence[str],
@@ -238,7 +251,7 @@ def _lesson_job(
     plain: int,
     **options: Any,
 ) -> Job:
-    """Return the job that makes lessons of a scene; see `SceneJobs.drawn`."""
+    """Return the job that makes lessons of a scene; see `SceneJobs.sample_lessons`."""
     return partial(
         SceneJobs.sample_lessons,
         split=split,
@@ -275,7 +288,7 @@ class GradientComputer:
 
     Args:
         student: the network, whose parameters collect the gradients.
-        given: the model before it was trained.
+        original_model: the model before it was trained.
         pool: the threads.
     """
 
@@ -285,6 +298,7 @@ class GradientComputer:
         self._student = student
         self._original_model = original_model
         self._pool = pool
+        # copies of the student that share its weights, one for each part of a batch
         self._twins: list[Trainable] = []
 
     def compute(
@@ -295,7 +309,7 @@ class GradientComputer:
     ) -> None:
         """Make the worst images of lessons worse, and compute the gradient of the loss.
 
-        The gradient is left with the parameters.
+        The gradient is left with the parameters. A further batch adds its mean loss.
 
         Args:
             batch: the lessons.
@@ -310,6 +324,7 @@ class GradientComputer:
         def texture_gradients(
             part: Sequence[TextureLesson], twin: Trainable, seed: int
         ) -> Sequence[Tensor]:
+            """Return the gradient (d,) of the loss by the texture of each lesson."""
             return lessons.compute_texture_gradients(
                 part, twin.evaluation_logits, lambda images: _augment(images, seed)
             )
@@ -317,6 +332,7 @@ class GradientComputer:
         def weight_gradients(
             part: Sequence[Lesson], twin: Trainable, seed: int
         ) -> Sequence[Tensor | None]:
+            """Return the gradient of the loss of a part by each parameter."""
             loss = self._loss(twin, part, plain_weight, worst_weight, seed)
             return torch.autograd.grad(loss, twin.parameters(), allow_unused=True)
 
@@ -340,6 +356,7 @@ class GradientComputer:
         for parameter, *part_gradients in zip(
             self._student.parameters(), *gradients, strict=True
         ):
+            # None: the part's loss does not depend on the parameter
             used = [gradient for gradient in part_gradients if gradient is not None]
             parameter.grad = torch.stack(used).sum(dim=0) if used else None
 
@@ -384,16 +401,20 @@ class GradientComputer:
             worst_weight: of each worst image.
             seed: of the augmentation and the mixing.
         """
-        hard_lessons = select_hard_lessons(part)
-        taught: list[Lesson] = [*part, *hard_lessons]
-        right = [lesson.right_classes for lesson in taught]
-        images = _augmented_images(part, hard_lessons, seed)
+        # of each image: first all plain ones, then the worst ones
+        lesson_of_image: list[Lesson] = [*part, *select_hard_lessons(part)]
+        right = [lesson.right_classes for lesson in lesson_of_image]
+        images = _augment_images(part, select_hard_lessons(part), seed)
 
-        mixed, partners, partner_weight = _mix_images(seed, taught, images)
+        mixed, partners, partner_weight = _mix_images(images, lesson_of_image, seed)
 
         logits = student.logits(images)
         losses = negative_log_likelihood(logits, right)
-        _mix_losses(mixed, logits, right, partners, losses, partner_weight)
+        if mixed:
+            partner_losses = negative_log_likelihood(
+                logits[mixed], [right[index] for index in partners]
+            )
+            losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
         loss = (
             plain_weight * losses[: len(part)].sum()
             + worst_weight * losses[len(part) :].sum()
@@ -429,32 +450,26 @@ class GradientComputer:
         )
 
 
-def _mix_losses(
-    mixed: Sequence[int],
-    logits: Tensor,
-    right: Sequence[tuple[int, ...]],
-    partners: Sequence[int],
-    losses: Tensor,
-    partner_weight: float,
-) -> None:
-    """Mix the losses of mixed images in place, as those of both right classes."""
-    if mixed:
-        partner_losses = negative_log_likelihood(
-            logits[mixed], [right[index] for index in partners]
-        )
-        losses[mixed] = torch.lerp(losses[mixed], partner_losses, partner_weight)
-
-
 def _mix_images(
-    seed: int, taught: Sequence[Lesson], images: Tensor
+    images: Tensor, lesson_of_image: Sequence[Lesson], seed: int
 ) -> tuple[list[int], list[int], float]:
-    """Mix rendered images with each other in place, at random (mixup)."""
+    """Mix rendered images with each other in place, at random (mixup).
+
+    Args:
+        images: (N, H, W, 3), which are changed.
+        lesson_of_image: N of them.
+        seed: of the choice whether they are mixed, of the partners and of the weight.
+
+    Returns:
+        The indices of the images that are mixed, none if it was decided so; the index
+        of the partner of each; and the weight of the partner, at most 1/2.
+    """
     rng = np.random.default_rng(seed)
     mixed = list[int]()
     if rng.random() < MIXUP_PROBABILITY:
         mixed = [
             index
-            for index, lesson in enumerate(taught)
+            for index, lesson in enumerate(lesson_of_image)
             if isinstance(lesson, RenderedLesson)
         ]
     partners = rng.permutation(mixed).astype(int).tolist()
@@ -474,7 +489,7 @@ def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
     ]
 
 
-def _augmented_images(
+def _augment_images(
     part: Sequence[Lesson], hard_lessons: Sequence[Lesson], seed: int
 ) -> Tensor:
     """Return the plain images of lessons, then the worst ones, augmented (N, H, W, 3).

@@ -208,6 +208,7 @@ class Photographs:
     row_kinds = (PHOTO, LOOSE_PHOTO)
 
     def __init__(self) -> None:
+        # of the last run
         self._load_evaluators = lru_cache(maxsize=1)(_load_evaluators)
         # A scene is used only by the thread that loaded it.
         self._thread = ThreadPoolExecutor(1, "photographs")
@@ -224,8 +225,14 @@ class Photographs:
             InputError: there is no such rendering, the data is no photograph, another
                 process works on the run, or its scene has changed.
         """
-        self._thread.submit(self._add, run, rendering, data, "").result()
+        self._add_in_thread(run, rendering, data, source="")
         return photo_agreement(run)
+
+    def _add_in_thread(
+        self, run: Path, rendering: str | None, data: bytes, source: str
+    ) -> None:
+        """Evaluate and store a photograph in the thread of the scene, and wait."""
+        self._thread.submit(self._add, run, rendering, data, source).result()
 
     def add_files(self, run: Path, files: Sequence[Path]) -> None:
         """Evaluate and store the photographs that a sweep of one object does not have.
@@ -247,7 +254,7 @@ class Photographs:
             rendering = aligned[1] if aligned else None
             data = stored_files.read_bytes(file, "a photograph", markup.MAX_BODY_BYTES)
             try:
-                self._thread.submit(self._add, run, rendering, data, file.name).result()
+                self._add_in_thread(run, rendering, data, source=file.name)
             except InputError as error:
                 raise InputError(f"{file.name}: {error}") from None
 
@@ -263,7 +270,14 @@ class Photographs:
     def _add(self, run: Path, rendering: str | None, data: bytes, source: str) -> None:
         """Evaluate a photograph by all models of a run, and store it.
 
-        Without a rendering only the predictions are stored.
+        It is cut to the size of the rendering, or else of the model's images. Without a
+        rendering only the predictions are stored.
+
+        Args:
+            run: the directory of the run.
+            rendering: name of the rendering that it was aligned with, if any.
+            data: the image file.
+            source: name of the file that it came from; empty if a browser sent it.
         """
         file = None
         cut_photo = b""
@@ -287,34 +301,36 @@ class Photographs:
                     )
                     photo |= {"rendering": rendering, "right": right, "label": label}
                     photo["file"] = f"{rendering}-{number:04d}.jpg"
-                row = _make_row(rendering, values, evaluator, kind, number, cut_photo)
+                row = workbench.Row(kind, number, values=values)
+                row = _add_prediction(row, evaluator, rendering, cut_photo)
                 payload = {"photo": {**photo}, "answer": row.payload}
                 rows.append(replace(row, payload=payload))
             _write_photo(run, file, photo, cut_photo)
             resumed_run.append_rows(*rows)
 
 
-def _make_row(
+def _add_prediction(
+    row: workbench.Row,
+    evaluator: _PhotoEvaluator,
     rendering: str | None,
-    values: Mapping[str, workbench.Value],
-    evaluator: Any,
-    kind: str,
-    number: int,
     cut_photo: bytes,
 ) -> workbench.Row:
-    """Return the row of a model's prediction on a photograph."""
+    """Return a row with a model's prediction on a photograph.
+
+    Args:
+        row: with the values of the rendering, if there is one.
+        evaluator: of the model, whose name is added to the values.
+        rendering: name of the rendering that the photograph was aligned with, if any.
+        cut_photo: the image file.
+    """
     # A sweep over several objects stores which one it was.
     object_name = None
-    if "object" in values:
-        object_name = str(values["object"]["value"])
-    model_value: workbench.Value = {
-        "value": evaluator.model.name,
-        "unit": "",
-    }
-    return workbench.add_judgement(
-        workbench.Row(kind, number, values={**values, "model": model_value}),
-        evaluator.evaluate(rendering, object_name, cut_photo),
-    )
+    if "object" in row.values:
+        object_name = str(row.values["object"]["value"])
+    model_value: workbench.Value = {"value": evaluator.model.name, "unit": ""}
+    row = replace(row, values={**row.values, "model": model_value})
+    judgement = evaluator.evaluate(rendering, object_name, cut_photo)
+    return workbench.add_judgement(row, judgement)
 
 
 def _write_photo(
@@ -408,76 +424,98 @@ def _load_evaluators(run: Path) -> list[_PhotoEvaluator]:
 
 
 def _load_sweep_evaluators(config: SweepConfig) -> list[_PhotoEvaluator]:
-    """Load the models of a sweep, and find ground truth by the numbers of its
-    images.
-    """
-    scenes = workbench.load_scenes_of_sweep(config)
-    job = scenes.job
-
-    def find_truth(
-        model_index: int, rendering: str | None, object_name: str | None
-    ) -> workbench.Truth:
-        """Return the ground truth of an image of the sweep, or of the object in
-        view.
-        """
-        task = job.tasks[model_index]
-        if rendering is None or not _needs_position(task):
-            matching = [
-                candidate for candidate in job.scenes if candidate.object == object_name
-            ]
-            swept_scene = matching[0] if matching else job.scenes[0]
-            return task.truth(job.make_facts(swept_scene, {}))
-        number = int(rendering)
-        if number >= job.images_per_scene * len(job.scenes):
-            raise InputError(
-                f"rendering: the sweep has no picture {rendering}; it "
-                "belongs to another run"
-            )
-        scene, queries = scenes.make_queries(number)
-        query = queries[model_index]
-        return scene.problems[model_index].find_truth(query.u, query.values)
-
-    models = zip(job.models, job.tasks, job.image_sizes, strict=True)
+    """Load the models of a sweep, with the ground truth of its images."""
+    sweep = workbench.load_scenes_of_sweep(config)
+    models = zip(sweep.job.models, sweep.job.tasks, sweep.job.image_sizes, strict=True)
     return [
         _PhotoEvaluator(
-            model, task, size, partial(find_truth, index), index, len(job.models)
+            model=model,
+            task=task,
+            size=size,
+            find_truth=partial(_find_sweep_truth, sweep, index),
+            index=index,
+            n_models=len(sweep.job.models),
         )
         for index, (model, task, size) in enumerate(models)
     ]
 
 
-def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
-    """Load the models of an attack, and find ground truth by the names of its
-    images.
+def _find_sweep_truth(
+    sweep: Any, model_index: int, image_number: str | None, object_name: str | None
+) -> workbench.Truth:
+    """Return the ground truth of an image of a sweep for the task of a model.
+
+    If that does not depend on the configuration, or no image is named, it is that of
+    the object.
+
+    Args:
+        sweep: the loaded scenes (`SceneLoader`).
+        model_index: of the model.
+        image_number: number of the image as text; None for a photograph that was
+            aligned with none.
+        object_name: of the object; None, or one that the sweep does not have, for its
+            first one, which is the only one then.
+
+    Raises:
+        InputError: the sweep has no such image.
     """
+    job = sweep.job
+    task = job.tasks[model_index]
+    if image_number is None or not _needs_position(task):
+        named_scene = next(
+            (scene for scene in job.scenes if scene.object == object_name),
+            job.scenes[0],
+        )
+        return task.truth(job.make_facts(named_scene, {}))
+    number = int(image_number)
+    if number >= job.images_per_scene * len(job.scenes):
+        raise InputError(
+            f"rendering: the sweep has no picture {image_number}; it "
+            "belongs to another run"
+        )
+    scene, queries = sweep.make_queries(number)
+    query = queries[model_index]
+    return scene.problems[model_index].find_truth(query.u, query.values)
+
+
+def _load_attack_evaluators(run: Path, config: AttackConfig) -> list[_PhotoEvaluator]:
+    """Load the models of an attack, with the ground truth of its images."""
     problem, _ = workbench.problem_from_config(workbench.with_evaluation_only(config))
 
     def find_truth(task: Task, rendering: str | None, _: str | None) -> workbench.Truth:
-        """Return the ground truth of the clean or adversarial scene, or of a trial."""
+        """Return the ground truth of the clean or adversarial scene, or of a trial.
+
+        Renderings are named "clean", "adversarial" or "verification-NUMBER"; a trial
+        has the conditions of its seed, the others those that the scene comes with. The
+        clean scene stands for a photograph without a rendering, and for a task that
+        does not depend on the configuration.
+        """
         u = problem.domain.start
         is_adversarial = rendering not in (None, "clean")
         if is_adversarial and _needs_position(task):
             u = workbench.read_stored_configuration(run, problem)
-        trial = (rendering or "").rpartition("verification-")[2]
+        _, _, trial = (rendering or "").rpartition("verification-")
         seed = None
         if trial.isdigit():
             seed = seeds.stream(problem.seed, "verification", int(trial))
         configuration = problem.add_conditions(u, seed)
-        find_surfaces = partial(problem.renderer.surfaces, configuration)
-        describe = partial(problem.space.describe, configuration)
-        return task.truth(problem.make_facts(describe, find_surfaces))
+        facts = problem.make_facts(
+            lambda: problem.space.describe(configuration),
+            lambda: problem.renderer.surfaces(configuration),
+        )
+        return task.truth(facts)
 
     models: list[tuple[Model, Task]] = [(problem.model, problem.task)]
     if isinstance(problem.task, workbench.EnsembleTask):
         models = list(zip(problem.task.models, problem.task.tasks, strict=True))
     return [
         _PhotoEvaluator(
-            model,
-            task,
-            config.resolution or model.input_size,
-            partial(find_truth, task),
-            index,
-            len(models),
+            model=model,
+            task=task,
+            size=config.resolution or model.input_size,
+            find_truth=partial(find_truth, task),
+            index=index,
+            n_models=len(models),
         )
         for index, (model, task) in enumerate(models)
     ]

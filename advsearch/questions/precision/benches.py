@@ -74,16 +74,18 @@ class MeasuredRounds:
         setting of its line; else at the highest rate of any line; 0 without any.
         """
         if setting in self.wall_seconds:
-            walls = self.wall_seconds[setting]
-            warm = walls[COLD_CALLS:] or walls[-1:]
-            return statistics.median(warm[-3:])
-        by_cost = sorted(self.wall_seconds, key=lambda each: each.cost)
+            call_seconds = self.wall_seconds[setting]
+            warm_calls = call_seconds[COLD_CALLS:] or call_seconds[-1:]
+            return statistics.median(warm_calls[-3:])
+        by_cost = sorted(self.wall_seconds, key=lambda known: known.cost)
+        # The last one of a line, which is the most expensive, stays.
         most_expensive = {known.line: known for known in by_cost}
-        rates = {
+        seconds_per_cost = {
             line: self.estimate_call_seconds(known) / known.cost
             for line, known in most_expensive.items()
         }
-        return setting.cost * rates.get(setting.line, max(rates.values(), default=0.0))
+        highest = max(seconds_per_cost.values(), default=0.0)
+        return setting.cost * seconds_per_cost.get(setting.line, highest)
 
     def estimate_needed_seconds(
         self, setting: SampleSetting, seconds_left: float
@@ -91,21 +93,26 @@ class MeasuredRounds:
         """Estimate the seconds for `MIN_CALLS` calls of a new setting and of earlier
         ones.
 
-        An earlier setting that needs more than a fraction `MAX_SETTING_FRACTION` of the
-        remaining time turned out too expensive, and waits until the end.
+        The first calls of the new setting take longer by the median of what those of
+        earlier ones took. An earlier setting that needs more than a fraction
+        `MAX_SETTING_FRACTION` of the remaining time turned out too expensive, and waits
+        until the end.
         """
-        cold_seconds = list[float]()
+        extra_of_first_calls = list[float]()
         earlier_seconds = 0.0
-        for known, walls in self.wall_seconds.items():
-            call_seconds = self.estimate_call_seconds(known)
-            if len(walls) > COLD_CALLS:
-                cold_seconds.append(sum(walls[:COLD_CALLS]) - COLD_CALLS * call_seconds)
-            needed = max(0, MIN_CALLS - len(walls)) * call_seconds
+        for known, call_seconds in self.wall_seconds.items():
+            warm_seconds = self.estimate_call_seconds(known)
+            if len(call_seconds) > COLD_CALLS:
+                first_seconds = sum(call_seconds[:COLD_CALLS])
+                extra_of_first_calls.append(first_seconds - COLD_CALLS * warm_seconds)
+            needed = max(0, MIN_CALLS - len(call_seconds)) * warm_seconds
             if needed <= MAX_SETTING_FRACTION * seconds_left:
                 earlier_seconds += needed
-        first = max(0.0, statistics.median(cold_seconds)) if cold_seconds else 0.0
+        extra_seconds = 0.0
+        if extra_of_first_calls:
+            extra_seconds = max(0.0, statistics.median(extra_of_first_calls))
         new_seconds = MIN_CALLS * self.estimate_call_seconds(setting)
-        return first + new_seconds + earlier_seconds
+        return extra_seconds + new_seconds + earlier_seconds
 
 
 def measure_in_rounds(
@@ -128,30 +135,32 @@ def measure_in_rounds(
     """
     measured = MeasuredRounds()
 
-    def call(setting: SampleSetting) -> None:
+    def measure_once(setting: SampleSetting) -> None:
+        """Measure a setting with the next seed of its own, and store time and result."""
         measurements = measured.results.setdefault(setting, [])
         start = budget.clock()
         stream = f"precision {'/'.join(setting.line)}/{setting.spp}"
-        measurements.append(
-            measure(setting, seeds.stream(seed, stream, len(measurements)))
-        )
+        call_seed = seeds.stream(seed, stream, len(measurements))
+        measurements.append(measure(setting, call_seed))
         measured.wall_seconds.setdefault(setting, []).append(budget.clock() - start)
         on_done(setting)
 
-    for setting in sorted(settings, key=lambda each: each.cost):
-        if (
-            measured.results
-            and measured.estimate_needed_seconds(setting, budget.seconds_left)
-            > budget.seconds_left
-        ):
-            measured.skipped.append(setting)
+    def fits(setting: SampleSetting) -> bool:
+        """Return whether a new setting fits into the remaining time."""
+        needed = measured.estimate_needed_seconds(setting, budget.seconds_left)
+        return needed <= budget.seconds_left
+
+    for setting in sorted(settings, key=lambda setting: setting.cost):
+        is_first = not measured.results
+        if is_first or fits(setting):
+            for _ in range(COLD_CALLS):
+                measure_once(setting)
         else:
-            call(setting)
-            call(setting)
+            measured.skipped.append(setting)
     for _ in range(1, rounds):
         for setting in measured.results:
             if measured.estimate_call_seconds(setting) <= budget.seconds_left:
-                call(setting)
+                measure_once(setting)
     return measured
 
 
@@ -164,16 +173,17 @@ def take_reference_parts(
     """Return as many independent parts of a reference as fit into a budget.
 
     Each has its own seed. There are at least two, whatever they take: without these,
-    nothing is known about the error.
+    nothing is known about the error. At most there are `MAX_REFERENCE_PARTS`.
     """
     parts: list[Part] = []
-    slowest = 0.0
-    while len(parts) < 2 or (
-        len(parts) < MAX_REFERENCE_PARTS and slowest < budget.seconds_left
-    ):
+    expected_seconds = 0.0  # of the next part
+    while len(parts) < MAX_REFERENCE_PARTS:
+        if len(parts) >= 2 and expected_seconds >= budget.seconds_left:
+            break
         start = budget.clock()
         parts.append(take_part(seeds.stream(seed, "reference", len(parts))))
-        slowest = max(budget.clock() - start, 0.5 * slowest)
+        # A slow part may come again, but one slow part does not count for ever.
+        expected_seconds = max(budget.clock() - start, 0.5 * expected_seconds)
         on_done()
     return parts
 
@@ -205,13 +215,14 @@ def choose_part_samples(
     return max(fitting, default=counts[0])
 
 
-def measure_time(take: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
-    """Call a function; return its result, and seconds of processor and wall clock
-    time.
+def run_timed(function: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
+    """Call a function; return its result and its times.
+
+    `seconds` is the time of all processors, `wall_seconds` that of the clock.
     """
     process_start = time.process_time()
     wall_start = time.perf_counter()
-    result = take()
+    result = function()
     return result, {
         "seconds": time.process_time() - process_start,
         "wall_seconds": time.perf_counter() - wall_start,
@@ -241,7 +252,11 @@ class PictureBench:
     margin.
 
     Every sampler is measured, some with a denoiser too. Pictures with and without
-    denoiser have the same reference, margins their own.
+    denoiser have the same reference, margins their own. A *line* is the name of a
+    sampler, with `OIDN` at its end if it is denoised.
+
+    Attributes:
+        settings: all lines with all of their sample counts.
     """
 
     def __init__(
@@ -259,6 +274,7 @@ class PictureBench:
         for name in ("independent", REFERENCE_SAMPLER):
             if name in samplers:
                 self._lines.append(name + OIDN)
+        # by quantity and denoiser
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {
             name: renderer.scene.copy_with(sampler=name)
@@ -276,10 +292,10 @@ class PictureBench:
             for count in SAMPLE_COUNTS.get(line, (4, 16, 64, 256)):
                 self.settings.append(
                     SampleSetting(
-                        "picture",
-                        line,
-                        count,
-                        count * cost_factor,
+                        quantity="picture",
+                        estimator=line,
+                        spp=count,
+                        cost=count * cost_factor,
                         family=get_denoiser(line),
                     )
                 )
@@ -287,63 +303,77 @@ class PictureBench:
     def compute_references(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> list[PrecisionReference]:
-        """Render the references, one for each denoiser, within a budget."""
+        """Render the references, one for each denoiser, within a budget.
+
+        Each is the mean radiance of independent renders, shown as an image.
+        """
         families = list(dict.fromkeys(map(get_denoiser, self._lines)))
         rows = []
         for index, family in enumerate(families):
-            share = budget.take_fraction(1.0 / (len(families) - index))
-            name = REFERENCE_SAMPLER + OIDN * (family == "oidn")
-            take = partial(self._radiance, name)
-            spp = choose_part_samples(partial(take, 0), share.seconds_left)
+            family_budget = budget.take_fraction(1.0 / (len(families) - index))
+            line = REFERENCE_SAMPLER
+            if family == "oidn":
+                line += OIDN
+            spp = choose_part_samples(
+                partial(self._render_radiance, line, 0), family_budget.seconds_left
+            )
             radiances = take_reference_parts(
-                partial(take, spp=spp), share, on_done, seed
+                partial(self._render_radiance, line, spp=spp),
+                family_budget,
+                on_done,
+                seed,
             )
             parts = [flatten(radiance) for radiance in radiances]
-            picture = estimate_reference(
+            image = estimate_reference(
                 parts, lambda mean: flatten(self._display_mean(mean))
             )
             margin = estimate_reference(
                 parts, lambda mean: np.array([self._margin(self._display_mean(mean))])
             )
             self._references["margin", family] = margin
-            # that without denoiser, which comes first, is the reference of all pictures
-            undenoised = self._references.get(("picture", "none"), picture)
+            # that without denoiser, which comes first, is the reference of all images
+            undenoised = self._references.get(("picture", "none"), image)
             self._references["picture", family] = undenoised
             if family == "none":
-                rows.append(_make_row("picture", name, picture, spp))
-            rows.append(_make_row("margin", name, margin, spp))
+                rows.append(_make_row("picture", line, image, spp))
+            rows.append(_make_row("margin", line, margin, spp))
         return rows
 
     def _display_mean(self, mean: Float64Array) -> Tensor:
-        """Return the picture of a mean radiance (n,)."""
+        """Return the image (H, W, 3) of a mean radiance (n,)."""
         size = (*self._formation.resolution, 3)
-        return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(size))
+        return self._display(torch.from_numpy(mean).to(torch.float32).reshape(size))
 
     def reference_error(self, setting: SampleSetting, quantity: str) -> float:
         """Return the error of the reference of a quantity."""
         return self._references[quantity, setting.family].error
 
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
-        """Render a picture; return its errors, those of the margin, and the times."""
-        radiance, times = measure_time(
-            partial(self._radiance, setting.estimator, seed, setting.spp)
+        """Render an image; return the errors of the image and of the margin.
+
+        Both have the times of the render.
+        """
+        radiance, times = run_timed(
+            lambda: self._render_radiance(setting.estimator, seed, setting.spp)
         )
-        picture = self._picture(radiance)
-        values = {
-            "picture": flatten(picture),
-            "margin": np.array([self._margin(picture)]),
+        image = self._display(radiance)
+        value_of_quantity = {
+            "picture": flatten(image),
+            "margin": np.array([self._margin(image)]),
         }
         numbers = dict[str, Numbers]()
-        for name, value in values.items():
-            reference = self._references[name, setting.family]
-            numbers[name] = {**reference.compare(value), **times}
+        for quantity, value in value_of_quantity.items():
+            reference = self._references[quantity, setting.family]
+            numbers[quantity] = {**reference.compare(value), **times}
         return numbers
 
-    def _radiance(self, line: str, seed: int, spp: int) -> Tensor:
+    def _render_radiance(self, line: str, seed: int, spp: int) -> Tensor:
+        """Render the linear image (H, W, 3) of a line."""
         with torch.no_grad():
             return self._renderers[line].radiance(self._u, seed, spp)
 
-    def _picture(self, radiance: Tensor) -> Tensor:
+    def _display(self, radiance: Tensor) -> Tensor:
+        """Return the image (H, W, 3) in sRGB, as the model gets it."""
         with torch.no_grad():
             return self._space.apply_to_image(
                 self._u, self._formation.display(radiance)
@@ -365,7 +395,10 @@ MAX_DIFFERENCE_COORDINATES = 32
 class GradientPart:
     """Coordinates of a control whose gradient one call computes.
 
-    It is named with parameters if a control has several parts.
+    Attributes:
+        name: of the control, with the parameters if a control has several parts.
+        groups: which have the coordinates.
+        estimators: that are valid for all of them.
     """
 
     name: str
@@ -428,6 +461,11 @@ class GradientBench:
 
     The reference has a better sampler: differences at two steps for few coordinates,
     else the mean of an adjoint.
+
+    Attributes:
+        part: the coordinates.
+        reference: of the gradient; None before it is computed.
+        settings: all estimators with all of their sample counts.
     """
 
     def __init__(
@@ -445,48 +483,62 @@ class GradientBench:
             renderer.scene.copy_with(sampler=REFERENCE_SAMPLER)
         )
         self._by_differences = part.size <= MAX_DIFFERENCE_COORDINATES
-        adjoints = [name for name in part.estimators if name in ADJOINT_COST]
-        self._reference_estimator = (
-            "differences" if self._by_differences else (*adjoints, *part.estimators)[0]
-        )
+        if self._by_differences:
+            self._reference_estimator = "differences"
+        else:
+            # an adjoint, if there is one
+            adjoints = [name for name in part.estimators if name in ADJOINT_COST]
+            self._reference_estimator = (*adjoints, *part.estimators)[0]
         self.reference: ReferenceValue | None = None
         self.settings = list[SampleSetting]()
         for name in part.estimators:
             cost = 1.0 + ADJOINT_COST.get(name, part.count_renders(name))
             for count in SAMPLE_COUNTS["independent"]:
                 self.settings.append(
-                    SampleSetting("gradient", name, count, count * cost, part.name)
+                    SampleSetting(
+                        quantity="gradient",
+                        estimator=name,
+                        spp=count,
+                        cost=count * cost,
+                        control=part.name,
+                    )
                 )
 
     def compute_references(
         self, budget: TimeBudget, seed: int, on_done: Callable[[], None]
     ) -> list[PrecisionReference]:
-        """Compute the reference within a budget."""
+        """Compute the reference within a budget.
+
+        The bias of differences is a quarter of the mean disagreement of two steps.
+        """
         if self._by_differences:
-            take = partial(self._take_derivatives, self._list_probes())
+            compute = partial(self._compute_derivatives, self._list_probes())
             spp = choose_part_samples(
-                partial(take, 0), budget.seconds_left, parts=3, counts=(16, 64, 256)
+                partial(compute, 0), budget.seconds_left, parts=3, counts=(16, 64, 256)
             )
-            parts = take_reference_parts(partial(take, spp=spp), budget, on_done, seed)
+            parts = take_reference_parts(
+                partial(compute, spp=spp), budget, on_done, seed
+            )
             disagreements = [disagreement for _, disagreement in parts]
             bias = float(np.linalg.norm(np.mean(disagreements, axis=0))) / 4.0
             derivatives = [derivative for derivative, _ in parts]
             self.reference = estimate_reference(derivatives, bias=bias)
         else:
-            take_gradient = partial(
-                self._take_gradient, self._exact, self._reference_estimator
+            compute = partial(
+                self._compute_gradient, self._exact, self._reference_estimator
             )
-            spp = choose_part_samples(partial(take_gradient, 0), budget.seconds_left)
-            take_part = partial(take_gradient, spp=spp)
-            gradient_parts = take_reference_parts(take_part, budget, on_done, seed)
-            self.reference = estimate_reference(gradient_parts)
+            spp = choose_part_samples(partial(compute, 0), budget.seconds_left)
+            gradients_of_parts = take_reference_parts(
+                partial(compute, spp=spp), budget, on_done, seed
+            )
+            self.reference = estimate_reference(gradients_of_parts)
         return [
             _make_row(
                 "gradient",
                 self._reference_estimator,
                 self.reference,
-                spp,
-                self.part.name,
+                spp=spp,
+                control=self.part.name,
             )
         ]
 
@@ -506,13 +558,18 @@ class GradientBench:
                 )
         return probes
 
-    def _take_derivatives(
+    def _compute_derivatives(
         self, probes: Sequence[gradients.Probe], noise: int, spp: int
     ) -> Float64Array:
-        """Return derivatives and step errors, (2, n), along each probe.
+        """Compute derivatives and step errors, (2, n), along each probe.
 
         A derivative is extrapolated to a step of zero; its step error is the difference
         between two steps.
+
+        Args:
+            probes: n directions.
+            noise: the seed.
+            spp: samples per pixel.
         """
         bench = gradients.Bench(self._exact, self._loss, self._u, noise, spp)
         references = [
@@ -531,20 +588,18 @@ class GradientBench:
         return self.reference.error if self.reference else 0.0
 
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
-        """Compute a gradient; return its errors, and times including the picture
-        itself.
+        """Compute a gradient; return its errors and times, as `PictureBench.measure`.
+
+        The times include the render of the image at which the gradient is taken.
         """
         assert self.reference is not None
-        gradient, times = measure_time(
-            partial(
-                self._take_gradient,
-                self._renderer,
-                setting.estimator,
-                seed,
-                setting.spp,
+        gradient, times = run_timed(
+            lambda: self._compute_gradient(
+                self._renderer, setting.estimator, seed, setting.spp
             )
         )
-        return {"gradient": {**self.reference.compare(gradient), **times}}
+        errors = self.reference.compare(gradient)
+        return {"gradient": {**errors, **times}}
 
     def check_bias(self, seed: int) -> str | None:
         """Check the reference by an adjoint against differences along one direction.
@@ -575,15 +630,13 @@ class GradientBench:
             "that bias"
         )
 
-    def _take_gradient(
+    def _compute_gradient(
         self, renderer: gradients.Renderer, estimator: str, seed: int, spp: int
     ) -> Float64Array:
+        """Compute the gradient (n,) of the part by an estimator."""
         plan = gradients.restrict_plan(renderer.plan, self.part.group_names, estimator)
-        return self.part.select(
-            gradients.Bench(renderer, self._loss, self._u, seed, spp).compute_gradient(
-                plan, seed
-            )
-        )
+        bench = gradients.Bench(renderer, self._loss, self._u, seed, spp)
+        return self.part.select(bench.compute_gradient(plan, seed))
 
 
 def _make_row(

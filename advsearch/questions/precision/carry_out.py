@@ -81,28 +81,34 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     problem, remarks = workbench.problem_from_config(config)
     for remark in remarks:
         context.progress.message(remark)
-    job = QuantityMeasurer(config, problem, context.progress)
+    measurer = QuantityMeasurer(config, problem, context.progress)
     measurements = context.open_measurements()
     setup_seconds = time.perf_counter() - start_time
 
     def measure_sittings() -> Iterator[Sitting]:
+        """Yield each sitting; time that one leaves is shared among those after it."""
         seconds_left = config.seconds
-        shares = [share for _, share, _ in job.sittings]
-        for number, (name, share, measure) in enumerate(job.sittings):
-            budget = TimeBudget(seconds_left * share / math.fsum(shares[number:]))
+        fractions = [fraction for _, fraction, _ in measurer.sittings]
+        for number, (name, fraction, measure) in enumerate(measurer.sittings):
+            fraction_left = math.fsum(fractions[number:])
+            budget = TimeBudget(seconds_left * fraction / fraction_left)
+            # A stored sitting is read; `measure` is called only for others.
             sitting = measurements.get_row(name, Sitting, partial(measure, budget))
             seconds_left = max(0.0, seconds_left - sitting.took)
             yield sitting
 
     def make_result(sittings: list[Sitting]) -> PrecisionResult:
+        """Return the result of the sittings that are finished."""
+
         def join(name: str) -> list[Any]:
+            """Return the rows of this name of all sittings."""
             return [row for sitting in sittings for row in getattr(sitting, name)]
 
         points = join("points")
         warnings = join("warnings")
         slopes = []
         for line in group_by_line(points).values():
-            slope = fit_line(line, job.may_be_steeper(line[0]))
+            slope = fit_line(line, measurer.may_be_steeper(line[0]))
             if slope is not None:
                 slopes.append(slope)
                 warnings += filter(None, [describe_disagreement(slope, line)])
@@ -122,7 +128,11 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
             left_out=join("left_out"),
             warnings=[*warnings, *list_cautions(points)],
             recommendations=recommend_settings(
-                points, join("again"), config.error, job.round_up, job.may_be_steeper
+                points,
+                confirmations=join("again"),
+                goal=config.error,
+                round_up=measurer.round_up,
+                or_steeper=measurer.may_be_steeper,
             ),
             figures=[],
             seconds={"budget": config.seconds, "setup": setup_seconds},
@@ -144,8 +154,12 @@ def _write_figures(run: RunDirectory, result: PrecisionResult) -> list[Path]:
 class QuantityMeasurer:
     """The quantities that can be measured.
 
-    `sittings` has the name of each, its fraction of the time, and the function that
-    measures it.
+    With a linear loss, gradients are those of an undenoised linear image and of a
+    smooth loss, so that theory knows how their error falls.
+
+    Attributes:
+        sittings: the name of each quantity, its fraction of the time, and the function
+            that measures it within a budget.
     """
 
     def __init__(
@@ -182,14 +196,11 @@ class QuantityMeasurer:
                     f"`controls` {names}: has no derivative; leave "
                     "gradient out of `quantities`"
                 )
-            share = TIME_FRACTIONS["gradient"] / len(parts)
+            fraction = TIME_FRACTIONS["gradient"] / len(parts)
             for part in parts:
+                measure_part = partial(self._measure_gradient, part)
                 self.sittings.append(
-                    (
-                        f"gradient of {part.name}",
-                        share,
-                        partial(self._measure_gradient, part),
-                    )
+                    (f"gradient of {part.name}", fraction, measure_part)
                 )
 
     def round_up(self, point: PrecisionPoint, samples: float) -> int:
@@ -198,12 +209,9 @@ class QuantityMeasurer:
         A line of the image is named after its sampler; one of a gradient has that of
         the run.
         """
-        is_gradient = point.quantity == "gradient"
-        sampler = (
-            self._config.pixel_sampler
-            if is_gradient
-            else point.estimator.removesuffix(OIDN)
-        )
+        sampler: str = self._config.pixel_sampler
+        if point.quantity != "gradient":
+            sampler = point.estimator.removesuffix(OIDN)
         return self._renderer.scene.round_sample_count(samples, sampler)
 
     def may_be_steeper(self, point: PrecisionPoint) -> bool | None:
@@ -213,10 +221,13 @@ class QuantityMeasurer:
         material form its limits, and the denoiser its own. Stratification never makes
         the slope shallower, and often steeper (Owen 1997).
         """
+        sampler: str = self._config.pixel_sampler
         if point.quantity == "gradient":
             is_unbiased = self._is_linear and point.estimator == "adjoint"
-            return self._config.pixel_sampler != "independent" if is_unbiased else None
-        return point.estimator != "independent" if point.family == "none" else None
+        else:
+            sampler = point.estimator
+            is_unbiased = point.family == "none"  # not denoised
+        return sampler != "independent" if is_unbiased else None
 
     def _measure_image(self, budget: TimeBudget) -> Sitting:
         """Measure pictures and the model's margin on them."""
@@ -239,17 +250,22 @@ class QuantityMeasurer:
         bench = GradientBench(
             renderer, self._loss, gradients.find_interior_point(renderer), part
         )
-        first_share = 1.0 - CONFIRM_FRACTION * (1.0 - REFERENCE_FRACTION)
+        # `CONFIRM_FRACTION` of what the reference leaves is for the confirmation.
+        first_fraction = 1.0 - CONFIRM_FRACTION * (1.0 - REFERENCE_FRACTION)
         sitting = self._measure_settings(
-            title, bench, budget.take_fraction(first_share)
+            title, bench, budget.take_fraction(first_fraction)
         )
         remark = None
-        chosen = recommend_settings(
-            sitting.points, [], self._config.error, self.round_up, self.may_be_steeper
-        )[0]
+        recommended = recommend_settings(
+            sitting.points,
+            confirmations=[],
+            goal=self._config.error,
+            round_up=self.round_up,
+            or_steeper=self.may_be_steeper,
+        )[0]  # a gradient is one quantity
         if budget.seconds_left > 0.0:
             remark = bench.check_bias(self._seed)
-        again = self._confirm(title, bench, chosen, budget)
+        again = self._confirm(title, bench, recommended, budget)
         warnings = [remark] if remark else []
         took = time.perf_counter() - start_time
         return sitting.model_copy(
@@ -257,24 +273,31 @@ class QuantityMeasurer:
         )
 
     def _confirm(
-        self, title: str, bench: GradientBench, chosen: Recommended, budget: TimeBudget
+        self,
+        title: str,
+        bench: GradientBench,
+        recommended: Recommended,
+        budget: TimeBudget,
     ) -> list[PrecisionPoint]:
         """Measure the recommended setting of a gradient again.
 
-        Return its point, or nothing if it was not measured often enough.
+        Return its point, or nothing if it was not measured often enough, or nothing is
+        recommended.
         """
-        if chosen.estimator is None or chosen.spp is None:
+        if recommended.estimator is None or recommended.spp is None:
             return []
-        known = next(
+        similar = next(
             setting
             for setting in bench.settings
-            if setting.estimator == chosen.estimator
+            if setting.estimator == recommended.estimator
         )
+        cost_per_sample = similar.cost / similar.spp
         setting = replace(
-            known, spp=chosen.spp, cost=known.cost / known.spp * chosen.spp
+            similar, spp=recommended.spp, cost=cost_per_sample * recommended.spp
         )
-        tick = self._begin_stage(
-            f"{title}: {chosen.estimator} with {chosen.spp} samples again", budget
+        advance = self._begin_stage(
+            f"{title}: {recommended.estimator} with {recommended.spp} samples again",
+            budget,
         )
         seed = seeds.stream(self._seed, "confirm")
         measured = measure_in_rounds(
@@ -283,7 +306,7 @@ class QuantityMeasurer:
             budget,
             rounds=MAX_CONFIRMATIONS,
             seed=seed,
-            on_done=lambda _: tick(),
+            on_done=lambda _: advance(),
         )
         samples = [numbers["gradient"] for numbers in measured.results[setting]]
         if len(samples) < MIN_CONFIRMATIONS:
@@ -299,18 +322,22 @@ class QuantityMeasurer:
     ) -> Sitting:
         """Compute a bench's references, and measure all of its settings in rounds."""
         start_time = time.perf_counter()
-        share = budget.take_fraction(REFERENCE_FRACTION)
+        reference_budget = budget.take_fraction(REFERENCE_FRACTION)
         references = bench.compute_references(
-            share, self._seed, self._begin_stage(f"{title}: references", share)
+            reference_budget,
+            self._seed,
+            self._begin_stage(f"{title}: references", reference_budget),
         )
-        tick = self._begin_stage(f"{title}: measuring every setting in rounds", budget)
+        advance = self._begin_stage(
+            f"{title}: measuring every setting in rounds", budget
+        )
         measured = measure_in_rounds(
             bench.settings,
             bench.measure,
             budget,
             rounds=self._config.rounds,
             seed=self._seed,
-            on_done=lambda setting: tick(now=setting.estimator, samples=setting.spp),
+            on_done=lambda setting: advance(now=setting.estimator, samples=setting.spp),
         )
         points = []
         for setting, samples in measured.results.items():
@@ -332,20 +359,24 @@ class QuantityMeasurer:
         )
 
     def _begin_stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:
-        """Start a stage of the progress bar in seconds, and return what advances it."""
+        """Start a stage of the progress bar in seconds, and return what advances it.
+
+        The returned function moves the bar to the seconds that have passed; keywords
+        are shown next to it.
+        """
         total = max(1, math.ceil(budget.seconds_left))
         done = 0
         self._progress.stage(
             name, total, hint="counted in seconds; `seconds` sets them", at_most=True
         )
 
-        def tick(**info: float | str) -> None:
+        def advance(**info: float | str) -> None:
             nonlocal done
             passed = min(total, total - math.ceil(budget.seconds_left))
             self._progress.advance(passed - done, **info)
             done = passed
 
-        return tick
+        return advance
 
 
 def _describe_skipped(title: str, measured: Any) -> list[str]:
@@ -386,18 +417,26 @@ def recommend_settings(
 ) -> list[Recommended]:
     """Return the fastest setting that reaches a goal for each quantity, if any does.
 
-    A setting that was measured `confirmations` is recommended by these measurements.
+    A recommendation without an estimator says that none does. A setting that was
+    measured again is recommended by these measurements.
+
+    Args:
+        points: measured settings.
+        confirmations: gradient settings that were measured again.
+        goal: the relative error.
+        round_up: gives the next sample count that a setting takes.
+        or_steeper: of a point, whether the error may fall faster; see `fit_line`.
     """
     candidates: dict[tuple[str, ...], list[Recommended]] = {}
-    for key, line in group_by_line(points).items():
-        of_quantity = candidates.setdefault(key[:3], [])
+    for (quantity, control, family, _), line in group_by_line(points).items():
+        quantity_candidates = candidates.setdefault((quantity, control, family), [])
         candidate = recommend_count(line, goal, round_up, or_steeper(line[0]))
         if candidate:
-            of_quantity.append(candidate)
+            quantity_candidates.append(candidate)
     recommended = []
-    for (quantity, control, family), of_quantity in candidates.items():
+    for (quantity, control, family), quantity_candidates in candidates.items():
         best = min(
-            of_quantity,
+            quantity_candidates,
             key=lambda row: row.seconds or 0.0,
             default=Recommended(quantity=quantity, control=control),
         )

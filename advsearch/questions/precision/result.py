@@ -477,6 +477,7 @@ def draw_figures(result: PrecisionResult) -> figures.Figures:
     )
 
     def draw(figure: Any) -> None:
+        """Draw a panel for each quantity, in rows of two, under the headline."""
         for number, (title, panel_points) in enumerate(panels.items(), start=1):
             axes = figure.add_subplot(n_rows, n_columns, number)
             axes.set_title(title)
@@ -493,10 +494,11 @@ def draw_figures(result: PrecisionResult) -> figures.Figures:
 def _make_caption(result: PrecisionResult) -> str:
     """Describe the machine, the repeats and the markers of the diagrams."""
     machine = result.machine
-    threads = ", ".join(
-        f"{count} {name} thread" + "s" * (count != 1)
-        for name, count in machine.threads.items()
-    )
+    thread_counts = []
+    for name, count in machine.threads.items():
+        thread = "thread" if count == 1 else "threads"
+        thread_counts.append(f"{count} {name} {thread}")
+    threads = ", ".join(thread_counts)
     max_repeats = max(point.repeats for point in result.points)
     seconds = f"of the last of {max_repeats} repeats at most"
     if max_repeats > WARM_UP_CALLS + 1:
@@ -578,7 +580,7 @@ def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
     if not end >= 1.5 * start:
         return
     smallest = min(point.rms * math.sqrt(point.seconds) for point in points)
-    scale = PERCENT * smallest * 0.8
+    scale = PERCENT * smallest * 0.8  # a little under the lowest point
     center = math.sqrt(start * end)
     axes.plot(
         [start, end],
@@ -613,7 +615,10 @@ def _draw_line(
     for point in line:
         x = point.seconds
         y = PERCENT * point.rms
-        lower, upper = (PERCENT * end for end in point.interval or (math.nan, math.nan))
+        lower, upper = (
+            PERCENT * bound for bound in point.interval or (math.nan, math.nan)
+        )
+        # Neither a missing interval (NaN) nor a very wide one is drawn.
         if upper < 4.0 * y:
             axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
         axes.plot(
@@ -647,7 +652,7 @@ def _plain_axis(axis: Any) -> None:
 
     low, high = sorted(axis.get_view_interval())
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    finest = [1.0 + 0.2 * k for k in range(45)]
+    finest = [1.0 + 0.2 * k for k in range(45)]  # 1.0 to 9.8
     for factors in (
         [1.0],
         [1.0, 2.0, 5.0],

@@ -52,15 +52,26 @@ SLOPE_TOLERANCE = 0.1
 MONTE_CARLO_SLOPE = -0.5
 # multiple of the largest measured sample count up to which an error is extrapolated
 MAX_EXTRAPOLATION = 16.0
-# minimum number of points of a fit
+# minimum number of different sample counts of a fit
 MIN_FIT_POINTS = 3
+# A line that is fitted or extrapolated is at least this steep. Flatter ones reach an
+# error only with sample counts of which nothing is known.
+MAX_FALLING_SLOPE = -0.1
+# A line is extrapolated at most this steep, however steep it is between points.
+MIN_EXTRAPOLATED_SLOPE = -1.0
 
 
 @dataclass(frozen=True)
 class SampleSetting:
     """A way to compute a quantity: an estimator with a sample count.
 
-    `cost` is the expected time in any unit; settings are recommended within a `family`.
+    Attributes:
+        quantity: "picture", "margin" or "gradient".
+        estimator: name of the sampler with the denoiser, or of the gradient estimator.
+        spp: samples per pixel.
+        cost: the expected time in any unit.
+        control: of a gradient, the name of its part; else empty.
+        family: settings are compared and recommended within one: the denoiser.
     """
 
     quantity: str
@@ -72,6 +83,7 @@ class SampleSetting:
 
     @property
     def line(self) -> tuple[str, str, str]:
+        """The settings that differ in samples alone have the same line."""
         return self.quantity, self.control, self.estimator
 
 
@@ -132,24 +144,23 @@ def estimate_reference(
         )
     total = np.sum(parts, axis=0)
     value = function(total / count)
+    # the function of the mean of all parts but one, of each part
     jackknife_values = [function((total - part) / (count - 1)) for part in parts]
     center = np.mean(jackknife_values, axis=0)
-    scatter = math.sqrt(
-        (count - 1)
-        / count
-        * sum(float(np.sum((each - center) ** 2)) for each in jackknife_values)
+    sum_of_squares = sum(
+        float(np.sum((jackknife_value - center) ** 2))
+        for jackknife_value in jackknife_values
     )
-    bias_estimate = (
-        (count - 1) * float(np.linalg.norm(center - value)) if count > 2 else 0.0
-    )
+    scatter = math.sqrt((count - 1) / count * sum_of_squares)
+    bias_estimate = 0.0
+    if count > 2:
+        bias_estimate = (count - 1) * float(np.linalg.norm(center - value))
     # the estimate of the bias scatters as much as the value does
     bias_estimate = max(0.0, bias_estimate - scatter)
-    size = float(np.linalg.norm(value))
+    norm = float(np.linalg.norm(value))
+    error = math.hypot(scatter, bias_estimate, bias)
     return ReferenceValue(
-        value,
-        relative_error(math.hypot(scatter, bias_estimate, bias), size),
-        size,
-        count,
+        value, error=relative_error(error, norm), norm=norm, parts=count
     )
 
 
@@ -169,11 +180,9 @@ def summarize_samples(
     is_heavy = is_heavy_tailed(samples)
     exceeds_floor = mean_square > (MIN_ERROR_RATIO * reference_error) ** 2
     is_known = exceeds_floor and math.isfinite(mean_square) and mean_square > 0.0
-    error = (
-        math.sqrt(mean_square - reference_error**2)
-        if is_known
-        else math.sqrt(mean_square)
-    )
+    error = math.sqrt(mean_square)
+    if is_known:
+        error = math.sqrt(mean_square - reference_error**2)
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
         deviation = statistics.stdev(squares) / math.sqrt(len(squares))
@@ -204,6 +213,7 @@ def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
     The deviation is the standard error of the mean square of `count` values.
     """
     quantile = float(stdtrit(count - 1, (1.0 + CONFIDENCE) / 2.0))
+    # 0.5: the logarithm of a root is half as wide; 50: so that exp does not overflow.
     return math.exp(min(50.0, quantile * (0.5 * deviation / mean_square)))
 
 
@@ -238,10 +248,12 @@ def fit_line(
     """Fit the line of log error against log samples by least squares.
 
     Only points with a known error count: one below the reference's own error says
-    nothing. None if fewer than `MIN_FIT_POINTS` are left. Theory says
-    `MONTE_CARLO_SLOPE`, `or_steeper`, or nothing (None). A slope disagrees if its
-    interval excludes theory
-    *and* it differs by more than `SLOPE_TOLERANCE`.
+    nothing. None if fewer than `MIN_FIT_POINTS` sample counts are left.
+
+    Theory says `MONTE_CARLO_SLOPE`; with `or_steeper` that or steeper; with None
+    nothing, and then it is not known whether the slope agrees. A slope agrees if it
+    differs by `SLOPE_TOLERANCE` at most. It disagrees if it differs by more, *and* its
+    interval excludes theory; otherwise nothing is known.
     """
     known = [point for point in points if point.is_known]
     if len({point.spp for point in known}) < MIN_FIT_POINTS:
@@ -251,18 +263,19 @@ def fit_line(
         np.log([point.rms for point in known]),
     )
     slope = float(line.slope)
-    half_width = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0)) * float(
-        line.stderr
-    )
-    difference = (
-        slope - MONTE_CARLO_SLOPE if or_steeper else abs(slope - MONTE_CARLO_SLOPE)
-    )
+    quantile = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0))
+    half_width = quantile * float(line.stderr)
+    difference = slope - MONTE_CARLO_SLOPE
+    if not or_steeper:
+        difference = abs(difference)
     agrees: bool | None = False
     if difference <= SLOPE_TOLERANCE:
         agrees = True
     elif difference <= half_width:
         agrees = None
+    theory: float | None = MONTE_CARLO_SLOPE
     if or_steeper is None:
+        theory = None
         agrees = None
     return PrecisionSlope(
         quantity=known[0].quantity,
@@ -272,7 +285,7 @@ def fit_line(
         interval=(slope - half_width, slope + half_width),
         offset=float(line.intercept),
         points=len(known),
-        theory=None if or_steeper is None else MONTE_CARLO_SLOPE,
+        theory=theory,
         or_steeper=bool(or_steeper),
         agrees=agrees,
     )
@@ -302,25 +315,25 @@ def describe_disagreement(
 
 
 def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
-    """Return whether the last step between known points is much flatter than the first
-    ones.
+    """Return whether the last step between known points is much flatter than before.
 
-    That is less than half as steep.
+    That is less than half as steep as the steepest one before it.
     """
     known = sorted(
         (point for point in points if point.is_known), key=lambda point: point.spp
     )
-    steps = [
+    slopes = [
         math.log(b.rms / a.rms) / math.log(b.spp / a.spp)
         for a, b in pairwise(known)
         if b.spp > a.spp
     ]
-    return len(steps) >= 2 and steps[-1] > 0.5 * min(*steps[:-1], 0.0)
+    # Slopes are negative: the steepest is the smallest.
+    return len(slopes) >= 2 and slopes[-1] > 0.5 * min(*slopes[:-1], 0.0)
 
 
 def round_up_exactly(point: PrecisionPoint, samples: float) -> int:
     """Return the next whole number of samples."""
-    return math.ceil(samples - 1e-9)
+    return math.ceil(samples - 1e-9)  # a whole number may be larger by rounding
 
 
 def recommend_count(
@@ -353,10 +366,11 @@ def recommend_count(
     if explaining_line:
         error = _error_on_line(explaining_line, spp)
     else:
-        slope = max(line.slope, -1.0) if line else MONTE_CARLO_SLOPE
-        error = _interpolate_value(
-            ordered, spp, [point.rms for point in ordered], slope
-        )
+        slope = MONTE_CARLO_SLOPE
+        if line:
+            slope = max(line.slope, MIN_EXTRAPOLATED_SLOPE)
+        errors = [point.rms for point in ordered]
+        error = _interpolate_value(ordered, spp, errors, slope)
     seconds = [point.seconds for point in ordered]
     return Recommended(
         quantity=ordered[0].quantity,
@@ -364,7 +378,7 @@ def recommend_count(
         goal=goal,
         estimator=ordered[0].estimator,
         spp=spp,
-        seconds=_interpolate_value(ordered, spp, seconds, 1.0),
+        seconds=_interpolate_value(ordered, spp, seconds, slope=1.0),
         error=error,
         basis=basis,
     )
@@ -375,10 +389,14 @@ def _error_on_line(line: PrecisionSlope, spp: float) -> float:
 
 
 def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) -> bool:
-    """Return whether a falling line passes through the interval of every known
-    point.
+    """Return whether a falling line passes through the interval of every known point.
+
+    A line of `MIN_FIT_POINTS` points nearly always does, and so explains nothing. A
+    known point without an interval is not explained.
     """
-    if line.points <= MIN_FIT_POINTS or not line.slope <= -0.1:
+    has_spare_points = line.points > MIN_FIT_POINTS
+    is_falling = line.slope <= MAX_FALLING_SLOPE
+    if not has_spare_points or not is_falling:
         return False
     for point in ordered:
         if not point.is_known:
@@ -394,7 +412,11 @@ def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) ->
 def _solve_line(
     line: PrecisionSlope, ordered: Sequence[PrecisionPoint], goal: float
 ) -> tuple[float | None, str]:
-    """Return the samples at which a line reaches a goal, and the basis."""
+    """Return the samples at which a line reaches a goal, and the basis.
+
+    At least the smallest measured number; None beyond `MAX_EXTRAPOLATION` times the
+    largest one.
+    """
     samples = math.exp((math.log(goal) - line.offset) / line.slope)
     smallest = float(ordered[0].spp)
     largest = float(ordered[-1].spp)
@@ -402,7 +424,9 @@ def _solve_line(
         return smallest, "measured"
     if samples <= largest:
         return samples, "fitted"
-    return (None if samples > MAX_EXTRAPOLATION * largest else samples), "extrapolated"
+    if samples <= MAX_EXTRAPOLATION * largest:
+        return samples, "extrapolated"
+    return None, "extrapolated"
 
 
 def confirm_recommendation(
@@ -419,20 +443,17 @@ def confirm_recommendation(
     the root.
     """
     assert recommendation.goal is not None and recommendation.spp is not None
-    spp = round_up(
-        point,
-        recommendation.spp
-        * min(MAX_EXTRAPOLATION, max(1.0, (point.rms / recommendation.goal) ** 2)),
-    )
-    times = spp / recommendation.spp
-    new = {
+    needed_factor = max(1.0, (point.rms / recommendation.goal) ** 2)
+    spp = round_up(point, recommendation.spp * min(MAX_EXTRAPOLATION, needed_factor))
+    factor = spp / recommendation.spp
+    update = {
         "spp": spp,
-        "seconds": point.seconds * times,
-        "error": point.rms / math.sqrt(times),
+        "seconds": point.seconds * factor,
+        "error": point.rms / math.sqrt(factor),
+        "basis": "confirmed",
+        "repeats": point.repeats,
     }
-    return recommendation.model_copy(
-        update={**new, "basis": "confirmed", "repeats": point.repeats}
-    )
+    return recommendation.model_copy(update=update)
 
 
 def _interpolate_count(
@@ -441,46 +462,67 @@ def _interpolate_count(
     line: PrecisionSlope | None,
     or_steeper: bool | None,
 ) -> tuple[float | None, str]:
-    """Return the samples from which on ordered points stay at or below a goal, and the
-    basis.
+    """Return the samples from which on ordered points stay at or below a goal.
+
+    Returns:
+        The samples, None if nothing is known of so many; and the basis.
+    """
+    if ordered[-1].rms > goal:
+        return _extrapolate_count(ordered, goal, line, or_steeper), "extrapolated"
+    n_until_goal = 0  # points up to the last one above the goal
+    for number, point in enumerate(ordered, start=1):
+        if point.rms > goal:
+            n_until_goal = number
+    below = ordered[n_until_goal]
+    if n_until_goal == 0:
+        return float(below.spp), "measured"
+    above = ordered[n_until_goal - 1]
+    fraction = math.log(above.rms / goal) / math.log(above.rms / below.rms)
+    return above.spp * (below.spp / above.spp) ** fraction, "interpolated"
+
+
+def _extrapolate_count(
+    ordered: Sequence[PrecisionPoint],
+    goal: float,
+    line: PrecisionSlope | None,
+    or_steeper: bool | None,
+) -> float | None:
+    """Return the samples beyond the last point at which a goal is reached.
+
+    The error follows the slope of the line, or that of theory without a line. None if
+    neither is known, the slope is too flat, the last error is a limit, or the points
+    have leveled off; or beyond `MAX_EXTRAPOLATION` times the samples.
     """
     last = ordered[-1]
-    if last.rms > goal:
-        slope = None
-        if line:
-            slope = line.slope
-        elif or_steeper is not None:
-            slope = MONTE_CARLO_SLOPE
-        if (
-            slope is None
-            or not last.is_known
-            or slope > -0.1
-            or has_leveled_off(ordered)
-        ):
-            return None, ""
-        factor = (goal / last.rms) ** (1.0 / max(slope, -1.0))
-        return (
-            last.spp * factor if factor <= MAX_EXTRAPOLATION else None
-        ), "extrapolated"
-    first = (
-        max((at for at, point in enumerate(ordered) if point.rms > goal), default=-1)
-        + 1
-    )
-    good = ordered[first]
-    if not first:
-        return float(good.spp), "measured"
-    before = ordered[first - 1]
-    fraction = math.log(before.rms / goal) / math.log(before.rms / good.rms)
-    return before.spp * (good.spp / before.spp) ** fraction, "interpolated"
+    slope = None
+    if line:
+        slope = line.slope
+    elif or_steeper is not None:
+        slope = MONTE_CARLO_SLOPE
+    if slope is None or slope > MAX_FALLING_SLOPE:
+        return None
+    if not last.is_known or has_leveled_off(ordered):
+        return None
+    factor = (goal / last.rms) ** (1.0 / max(slope, MIN_EXTRAPOLATED_SLOPE))
+    return last.spp * factor if factor <= MAX_EXTRAPOLATION else None
 
 
 def _interpolate_value(
     ordered: Sequence[PrecisionPoint], spp: int, values: Sequence[float], slope: float
 ) -> float:
-    """Interpolate a value at a sample count, on logarithmic axes; beyond, follow a
+    """Interpolate a value at a sample count, on logarithmic axes.
+
+    Below the first point it is that of the first one; beyond the last it follows a
     slope.
+
+    Args:
+        ordered: points by ascending samples.
+        spp: the sample count.
+        values: of the points, at least 0.
+        slope: of the logarithm of the value against that of the samples.
     """
-    counts = np.log([float(point.spp) for point in ordered])
-    logs = np.log([max(1e-300, value) for value in values])
-    beyond = max(0.0, math.log(spp) - counts[-1])
-    return math.exp(float(np.interp(math.log(spp), counts, logs)) + slope * beyond)
+    log_counts = np.log([float(point.spp) for point in ordered])
+    log_values = np.log([max(1e-300, value) for value in values])  # no log of 0
+    log_beyond = max(0.0, math.log(spp) - log_counts[-1])
+    log_value = float(np.interp(math.log(spp), log_counts, log_values))
+    return math.exp(log_value + slope * log_beyond)

@@ -251,7 +251,13 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
     """Load what a run names, and return the parameters of its rows.
 
-    If it samples around the result of a search, `search` has the settings of that.
+    Those of a sweep are what its scenes describe. A run around the result of a search
+    is not loaded, since its ranges follow from the result; it has the parameters of the
+    search's controls.
+
+    Args:
+        config: the settings of the run.
+        search: those of the search; None of a run that samples around none.
     """
     if search is None and isinstance(config, SweepConfig):
         return workbench.row_parameters(config)
@@ -265,7 +271,10 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
         kind = name.partition(":")[0]
         parameters = []
         if kind in workbench.CONTROLS:
-            parameters = [each.name for each in workbench.CONTROLS[kind].parameters]
+            parameters = [
+                parameter.name for parameter in workbench.CONTROLS[kind].parameters
+            ]
+        # A control that declares none gets its parameters from the scene.
         columns |= {
             f"{name}.{parameter}" for parameter in parameters or [ANY_PARAMETER]
         }
@@ -290,10 +299,11 @@ def check_figures(
         location = f"It stands in {where}, figure {index} ({kind})"
         baseline = getattr(options, "beside", None)
         _check_option_parts(recipe, options, baseline, location)
+        parts = options.of or tuple(columns)
         columns_of_part = {
             part: part_columns
             for part, part_columns in columns.items()
-            if part != baseline and part in (options.of or columns)
+            if part in parts and part != baseline
         }
         if not columns_of_part:
             continue
@@ -301,7 +311,13 @@ def check_figures(
             value = getattr(options, option, None) or ()
             names = [value] if isinstance(value, str) else value
             for name in names:
-                _check_column(recipe, name, option, columns_of_part, location)
+                _check_column(
+                    recipe,
+                    name,
+                    option=option,
+                    columns_of_part=columns_of_part,
+                    location=location,
+                )
 
 
 def _check_option_parts(
@@ -327,6 +343,13 @@ def _check_column(
     location: str,
 ) -> None:
     """Check that all parts of a figure have a column.
+
+    Args:
+        recipe: with groups, all parts have a column of the group.
+        name: of the column.
+        option: of the figure, which names it.
+        columns_of_part: names of columns of each part of the figure.
+        location: of the figure, for messages.
 
     Raises:
         InputError: if no part has it, or only some have.
@@ -378,6 +401,8 @@ def _run_parts(
     runs: Sequence[PlannedRun], context: RunContext[RecipeConfig]
 ) -> tuple[list[DoneRun], list[str]]:
     """Run what is not finished, until a run is interrupted.
+
+    A run around a search whose result has no distribution is left out.
 
     Returns:
         The runs with their results, and a sentence for each run that was left out.
@@ -456,6 +481,7 @@ def _range_around(
     """
     to_scale = math.log if parameter.log else float
     lower, upper, center = (to_scale(value) for value in (*search_range, mean))
+    # A uniform distribution of deviation s is 2 sqrt(3) s wide.
     half_width = math.sqrt(3.0) * deviation * (upper - lower)
     if parameter.periodic and upper - lower >= FULL_TURN:
         half_width = min(half_width, FULL_TURN / 2)
@@ -526,7 +552,11 @@ def _write_figures(
 def _read_frame(
     recipe: Recipe, done: Sequence[DoneRun], recipe_run: RunDirectory
 ) -> Rows:
-    """Read the rows of all runs into one frame."""
+    """Read the rows of all runs into one frame.
+
+    A sweep has rows of its part, and those of its photographs under `PHOTOGRAPHS`. Rows
+    of a sweep that sets `workers` have a column of that.
+    """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
     surfaces = dict[str, Any]()
@@ -540,11 +570,16 @@ def _read_frame(
             if result.surface:
                 surfaces[run.name] = result.surface
         workers = getattr(run.config, WORKERS_COLUMN, None)
-        more = {} if workers is None else {WORKERS_COLUMN: workers}
+        more_columns = {} if workers is None else {WORKERS_COLUMN: workers}
         folder = RunDirectory.locate_part(recipe_run.path, run.name)
         for part, kinds in row_kinds.items():
             part_rows, part_units = read_rows(
-                part, folder, result, run.config.seed, kinds, **more
+                part,
+                folder,
+                summary=result,
+                seed=run.config.seed,
+                kinds=kinds,
+                **more_columns,
             )
             rows += part_rows
             units |= part_units
@@ -583,16 +618,16 @@ def read_figure_options(
 def make_figures(rows: Rows, kind: str, options: Options) -> Iterator[FigureContent]:
     """Yield a figure, or one for each model if the kind does not compare models.
 
+    It has the rows of the parts that it requires, or else all but photographs.
+
     Raises:
         InputError: if the rows lack what the figure needs.
     """
-    part = rows[rates.PART_COLUMN]
+    part_of_row = rows[rates.PART_COLUMN]
     _, make_figure = FIGURES[kind]
-    is_selected = (
-        part.isin(options.required_parts)
-        if options.required_parts
-        else part != PHOTOGRAPHS
-    )
+    is_selected = part_of_row != PHOTOGRAPHS
+    if options.required_parts:
+        is_selected = part_of_row.isin(options.required_parts)
     selected = rows[is_selected]
     compares_models = (
         kind in COMPARES_MODELS or rates.MODEL_COLUMN in vars(options).values()

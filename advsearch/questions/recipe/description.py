@@ -247,8 +247,13 @@ def format_first_error(error: ValidationError) -> str:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a recipe; `around` is the directory of the run whose result it samples
-    around.
+    """A run of a recipe.
+
+    Attributes:
+        name: of its directory.
+        part: of the recipe.
+        config: its settings.
+        around: the directory of the run whose result it samples around; None of others.
     """
 
     name: str
@@ -260,7 +265,9 @@ class PlannedRun:
 def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     """Plan the runs of a recipe in the order in which they run.
 
-    A run has one object; a search has one environment and one model too.
+    A run has one object; a search has one environment and one model too. A directory is
+    named after the part, the number of the run in it, and what tells it from the
+    others; a run samples around the run of the same number and names of another part.
 
     Raises:
         InputError: if a part has a setting that its command lacks, or there are too
@@ -280,7 +287,14 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
             ]
             suffix = f"{index:02d}-{make_directory_name(words)}"
             around = f"{part.around}-{suffix}" if part.around else part.around
-            runs.append(PlannedRun(f"{name}-{suffix}", name, run_config, around))
+            runs.append(
+                PlannedRun(
+                    name=f"{name}-{suffix}",
+                    part=name,
+                    config=run_config,
+                    around=around,
+                )
+            )
     if len(runs) > MAX_RUNS:
         raise InputError(
             f"{config.recipe}: expected at most {MAX_RUNS} runs, got "
@@ -309,7 +323,11 @@ def _make_run_config(
     value_of_axis: Mapping[str, str],
     config: RecipeConfig,
 ) -> SceneConfig:
-    """Make the settings of the run `index` of the part `name`."""
+    """Make the settings of the run `index` of the part `name`.
+
+    Those of the part go over those of the recipe. The seed follows from that of the
+    recipe; a part that repeats another has its seeds. Errors name the part.
+    """
     part = recipe.parts[name]
     # different in each run, so that no two runs draw the same samples
     seed_name = f"recipe {part.drawn_as or name} {index}"

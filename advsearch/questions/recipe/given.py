@@ -27,6 +27,7 @@ MAX_LETTERS = 85
 MIN_LETTERS = 4
 
 # a prediction with its count, and how many of these predictions are correct
+# how often a prediction is made, and how many of these are right
 PredictionCount = tuple[ClusteredFraction, int]
 
 
@@ -52,6 +53,7 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
             groups[value].append((tally, n_right))
 
     def draw(figure: Any) -> None:
+        """Draw a stacked bar for each value of the column."""
         axes = figure.subplots()
         for position, counts in enumerate(groups.values()):
             _draw_stacked_bar(axes, position, counts)
@@ -67,11 +69,13 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
     for value, counts in groups.items():
         for tally, n_right in counts:
             table.append([value, tally.name, *tally.table_cells, n_right])
-    heads = [options.by, "prediction", "given in", *rates.FRACTION_HEADS, "right"]
-    title = f"Most frequent predictions by {options.by}"
-    text = _describe_predictions(groups, rates.pluralize_column(options.by))
     return FigureContent(
-        title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups))
+        title=f"Most frequent predictions by {options.by}",
+        text=_describe_predictions(groups, rates.pluralize_column(options.by)),
+        columns=[options.by, "prediction", "given in", *rates.FRACTION_HEADS, "right"],
+        rows=table,
+        draw=draw,
+        size=(6.4, 1.2 + 0.3 * len(groups)),
     )
 
 
@@ -104,11 +108,12 @@ def _draw_stacked_bar(
     for tally, n_right in counts:
         share = tally.fraction or 0.0
         is_mostly_right = 2 * n_right >= tally.n_counted
+        color = figures.BLUE if is_mostly_right else figures.RED
         axes.barh(
             position,
             share,
             left=left,
-            color=figures.BLUE if is_mostly_right else figures.RED,
+            color=color,
             alpha=0.5,
             height=0.72,
             edgecolor="white",
@@ -171,6 +176,8 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
 
     Its sentences also say which of both cues predicts the predictions better.
     """
+    # by texture: which predictions name it, and counts of those that name the object,
+    # and the texture
     names_texture = dict[str, Any]()
     by_shape = dict[str, ClusteredFraction]()
     by_texture = dict[str, ClusteredFraction]()
@@ -202,16 +209,17 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
     text += rates.describe_extremes(
         list(by_shape.values()), "The hardest texture", "the easiest", "textures"
     )
+    table: list[list[rates.Cell]] = [
+        [name, *by_shape[name].table_cells, by_texture[name].n_counted]
+        for name in by_shape
+    ]
     return FigureContent(
-        "Predictions by shape and by texture",
-        text,
-        [options.texture, "the object", *rates.FRACTION_HEADS, "the texture"],
-        [
-            [name, *by_shape[name].table_cells, by_texture[name].n_counted]
-            for name in by_shape
-        ],
-        lambda figure: _draw_cues(figure, by_shape, by_texture),
-        (6.0, 1.7 + 0.27 * len(by_shape)),
+        title="Predictions by shape and by texture",
+        text=text,
+        columns=[options.texture, "the object", *rates.FRACTION_HEADS, "the texture"],
+        rows=table,
+        draw=lambda figure: _draw_cues(figure, by_shape, by_texture),
+        size=(6.0, 1.7 + 0.27 * len(by_shape)),
     )
 
 
@@ -413,12 +421,12 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
         _draw_panels(figure, panels, list(corners.values()), names, by_margin, options)
 
     return FigureContent(
-        f"Predictions over {', '.join(names)}",
-        text,
-        heads,
-        table,
-        draw,
-        (max(2.4 * len(panels), 4.8), 3.5),
+        title=f"Predictions over {', '.join(names)}",
+        text=text,
+        columns=heads,
+        rows=table,
+        draw=draw,
+        size=(max(2.4 * len(panels), 4.8), 3.5),
     )
 
 
@@ -494,7 +502,8 @@ def _mean_by_triangle(
     means = list[float | None]()
     for is_inside in in_triangle:
         known = values[is_inside & ~np.isnan(values)]
-        means.append(float(known.mean()) if len(known) else None)
+        mean = float(known.mean()) if len(known) else None
+        means.append(mean)
     return means
 
 
@@ -541,10 +550,12 @@ def _describe_ingredients(
                 "difference is shown."
             )
         else:
-            rarest = f"{whose} rarest where most of the mixture"
-            most_frequent = "most frequent where most of it"
             text += rates.describe_extremes(
-                tallies, rarest, most_frequent, "ingredients", "given"
+                tallies,
+                lowest_prefix=f"{whose} rarest where most of the mixture",
+                highest_prefix="most frequent where most of it",
+                things="ingredients",
+                verb="given",
             )
         table += [[label, tally.name, *tally.table_cells] for tally in tallies]
     return text, heads, table
@@ -558,7 +569,16 @@ def _draw_panels(
     by_margin: bool,
     options: TernaryOptions,
 ) -> None:
-    """Draw a ternary diagram for each prediction, with one or several color bars."""
+    """Draw a ternary diagram for each prediction, with one or several color bars.
+
+    Args:
+        figure: of matplotlib.
+        panels: the value of each triangle, by prediction.
+        corners: mixtures at the corners of the triangles.
+        names: of the ingredients.
+        by_margin: whether values are margins, not fractions.
+        options: with `normalised`, each diagram has colors and a bar of its own.
+    """
     all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, (prediction, values) in zip(all_axes, panels.items(), strict=True):
         triangles = _draw_panel(axes, prediction, values, corners, names)
@@ -568,7 +588,7 @@ def _draw_panels(
         if options.normalised and by_margin:
             lower = min(known)
         if options.normalised or by_margin:
-            upper = max([*known, 1e-9])
+            upper = max([*known, 1e-9])  # above 0, where the colors begin
         triangles.set_clim(lower, upper)
         if options.normalised:
             figure.colorbar(
@@ -588,7 +608,9 @@ def _draw_panels(
 def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
     """Return the triangle of a ternary diagram that three fractions (3,) lie in.
 
-    `side` is the number of triangles along a side.
+    Rounded down, the fractions add up to 1 less than `side` in a triangle that points
+    up, and to 2 less in one that points down. `side` is the number of triangles along a
+    side.
     """
     a, b, c = (int(fraction * side) for fraction in mixture)
     while a + b + c >= side:  # a corner of triangles: move towards the largest
@@ -605,6 +627,7 @@ def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]
     """Return the triangles of a ternary diagram with the fractions at their corners."""
 
     def mixture_at(x: int, y: int) -> Mixture:
+        """Return the fractions at the corner x and y steps along the first two."""
         return x / side, y / side, (side - x - y) / side
 
     corners = {}
@@ -678,7 +701,10 @@ def _draw_panel(
     hatched = list[Any]()
     for mixtures, value in zip(corners, values, strict=True):
         points = [_to_plane(mixture) for mixture in mixtures]
-        (hatched if value is None else colored).append(points)
+        if value is None:
+            hatched.append(points)
+        else:
+            colored.append(points)
     triangles = PolyCollection(
         colored,
         array=[value for value in values if value is not None],
@@ -697,7 +723,8 @@ def _draw_panel(
     )
     pure = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     outline = [_to_plane(mixture) for mixture in pure]
-    axes.plot(*zip(*outline, outline[0], strict=True), color="#1c1d20", linewidth=0.8)
+    closed_outline = np.array([*outline, outline[0]])
+    axes.plot(*closed_outline.T, color="#1c1d20", linewidth=0.8)
     for (x, y), name in zip(outline, names, strict=True):
         is_base = y < 0.1
         axes.annotate(

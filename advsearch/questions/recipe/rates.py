@@ -187,9 +187,14 @@ class ClusteredFraction:
     """Count rows of independent units, and estimate the fraction that is counted.
 
     A unit is what rows share that are not independent, such as a draw of a seed.
-    `unit_counts` (n,) of its `unit_sizes` (n,) rows are counted in each unit; in all,
-    `n_counted` of `total`. `fraction` is the mean over units of their fraction, None
-    without rows.
+
+    Attributes:
+        name: of what the rows are of, for tables and sentences.
+        unit_counts: (n,) rows that are counted in each unit.
+        unit_sizes: (n,) rows of each unit.
+        n_counted: rows that are counted in all.
+        total: rows in all.
+        fraction: the mean over units of their fraction; None without rows.
     """
 
     def __init__(
@@ -412,8 +417,7 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
         InputError: if there are no rows, or the columns don't suit the options.
     """
     verb = "wrong" if options.wrong else "right"
-    baseline_rows = rows[rows[PART_COLUMN] == options.beside]
-    rows = rows[rows[PART_COLUMN] != options.beside]
+    baseline_rows, rows = _split_baseline(rows, options)
     if rows.empty:
         raise InputError(
             "figures: rates: expected rows of a part beside "
@@ -435,6 +439,7 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
         bars = {name: tallies, **cells}
 
     def draw(figure: Any) -> None:
+        """Draw lines over the bins, or else bars or a map."""
         if options.form == "lines":
             positions = bin_centers or range(len(cells))
             unit = format_unit(rows, options.by).strip()
@@ -444,16 +449,22 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
 
     series_column = [options.series] if options.series else []
     return FigureContent(
-        f"{'Error' if options.wrong else 'Accuracy'} by {_split_columns(options)}",
-        text,
-        [options.by, *series_column, verb, *FRACTION_HEADS],
-        _tabulate_rates(bars, totals, series, options),
-        draw,
-        _choose_size(len(bars), len(cells), len(series), options),
+        title=f"{'Error' if options.wrong else 'Accuracy'} by {_name_columns(options)}",
+        text=text,
+        columns=[options.by, *series_column, verb, *FRACTION_HEADS],
+        rows=_tabulate_rates(bars, totals, series, options),
+        draw=draw,
+        size=_choose_size(len(bars), len(cells), len(series), options),
     )
 
 
-def _split_columns(options: RatesOptions) -> str:
+def _split_baseline(rows: Rows, options: RatesOptions) -> tuple[Rows, Rows]:
+    """Return the rows of the part that is the baseline, and all others."""
+    is_baseline = rows[PART_COLUMN] == options.beside
+    return rows[is_baseline], rows[~is_baseline]
+
+
+def _name_columns(options: RatesOptions) -> str:
     """Name the columns that rates are split by: ``environments and models``."""
     columns = pluralize_column(options.by)
     if options.series:
@@ -509,7 +520,14 @@ def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
 def _describe_cells(
     cells: Cells, series: Sequence[str], is_binned: bool, options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell: over a map, or of each series."""
+    """Describe the lowest and the highest cell: over a map, or of each series.
+
+    Args:
+        cells: the counts of each series, by row.
+        series: names of the series.
+        is_binned: whether the rows are bins of a number.
+        options: of the figure.
+    """
     verb = "wrong" if options.wrong else "right"
     if options.form == "map":
         pairs = []
@@ -517,8 +535,13 @@ def _describe_cells(
             names = _name_series(series, options)
             for name, tally in zip(names, tallies, strict=True):
                 pairs.append(tally.with_name(f"{row_name} with {name}"))
-        things = f"pairs of {_split_columns(options)}"
-        return describe_extremes(pairs, "The lowest pair", "the highest", things, verb)
+        return describe_extremes(
+            pairs,
+            lowest_prefix="The lowest pair",
+            highest_prefix="the highest",
+            things=f"pairs of {_name_columns(options)}",
+            verb=verb,
+        )
 
     text = list[str]()
     where = f" where {options.axis_label}" if is_binned else ""
@@ -530,10 +553,10 @@ def _describe_cells(
         lowest = f"For {name}, lowest" if len(series) > 1 else "Lowest"
         text += describe_extremes(
             tallies,
-            f"{lowest}{where}",
-            f"highest{where}",
-            pluralize_column(options.by),
-            verb,
+            lowest_prefix=f"{lowest}{where}",
+            highest_prefix=f"highest{where}",
+            things=pluralize_column(options.by),
+            verb=verb,
         )
     return text
 
@@ -544,18 +567,23 @@ def _describe_series(
     series: Sequence[str],
     options: RatesOptions,
 ) -> list[str]:
-    """Compare the series over all rows, and models by their mean relative error."""
+    """Compare the series over all rows, and models by their mean relative error.
+
+    That is the mCE of Hendrycks and Dietterich (2019), with the first model as the
+    reference.
+    """
     if not options.series or len(series) < 2:
         return []
+    verb = "wrong" if options.wrong else "right"
     overall = []
     for name, tally in zip(_name_series(series, options), totals, strict=True):
         overall.append(tally.with_name(f"that of {name}"))
     sentences = describe_extremes(
         overall,
-        "Over all, the lowest share",
-        "the highest",
-        pluralize_column(options.series),
-        "wrong" if options.wrong else "right",
+        lowest_prefix="Over all, the lowest share",
+        highest_prefix="the highest",
+        things=pluralize_column(options.series),
+        verb=verb,
     )
     # one text, so that figures by other columns do not repeat it
     text = [" ".join(sentences)]
@@ -618,7 +646,10 @@ def _tabulate_rates(
 def _choose_size(
     n_bars: int, n_rows: int, n_series: int, options: RatesOptions
 ) -> tuple[float, float]:
-    """Return width and height of a rates figure, inches."""
+    """Return width and height of a rates figure, inches.
+
+    A map has room for each series and row, bars for each series of each row.
+    """
     if options.form == "map":
         return max(2.8 + 0.42 * n_series, 5.4), 1.9 + 0.28 * n_rows
     if options.form == "lines":
@@ -671,7 +702,11 @@ def _draw_rate_lines(
 def _group_rows(
     rows: Rows, options: RatesOptions
 ) -> tuple[Mapping[str, Rows], list[float] | None]:
-    """Split rows by a column's values, or by bins; also return the centers of bins."""
+    """Split rows by a column's values, or by bins; also return the centers of bins.
+
+    Without `bins` and lines, each value is a group, and there are no centers. Rows
+    outside the `range` are in no bin.
+    """
     if options.bins is None and options.form != "lines":
         return split_rows(rows, options.by), None
     values = _read_binned_values(rows, options)
@@ -689,15 +724,17 @@ def _group_rows(
     for index, (start, end) in enumerate(pairwise(edges)):
         bounds = f"{wording.format_figure_value(start)} to {wording.format_figure_value(end)}"
         name = bounds + format_unit(rows, options.by)
-        groups[name] = rows[bin_index == index]
+        in_bin = bin_index == index
+        groups[name] = rows[in_bin]
         centers.append((start + end) / 2)
     return groups, centers
 
 
 def _find_bins(values: Any, lower: float, upper: float, n_bins: int) -> Any:
-    """Return the bin of each value, NaN outside of the range."""
+    """Return the bin of each value, NaN outside of the range, whose ends belong to it."""
     position = (values - lower) / (upper - lower) * n_bins
     in_range = values.between(lower, upper)
+    # The upper end is in the last bin.
     return position.clip(upper=n_bins - 1).where(in_range) // 1
 
 
@@ -709,8 +746,9 @@ def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
     distance = (values - options.away_from).abs()
     if options.turn is None:
         return distance
-    # the shorter way round a circle
-    return np.minimum(distance % options.turn, options.turn - distance % options.turn)
+    # the shorter of both arcs of a circle
+    arc = distance % options.turn
+    return np.minimum(arc, options.turn - arc)
 
 
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
@@ -805,12 +843,14 @@ class AgreementOptions(Options):
 def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureContent:
     """Compare predictions about renderings with those about other images of the same.
 
-    A pair agrees if the model is right about both or wrong about both.
+    A pair agrees if the model is right about both or wrong about both. The other images
+    are photographs, and those of the other parts; without photographs a sentence says
+    so.
 
     Raises:
         InputError: if a part has no rows or other configurations.
     """
-    renderings = rows[rows[PART_COLUMN] == options.of[0]].dropna(axis=1, how="all")
+    renderings = _select_part(rows, options.of[0]).dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(
             "figures: agreement: expected predictions of a part "
@@ -822,7 +862,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
     table = list[list[Cell]]()
     series = list[str]()
     for part in (PHOTOGRAPHS, *options.of[1:]):
-        part_rows = rows[rows[PART_COLUMN] == part]
+        part_rows = _select_part(rows, part)
         if part == PHOTOGRAPHS and part_rows.empty:
             text.append(NO_PHOTOGRAPHS)
             continue
@@ -843,9 +883,9 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
 
     four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
     return FigureContent(
-        "Renderings and other pictures of the same",
-        text,
-        [
+        title="Renderings and other pictures of the same",
+        text=text,
+        columns=[
             "rendering and",
             "object",
             *four_heads,
@@ -853,10 +893,16 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
             "agree",
             *FRACTION_HEADS,
         ],
-        table,
-        lambda figure: _draw_agreement(figure, bars, series),
-        (6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
+        rows=table,
+        draw=lambda figure: _draw_agreement(figure, bars, series),
+        size=(6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
     )
+
+
+def _select_part(rows: Rows, part: str) -> Rows:
+    """Return the rows of a part of the recipe."""
+    is_of_part = rows[PART_COLUMN] == part
+    return rows[is_of_part]
 
 
 def _add_agreement(
@@ -869,7 +915,10 @@ def _add_agreement(
     each.
     """
     for name, tallies in bars.items():
-        object_pairs = pairs if name == ALL_OBJECTS else pairs[pairs["object"] == name]
+        object_pairs = pairs
+        if name != ALL_OBJECTS:
+            is_of_object = pairs["object"] == name
+            object_pairs = pairs[is_of_object]
         tally, cells = _count_agreement(name, object_pairs)
         tallies.append(tally)
         table.append([series_name, name, *cells])
@@ -950,12 +999,12 @@ def _describe_where(right: bool, pairs: Rows) -> str:
     wrong.
     """
     verb = "right" if right else "wrong"
-    selected = pairs[pairs["correct rendered"] == right]
+    is_selected = pairs["correct rendered"] == right
+    selected = pairs[is_selected]
     if selected.empty:
         return f"It is {verb} about none of the renderings."
-    rate = ClusteredFraction.from_rows(
-        "", selected, selected["correct"] == right
-    ).describe(verb)
+    tally = ClusteredFraction.from_rows("", selected, selected["correct"] == right)
+    rate = tally.describe(verb)
     return f"Where it is {verb} about the rendering, it is {rate} about the other."
 
 
@@ -999,7 +1048,12 @@ def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
         "times as many as the fewest workers",
     ]
     return FigureContent(
-        "Pictures a second by number of workers", text, heads, table, draw, (6.0, 3.4)
+        title="Pictures a second by number of workers",
+        text=text,
+        columns=heads,
+        rows=table,
+        draw=draw,
+        size=(6.0, 3.4),
     )
 
 
@@ -1122,6 +1176,7 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
         )
 
     def draw(figure: Any) -> None:
+        """Draw the figures of the runs below each other."""
         from matplotlib.image import imread  # matplotlib takes half a second
 
         all_axes = figure.subplots(len(surfaces), squeeze=False)[:, 0]
@@ -1155,5 +1210,11 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
         "with wrong predictions",
         "with right predictions",
     ]
-    title = "Which parts of the surface go with wrong predictions"
-    return FigureContent(title, text, heads, table, draw, (6.4, 2.65 * len(surfaces)))
+    return FigureContent(
+        title="Which parts of the surface go with wrong predictions",
+        text=text,
+        columns=heads,
+        rows=table,
+        draw=draw,
+        size=(6.4, 2.65 * len(surfaces)),
+    )

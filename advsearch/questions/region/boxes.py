@@ -10,7 +10,7 @@ from torch import Tensor
 
 from advsearch.extend import InputError, seeds, statistics
 
-LEVELS = 6  # sizes of the step of the faces, each half of the one before
+LEVELS = 6  # fractions by which faces move, each half of the one before
 ATTEMPTS = 4  # final checks at most
 PROBES = 8  # random points in the slab that a face would win
 USUAL_PROBED = 100  # images of growing for each parameter, usually
@@ -75,8 +75,8 @@ def grow_box(
 ) -> GrownBox:
     """Grow a box around a point, then check it with samples that nothing was fitted to.
 
-    Each face in turn tries to move out by a share of what is left to the bound (1/2 at
-    first, halved at every level at which no face can move any more). The slab that it
+    Each face in turn tries to move out by a fraction of what is left to the bound (1/2
+    at first, halved at every level at which no face can move any more). The slab that it
     would win is probed at random points; if all have the centre's prediction, it moves.
     Growing ends after `MAX_PROBED` images for each parameter at the latest. Then the
     box is sampled; on an exception, the face that cuts off the least of the box moves
@@ -111,7 +111,12 @@ def grow_box(
         for point in exceptions:
             box.exclude(point)
     return GrownBox(
-        center, box.low, box.high, samples - n_exceptions, samples, box.n_evaluated
+        center=center,
+        low=box.low,
+        high=box.high,
+        same=samples - n_exceptions,
+        samples=samples,
+        renders=box.n_evaluated,
     )
 
 
@@ -137,13 +142,13 @@ class GrowingBox:
         n_faces = 2 * len(self._center)
         # so many that a round of all faces still fits
         last_round = MAX_PROBED * len(self._center) - n_faces * PROBES
-        share = 0.5
+        fraction = 0.5
         for _ in range(LEVELS):
             has_moved = True
             while has_moved and self.n_evaluated <= last_round:
-                moves = [self._push(face, share) for face in range(n_faces)]
+                moves = [self._push(face, fraction) for face in range(n_faces)]
                 has_moved = any(moves)
-            share /= 2.0
+            fraction /= 2.0
 
     def sample_exceptions(self, count: int) -> Tensor:
         """Sample points of the box; return those (n, d) with another prediction."""
@@ -157,31 +162,42 @@ class GrowingBox:
         """
         if not bool(((point >= self.low) & (point <= self.high)).all()):
             return
-        width = (self.high - self.low).clamp_min(1e-12)
-        loss = torch.where(
+        width = (self.high - self.low).clamp_min(1e-12)  # not divided by 0
+        # the fraction of the box that a face cuts off, of each axis (d,)
+        lost_fraction = torch.where(
             point > self._center,
             (self.high - point) / width,
             (point - self.low) / width,
         )
-        # the centre stays inside
-        axis = int(torch.where(point == self._center, torch.inf, loss).argmin())
-        face = self.high if point[axis] > self._center[axis] else self.low
+        # No face can exclude the point along an axis where it is at the centre, which
+        # stays inside.
+        lost_fraction = torch.where(point == self._center, torch.inf, lost_fraction)
+        axis = int(lost_fraction.argmin())
+        is_upper = point[axis] > self._center[axis]
+        face = self.high if is_upper else self.low
         face[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
 
-    def _push(self, face: int, share: float) -> bool:
+    def _push(self, face: int, fraction: float) -> bool:
         """Move a face out if the slab that it wins has the centre's prediction.
+
+        A face close to the bound tries to move all of the distance. The slab is probed
+        at random points, one of which is moved to the outer face. A face does not move
+        by less than `MIN_STEP`.
 
         Args:
             face: its index: 2 * axis, and 1 more for the upper face.
-            share: of the distance to the bound.
+            fraction: of the distance to the bound.
 
         Returns:
             Whether it moved.
         """
         axis, is_upper = divmod(face, 2)
-        room = float(1.0 - self.high[axis] if is_upper else self.low[axis])
-        step = room if room < 4.0 * MIN_STEP else share * room
-        if room <= 0.0 or (step < MIN_STEP and step != room):
+        distance = float(1.0 - self.high[axis]) if is_upper else float(self.low[axis])
+        if distance <= 0.0:
+            return False
+        is_close = distance < 4.0 * MIN_STEP
+        step = distance if is_close else fraction * distance
+        if step < MIN_STEP and not is_close:
             return False
         slab_low = self.low.clone()
         slab_high = self.high.clone()
@@ -197,10 +213,12 @@ class GrowingBox:
         probes[0, axis] = outer
         if not all(self._evaluate(point) for point in probes):
             return False
-        (self.high if is_upper else self.low)[axis] = outer.clamp(0.0, 1.0)
+        corner = self.high if is_upper else self.low
+        corner[axis] = outer.clamp(0.0, 1.0)
         return True
 
     def _evaluate(self, u: Tensor) -> bool:
+        """Return whether a point has the centre's prediction, and count it."""
         self.n_evaluated += 1
         return self._is_same(u, self.n_evaluated - 1)
 

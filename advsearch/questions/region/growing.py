@@ -42,7 +42,7 @@ class VariedParameters:
 
     Attributes:
         names: of the parameters.
-        coordinates: where they lie in u (k,).
+        coordinates: their indices in u (k,).
         centre: the configuration around which the box grows (d,).
     """
 
@@ -52,18 +52,22 @@ class VariedParameters:
 
     @property
     def start(self) -> Tensor:
-        """Their values at the centre (k,)."""
+        """Their coordinates at the centre (k,), in [0, 1]."""
         return self.centre[self.coordinates]
 
     def with_values(self, values: Tensor) -> Tensor:
-        """Return the centre with other values (k,) of these parameters (d,)."""
+        """Return the centre (d,) with other coordinates (k,) of these parameters."""
         u = self.centre.clone()
         u[self.coordinates] = values
         return u
 
 
 def find_region(context: RunContext[RegionConfig]) -> RegionResult:
-    """Load the problem, grow and check the box, and draw the map."""
+    """Load the problem, grow and check the box, and draw the map.
+
+    Around an adversarial configuration, the controls have the budget of its attack.
+    After an interrupt the result has no box.
+    """
     config = context.config
     stages = context.stages
     stages.begin("setup", workbench.LOADING)
@@ -86,6 +90,9 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
         grown = RegionSearch(context, verifier, varied).run()
     stages.end()
     findings = verifier.state
+    transport = None
+    if findings.predictor or findings.predictor_refusal:
+        transport = findings.transport_summary
     return context.result(
         RegionResult,
         **vars(grown),
@@ -96,9 +103,7 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
         image_formation=problem.renderer.formation,
         clean={"moved": problem.space.adjusted_defaults},
         warnings=warnings,
-        transport=findings.transport_summary
-        if findings.predictor or findings.predictor_refusal
-        else None,
+        transport=transport,
         renders=count_renders(verifier),
         seconds={**stages.seconds, "total": stages.total},
     )
@@ -118,12 +123,15 @@ def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
 def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
     """Find the parameters in which the box grows, and its centre.
 
+    These are those of `vary`, or all that are searched but discrete choices. A vector
+    has a parameter for each component, ``NAME.INDEX``.
+
     Raises:
         UnknownNameError: `vary` names a parameter that the controls do not search.
         InputError: there are too few or too many, or `around` is a run over other
             controls.
     """
-    coordinate_of: dict[str, int] = {}
+    coordinate_of: dict[str, int] = {}  # index in u by name
     for group in problem.space.groups:
         if group.options:
             continue
@@ -185,8 +193,8 @@ class RegionSearch:
         self._run = context.run
         self._verifier = verifier
         self._varied = varied
-        self._is_checking = False
-        self._centre_verdict = False
+        self._is_checking = False  # whether the box has grown
+        self._centre_verdict = False  # whether the model is wrong at the centre
 
     def run(self) -> GrownRegion:
         """Find the verdict at the centre, grow the box, and draw the map."""
@@ -248,16 +256,18 @@ class RegionSearch:
         self._verifier.stages.begin("search", title, limit, hint=hint, at_most=True)
 
     def _is_same(self, values: Tensor, number: int) -> bool:
-        """Return whether the verdict at values (k,) is that of the centre.
+        """Return whether the verdict at coordinates (k,) is that of the centre.
 
-        An image without the object is neither right nor wrong.
+        An image without the object, or with a prediction that is not a number, is
+        neither right nor wrong, and so another one. Images of the check are rendered,
+        never predicted.
         """
         predictor = None if self._is_checking else self._verifier.state.predictor
         u = self._varied.with_values(values)
         (trial,) = self._verifier.try_configurations(
             "region", {number: u}, has_success=False, predictor=predictor
         )
-        is_counted = not trial.prediction.is_out_of_view and not trial.is_not_a_number
+        is_counted = not trial.prediction.is_out_of_view and not trial.is_non_finite
         return is_counted and trial.success == self._centre_verdict
 
 
@@ -281,7 +291,7 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
             "the centre, so there is no "
             "verdict; choose another centre"
         )
-    n_without_number = sum(trial.is_not_a_number for trial in trials)
+    n_without_number = sum(trial.is_non_finite for trial in trials)
     if n_without_number:
         raise InputError(
             f"the model's prediction is not a number in {n_without_number} of "
@@ -304,7 +314,8 @@ def describe_box(
 ) -> list[BoxSide]:
     """Return the range of each parameter in its unit.
 
-    Of a number that no control describes, as fractions of the range.
+    Of a number that no control describes, as fractions of the range. A component of a
+    vector is described as ``NAME.INDEX``.
 
     Args:
         problem: of the scene.
@@ -367,15 +378,16 @@ def draw_map(
         "or `verify_spp` shorten it"
     )
     verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
-    steps = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
+    grid = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
 
     def find_configuration(number: int) -> Tensor:
+        """Return the configuration (d,) of a point, row by row from the lowest."""
         row, column = divmod(number, size)
-        return varied.with_values(torch.stack([steps[column], steps[row]]))
+        return varied.with_values(torch.stack([grid[column], grid[row]]))
 
-    transport = verifier.state.predictor
+    predictor = verifier.state.predictor
     trials = verifier.try_in_batches(
-        "map", size * size, find_configuration, has_success=False, predictor=transport
+        "map", size * size, find_configuration, has_success=False, predictor=predictor
     )
     margins = [-trial.score for trial in trials]
     rows = [margins[begin : begin + size] for begin in range(0, len(margins), size)]

@@ -155,7 +155,13 @@ def same_render(
 ) -> ReplayCondition:
     """Return a condition that takes the run's renders and may change the image."""
     return ReplayCondition(
-        name, description, lambda: problem, spp, RUN_LIGHT, RUN_LIGHT, change
+        name,
+        description,
+        make_problem=lambda: problem,
+        spp=spp,
+        light=RUN_LIGHT,
+        source=RUN_LIGHT,
+        change=change,
     )
 
 
@@ -214,7 +220,10 @@ def with_scene(problem: Problem, **changes: Any) -> Problem:
 
 
 def image_formation_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
-    """Yield conditions with another denoiser or tone curve."""
+    """Yield conditions with another denoiser or tone curve.
+
+    A tone curve needs no renders of its own: it is applied to the run's radiance.
+    """
     denoiser = "none"
     if problem.renderer.formation.denoiser == "none":
         denoiser = "oidn"
@@ -281,13 +290,25 @@ def model_condition(
     """Return the condition that asks another model.
 
     A model that takes the same images as the run's own shares the run's renders.
+
+    Args:
+        problem: of the run.
+        other_problem: the same with the other model.
+        name: of the other model.
+        spp: samples per pixel.
     """
     light = name
     if other_problem.renderer.formation == problem.renderer.formation:
         light = RUN_LIGHT
         other_problem = replace(other_problem, renderer=problem.renderer)
-    make_problem = partial(replace, other_problem)
-    return ReplayCondition("model", name, make_problem, spp, light, light)
+    return ReplayCondition(
+        "model",
+        name,
+        make_problem=partial(replace, other_problem),  # a copy
+        spp=spp,
+        light=light,
+        source=light,
+    )
 
 
 # ---- the experiment
@@ -365,10 +386,18 @@ def run_replay(
     problem, warnings = load_problem()
     warnings += describe_changed_file(attack_directory, parts)
 
-    u = workbench.read_stored_configuration(attack_directory, problem)
     spp = verification_spp(attack)
     conditions = select_conditions(config, problem, spp, load_problem)
-    table = _fill_table(context, parts, u, config, conditions, spp)
+    table = _Table(
+        u=workbench.read_stored_configuration(attack_directory, problem),
+        trials=config.trials,
+        seed=seeds.stream(parts.config.seed, "replay"),
+        run=context.run,
+        progress=context.progress,
+    )
+    with context.until_interrupted():
+        for batch in batch_by_light(conditions, spp):
+            table.fill(batch)
     return context.result(
         ReplayResult,
         answer=str(attack_directory),
@@ -385,23 +414,6 @@ def run_replay(
         warnings=warnings,
         seed=parts.config.seed,
     )
-
-
-def _fill_table(
-    context: RunContext[ReplayConfig],
-    parts: workbench.AttackParts,
-    u: Tensor,
-    config: ReplayConfig,
-    conditions: Any,
-    spp: int,
-) -> _Table:
-    """Render the configuration under each condition, until an interrupt."""
-    seed = seeds.stream(parts.config.seed, "replay")
-    table = _Table(u, config.trials, seed, context.run, context.progress)
-    with context.until_interrupted():
-        for batch in batch_by_light(conditions, spp):
-            table.fill(batch)
-    return table
 
 
 def verification_spp(attack: workbench.AttackSummary) -> int:
@@ -447,7 +459,8 @@ def batch_by_light(
 ) -> list[list[ReplayCondition]]:
     """Put the conditions that share the run's renders into the first batch.
 
-    Every other condition is a batch by itself.
+    These have its light and its samples per pixel. Every other condition is a batch by
+    itself.
     """
     shared = [
         condition
@@ -500,6 +513,7 @@ class _Table:
             self._add_not_done(conditions, str(error))
 
     def _add_not_done(self, conditions: Sequence[ReplayCondition], reason: str) -> None:
+        """Add rows of conditions that were not rendered, with the reason."""
         for condition in conditions:
             self.rows[condition] = ReplayRow(
                 way=condition.name,
@@ -519,6 +533,7 @@ class _Table:
             hint="`trials` or `ways` shorten it",
         )
         retrial_of = {condition: condition.to_retrial() for condition in conditions}
+        # each renderer once, though conditions share it
         renderer_by_id = {
             id(retrial.problem.renderer): retrial.problem.renderer
             for retrial in retrial_of.values()

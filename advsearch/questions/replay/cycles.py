@@ -178,6 +178,10 @@ A line has the seed, the samples per pixel and the number of the image.
 """
 
 
+# Blender's cameras look along their own -z, and not along +z.
+TO_BLENDER_CAMERA = np.diag([-1.0, 1.0, -1.0, 1.0])
+
+
 class BlenderError(Exception):
     """Blender is not installed, cannot render a scene, or stopped."""
 
@@ -220,11 +224,15 @@ class Cycles:
         self._resolution = size
         self._depth = max_depth
         self._denoise = denoise
+        # the scene's inputs that the process has loaded
         self._inputs: dict[str, Tensor] = {}
         self._process: _Process | None = None
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
         """Render linear radiance (H, W, 3), as `MitsubaScene.radiance` does.
+
+        A process of Blender goes on as long as the inputs stay the same; for others a
+        new one is started.
 
         Raises:
             BlenderError: Blender stopped, or took too long.
@@ -258,21 +266,31 @@ class Cycles:
         if "environment.padded" in values:
             radiance = values["environment.padded"][:, 1:-1].numpy()
 
-        blender_settings = self._make_settings(values, scene, width, height, radiance)
+        blender_settings = self._make_settings(
+            values, width, height, has_environment=radiance is not None
+        )
         shapes = [_turn_for_blender(mesh) for mesh in meshes]
         return blender_settings, workbench.encode_glb(shapes), radiance
 
     def _make_settings(
         self,
         values: Mapping[str, Tensor],
-        scene: SceneDescription,
         width: int,
         height: int,
-        radiance: np.ndarray | None,
+        *,
+        has_environment: bool,
     ) -> dict[str, object]:
-        """Return the settings of the Blender script: image size, camera, lamps and
-        environment.
+        """Return what `RENDER_SCRIPT` reads: image size, camera, lamps, environment.
+
+        Angles are in radians; the shift of the camera is a fraction of the longer side
+        of the image.
+
+        Args:
+            values: the scene's inputs; what is missing is as the scene has it.
+            width, height: of the image, pixels.
+            has_environment: whether an environment map lights the scene.
         """
+        scene = self._description
         to_world = values.get(
             "camera.to_world",
             torch.from_numpy(geometry.camera_to_world(scene, width / height)),
@@ -286,16 +304,14 @@ class Cycles:
         blender_settings: dict[str, object] = {
             "width": width,
             "height": height,
-            # Blender's cameras look along their own -z.
-            "camera": (
-                to_world.double().numpy() @ np.diag([-1.0, 1.0, -1.0, 1.0])
-            ).tolist(),
+            "camera": (to_world.double().numpy() @ TO_BLENDER_CAMERA).tolist(),
             "fov": math.radians(fov),
             "shift": [shift_x * width / longer_side, -shift_y * height / longer_side],
             "lamps": _describe_lamps(scene, values),
-            "environment": radiance is not None,
+            "environment": has_environment,
             "turn": math.pi / 2.0 - math.radians(scene.number("environment.rotation")),
             "strength": 2.0 ** scene.number("environment.exposure"),
+            # A path of two segments has none: light, surface, camera.
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
@@ -313,7 +329,9 @@ def _find_unsupported(description: SceneDescription) -> list[str]:
             unsupported.append(f"a surface of Mitsuba's own on the {name}")
     if description.thin_lens or description.camera_model:
         unsupported.append("a lens")
-    if description.backdrop:
+    if description.backdrop_photograph:
+        unsupported.append("a photograph behind the object")
+    elif description.backdrop:
         unsupported.append("a plain background")
     return unsupported
 
@@ -443,6 +461,8 @@ class _Process:
     def render(self, seed: int, spp: int) -> Tensor:
         """Render one image with its own noise, linear (H, W, 3).
 
+        Blender writes the file of the image under its final name when it is complete.
+
         Raises:
             BlenderError: Blender stopped, or took too long.
         """
@@ -457,9 +477,10 @@ class _Process:
         except OSError:
             pass  # Blender has stopped, which is reported below
         while not path.is_file():
+            # It may have written the file just before it stopped.
             if self._process.poll() is not None and not path.is_file():
                 log = self._log.read_text("utf-8", "replace")
-                raise BlenderError(f"Blender stopped{workbench.last_line(log)}")
+                raise BlenderError(f"Blender stopped{workbench.get_last_line(log)}")
             if time.monotonic() > deadline:
                 raise BlenderError(
                     f"Blender had not rendered it after {time_limit} seconds"

@@ -222,11 +222,10 @@ def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
 
 def summarize_replay(result: ReplayResult) -> str:
     """Summarise in words under which conditions the adversarial scene holds."""
-    changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
-    if not result.table or (result.table[0].ending == NOT_DONE and not changed):
+    if all(row.ending == NOT_DONE for row in result.table):
         return "Nothing was rendered again."
-
-    unchanged_status = result.table[0].ending
+    changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
+    unchanged_status = result.table[0].ending  # the first row changes nothing
     unchanged_text = "does not hold"
     if unchanged_status == HOLDS:
         unchanged_text = "holds"

@@ -138,15 +138,18 @@ def _count_agreeing(
     return sum(agrees), len(agrees)
 
 
-def _has_value(value: float | str, of: workbench.AxisValue) -> bool:
-    """Return whether a value is that of an axis, or in its range."""
-    if isinstance(value, str) or isinstance(of, str):
-        return value == of
-    return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
+def _has_value(value: float | str, axis_value: workbench.AxisValue) -> bool:
+    """Return whether a value is that of an axis, or in its range, ends included."""
+    if isinstance(value, str) or isinstance(axis_value, str):
+        return value == axis_value
+    if isinstance(axis_value, tuple):
+        lower, upper = axis_value
+        return lower <= value <= upper
+    return math.isclose(value, axis_value)
 
 
 def list_triggering_conditions(result: results.Result) -> list[str]:
-    """Return rules under which the model is wrong more often."""
+    """Return rules under which the model is wrong more often, if it looks for any."""
     triggering = workbench.get_experiment(result.command).triggering
     return [] if triggering is None else list(triggering(result))
 
@@ -194,36 +197,43 @@ def describe_criterion(
         criterion: the minimum fraction.
         selected_axes: axes whose values were chosen.
     """
-    verdicts = {
+    verdict_of_condition = {
         row.condition: evaluate_criterion(criterion, row.interval) for row in conditions
     }
     lines = []
     if selected_axes and conditions:
-        counts = Counter(verdicts.values())
+        counts = Counter(verdict_of_condition.values())
         lines.append(
             f"At least {wording.percent(criterion)}, each condition by its own 95 % "
             f"interval: met in {counts['met']}, "
             f"not met in {counts['not met']} and open in {counts['open']} of "
-            f"{len(verdicts)}. There is no verdict over "
+            f"{len(verdict_of_condition)}. There is no verdict over "
             f"all: the values of {', '.join(selected_axes)} were chosen."
         )
     else:
         lines += _criterion_of_claims(claims, criterion, selected_axes)
-    for verdict in ("not met", "open") if selected_axes else ("not met",):
-        names = [condition for condition, known in verdicts.items() if known == verdict]
+    listed_verdicts = ["not met"]
+    if selected_axes:
+        listed_verdicts.append("open")
+    for listed in listed_verdicts:
+        names = [
+            condition
+            for condition, verdict in verdict_of_condition.items()
+            if verdict == listed
+        ]
         if names:
-            lines.append(f"{verdict.capitalize()} where: {', '.join(names)}.")
+            lines.append(f"{listed.capitalize()} where: {', '.join(names)}.")
     return lines
 
 
 def _criterion_of_claims(
-    claims: Sequence[views.Claim], criterion: float, chosen: Sequence[str]
+    claims: Sequence[views.Claim], criterion: float, selected_axes: Sequence[str]
 ) -> list[str]:
     """Describe for each claimed fraction of right predictions if a criterion is met."""
     remark = ""
-    if chosen:
+    if selected_axes:
         remark = (
-            f" Over the values of {', '.join(chosen)} that were chosen: others "
+            f" Over the values of {', '.join(selected_axes)} that were chosen: others "
             "give another share."
         )
     lines = []
@@ -316,10 +326,15 @@ def describe_exposure(
 def _weighted_mean(
     rows: Mapping[str, ConditionShare], weights: Mapping[str, float]
 ) -> tuple[float, float, float]:
-    """Return the weighted mean of fractions, and its lower and upper bound."""
+    """Return the weighted mean of fractions, and its lower and upper bound.
+
+    The bounds are those of intervals that hold jointly for all values (Bonferroni).
+    """
     total = sum(weights.values())
     confidence = 1.0 - 0.05 / len(weights)
-    mean = lower = upper = 0.0
+    mean = 0.0
+    lower = 0.0
+    upper = 0.0
     for value, weight in weights.items():
         row = rows[value]
         fraction = weight / total
@@ -358,6 +373,10 @@ def describe_domain(
     searched: Sequence[str],
 ) -> dict[str, DomainPart]:
     """Describe the parts of an operational design domain: ranges, or fixed values.
+
+    A part varied if a sentence is about it, or else if a control of the run belongs to
+    it. Where the place varied, light and weather are as each environment has them. What
+    belongs to no part is under `OTHER`, if there is anything.
 
     Args:
         result: result of the run.
@@ -417,11 +436,14 @@ def _fixed_domain(
 
 
 def find_domain_part(name: str) -> str:
-    """Return the part of a domain that an axis, a control or a parameter belongs to."""
-    beginning = re.match(r"\w+", name)
-    if beginning is not None:
+    """Return the part of a domain that an axis, a control or a parameter belongs to.
+
+    Its first word decides: ``camera`` of ``camera.azimuth``, also of a sentence.
+    """
+    first_word = re.match(r"\w+", name)
+    if first_word is not None:
         for part, names in DOMAIN.items():
-            if beginning[0] in names:
+            if first_word[0] in names:
                 return part
     return OTHER
 
@@ -560,8 +582,8 @@ def describe_run(
         renders_text = ", ".join(counts) or "none"
     seconds = values.get("seconds") or {}
     setting_texts = dict[str, str]()
-    for each in recorded:
-        setting_texts |= each.as_text()
+    for source_settings in recorded:
+        setting_texts |= source_settings.as_text()
     return EvidenceRun(
         run=name,
         command=result.command,
@@ -584,7 +606,11 @@ def describe_run(
 def _describe_subject(
     result: results.Result, recorded: Sequence[RecordedSettings]
 ) -> dict[str, str]:
-    """Return object, environment, model, task and what counts as right, by name."""
+    """Return object, environment, model, task and what counts as right, by name.
+
+    An environment that a control varied is marked as such. What is not known is left
+    out.
+    """
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())
     right = values.get("label_set") or join_values(
@@ -617,7 +643,15 @@ def _describe_subject(
 def describe_searched(
     result: results.Result, settings: Mapping[str, object]
 ) -> list[str]:
-    """Describe what varied in a run: parameters with ranges, and controls."""
+    """Describe what varied in a run: parameters with ranges, and controls.
+
+    A control has the ranges that were set; without any, and without a sentence about
+    its parameters, it varied over its defaults.
+
+    Args:
+        result: of the run.
+        settings: of the run.
+    """
     lines = []
     if is_attack(result):
         lines += _searched_by_attack(result)
@@ -669,12 +703,11 @@ def _searched_by_sweep(result: workbench.SweepSummary) -> list[str]:
 
 def _format_axis_values(values: Sequence[Any]) -> str:
     """Format the values of an axis; bins as their range."""
-    text = ", ".join(map(wording.format_number, values))
     if all(isinstance(value, tuple) for value in values):  # bins of a range
         lower = min(low for low, _ in values)
         upper = max(high for _, high in values)
-        text = f"{lower:.4g} to {upper:.4g}"
-    return text
+        return f"{lower:.4g} to {upper:.4g}"
+    return ", ".join(map(wording.format_number, values))
 
 
 def _format_range(varied: results.VariedValue) -> str:
@@ -691,7 +724,7 @@ def _describe_measurement(
     recorded: Sequence[RecordedSettings],
 ) -> dict[str, str]:
     """Return policy, seed, samples and the like by name."""
-    tasks = [each.task for each in recorded if each.is_of_scene]
+    tasks = [run_settings.task for run_settings in recorded if run_settings.is_of_scene]
     trials = "Trials of the worst configuration" if is_sweep(result) else "Trials"
     facts = {
         "Policy": getattr(result, "policy", None),
@@ -879,7 +912,7 @@ def _make_evidence_run(
             "photographs": count_conditions(result, photo_rows),
             "domain": {name: part.text for name, part in domain.items()},
             "not_shown": _describe_limits(
-                claims_of_photographs, domain, bool(weighted)
+                claims_of_photographs, domain, is_weighted=bool(weighted)
             ),
         }
     )
@@ -888,7 +921,11 @@ def _make_evidence_run(
 def _describe_stored_run(
     folder: Path, result: results.Result, claims: Sequence[views.Claim]
 ) -> tuple[list[RecordedSettings], EvidenceRun]:
-    """Return the recorded settings of a run and what it read, and it as evidence."""
+    """Return what a run recorded, with the runs that it read, and the run as evidence.
+
+    The recorded settings are the run's own first, then those of its claims, then those
+    of the runs.
+    """
     read_paths = [
         *find_read_sweeps(result),
         *find_read_attacks(read_run_settings(folder)),
@@ -896,7 +933,11 @@ def _describe_stored_run(
     recorded = collect_settings(folder, result, read_paths)
     versions = _collect_versions(folder, result, read_paths)
     run = describe_run(
-        directory.format_run_name(folder), result, claims, recorded, versions
+        directory.format_run_name(folder),
+        result,
+        claims=claims,
+        recorded=recorded,
+        versions=versions,
     )
     return recorded, run
 
@@ -909,11 +950,10 @@ def _describe_criterion(
     conditions: Any,
 ) -> list[str]:
     """Describe whether claims meet the criterion; nothing without one."""
-    criterion_text = list[str]()
-    if criterion is not None:
-        axes = _list_chosen_axes(result, sweeps)
-        criterion_text = describe_criterion(claims, conditions, criterion, axes)
-    return criterion_text
+    if criterion is None:
+        return []
+    selected_axes = _list_selected_axes(result, sweeps)
+    return describe_criterion(claims, conditions, criterion, selected_axes)
 
 
 def _collect_versions(
@@ -942,7 +982,7 @@ def _read_sweeps(
     return sweeps
 
 
-def _list_chosen_axes(
+def _list_selected_axes(
     result: results.Result,
     sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
 ) -> list[str]:
@@ -1018,6 +1058,7 @@ def _remark_quick(folder: Path) -> list[str]:
 def _describe_limits(
     claims_of_photographs: Sequence[views.Claim],
     domain: Mapping[str, DomainPart],
+    *,
     is_weighted: bool,
 ) -> list[str]:
     """Describe what a reader must not conclude from a run."""

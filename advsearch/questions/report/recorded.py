@@ -35,7 +35,12 @@ MAX_VALUE_LENGTH = 2000
 
 @dataclass
 class RecordedSettings:
-    """Settings of a file or a note, and their source: empty for the run's own."""
+    """Settings as a run recorded them.
+
+    Attributes:
+        source: name of the note or the run that has them; empty for the run's own.
+        values: by name, as a file has them.
+    """
 
     source: str
     values: Mapping[str, Any]
@@ -57,66 +62,78 @@ class RecordedSettings:
         prefix = f"{self.source}: " if self.source else ""
         texts = dict[str, str]()
         for name, value in self.values.items():
-            if name not in NOT_SETTINGS and self._is_used(name, value):
-                texts[f"{prefix}{name}"] = (
-                    self.task if name == "task" else _shorten(value)
-                )
+            if name in NOT_SETTINGS or not self._is_used(name, value):
+                continue
+            text = self.task if name == "task" else _shorten(value)
+            texts[f"{prefix}{name}"] = text
         return texts
 
     def _is_used(self, name: str, value: object) -> bool:
         """Return whether a setting has an effect.
 
-        A default has none if the command renders nothing, since it names no object, or
-        if it would clash with other settings, as `fps` without a path.
+        One that differs from its default has. A default has none if it is empty, if the
+        command renders nothing, since it names no object, or if the setting makes no
+        sense beside the others, as `fps` without a path.
         """
         defaults = self._defaults
         if name in defaults and value != defaults[name]:
             return True
         renders_nothing = "object" in defaults and not self.is_of_scene
-        if name in self._clashing or renders_nothing:
+        if name in self._meaningless or renders_nothing:
             return False
         is_empty = value is None or value is False or value in ("", {}, [], ())
         return not is_empty
 
     @cached_property
-    def _kind(self) -> type[Config] | None:
+    def _config_class(self) -> type[Config] | None:
+        """The class of the command's settings; None of a command that is not known."""
+        command = str(self.values.get("command") or "")
         with suppress(errors.AdvsearchError, KeyError):
-            config: type[Config] = workbench.get_experiment(
-                str(self.values.get("command") or "")
-            ).settings
-            return config
+            config_class: type[Config] = workbench.get_experiment(command).settings
+            return config_class
         return None
 
     @cached_property
     def _defaults(self) -> dict[str, Any]:
-        """The default of each setting of the command."""
-        known = settings.settings(self._kind) if self._kind else ()
+        """The default of each setting of the command; None of a required one."""
+        if self._config_class is None:
+            return {}
         return {
             setting.name: None if setting.required else setting.default
-            for setting in known
+            for setting in settings.settings(self._config_class)
         }
 
     @cached_property
-    def _clashing(self) -> set[str]:
-        """The settings that could not be given, since they clash with others."""
-        with suppress(errors.AdvsearchError):
-            if self._kind is not None:
-                values = {
-                    name: value
-                    for name, value in self.values.items()
-                    if name not in NOT_SETTINGS
-                }
-                config = self._kind(**values)
-                return {
-                    clash.setting.rstrip("_")
-                    for clash in self._kind.clashes
-                    if clash.with_others(config)
-                }
-        return set()
+    def _meaningless(self) -> set[str]:
+        """The settings that make no sense beside the others that were recorded.
+
+        They are those that a command rejects beside them, as `fps` without a path.
+        Nothing is known, and none is returned, if the settings are not valid any more:
+        versions or files may have changed since the run.
+        """
+        if self._config_class is None:
+            return set()
+        values = {
+            name: value
+            for name, value in self.values.items()
+            if name not in NOT_SETTINGS
+        }
+        try:
+            config = self._config_class(**values)
+            # Fields like `set_` have an underscore that the setting has not.
+            return {
+                clash.setting.rstrip("_")
+                for clash in self._config_class.clashes
+                if clash.with_others(config)
+            }
+        except errors.AdvsearchError:
+            return set()
 
 
 def describe_task(task: Any, objective: object) -> str:
     """Return a task in words with all of its options, also default ones.
+
+    Without options that are known, it is the task as it was recorded.
 
     Args:
         task: name of the task, or a mapping with its name and options.
@@ -128,7 +145,7 @@ def describe_task(task: Any, objective: object) -> str:
     )
     if not options:
         return _shorten(task)
-    name = str(task.get("name") if isinstance(task, Mapping) else task)
+    name = task.get("name") if isinstance(task, Mapping) else task
     return f"{name} ({options})"
 
 
@@ -143,7 +160,11 @@ def _shorten(value: object) -> str:
 
 
 def _task_options(named: Any, objective: object) -> dict[str, Any]:
-    """Return the options of a task by name, those of its parts after their names."""
+    """Return the options of a task by name, those of its parts after their names.
+
+    Options that a run sets are left out, and empty ones. None are known of a task that
+    cannot be made any more.
+    """
     from advsearch.extend import workbench  # it brings torch, which takes a second
 
     options = dict[str, Any]()
@@ -239,9 +260,9 @@ def join_values(
     `otherwise` stands for settings without a value.
     """
     texts = [
-        _shorten(each.values.get(name) or otherwise)
-        for each in recorded
-        if each.is_of_scene
+        _shorten(run_settings.values.get(name) or otherwise)
+        for run_settings in recorded
+        if run_settings.is_of_scene
     ]
     return "; ".join(dict.fromkeys(filter(None, texts)))
 

@@ -253,7 +253,11 @@ class Case:
     measure: Callable[[], Outcome]
 
     def run(self) -> CaseRow:
-        """Run the case. An exception means that it falls short, and is the reason."""
+        """Run the case. An exception means that it falls short, and is the reason.
+
+        An InputError counts as a refusal, any other exception as values that are not
+        finite. What decides is the first check that fails, else the last one.
+        """
         start = time.perf_counter()
         try:
             outcome = self.measure()
@@ -265,16 +269,19 @@ class Case:
                 f"raised {type(error).__name__}: {error}", 1.0, 0.0, 0.0
             )
             outcome = Outcome([failure], finite=False, ending="raised")
-        failed = [each for each in outcome.checks if not each.ok]
+        failed = [check for check in outcome.checks if not check.ok]
+        status = OK
         if failed:
+            status = FELL_SHORT
             decides = str(failed[0])
         elif not outcome.finite:
+            status = FELL_SHORT
             decides = "NaN or infinite values"
         else:
-            decides = "".join(map(str, outcome.checks[-1:]))
+            decides = str(outcome.checks[-1]) if outcome.checks else ""
         fields = {
             "case": self.name,
-            "status": OK if outcome.finite and not failed else FELL_SHORT,
+            "status": status,
             "decides": decides,
             "seconds": time.perf_counter() - start,
         }
@@ -293,30 +300,38 @@ def register_case(
     The first sentence of its docstring, which users see, states what must hold.
     """
 
-    def register(find: Callable[[], Outcome]) -> Callable[[], Outcome]:
-        sentence = " ".join((find.__doc__ or "").partition("\n\n")[0].split())
-        ALL_CASES.append(Case(name, group, sentence, slow, find))
-        return find
+    def register(measure: Callable[[], Outcome]) -> Callable[[], Outcome]:
+        first_paragraph, _, _ = (measure.__doc__ or "").partition("\n\n")
+        requirement = " ".join(first_paragraph.split())
+        ALL_CASES.append(
+            Case(name=name, group=group, holds=requirement, slow=slow, measure=measure)
+        )
+        return measure
 
     return register
 
 
 def register_cases(
     group: str,
-    find: Callable[..., Outcome],
-    table: Iterable[tuple[str, str, dict[str, Any]]],
+    measure: Callable[..., Outcome],
+    rows: Iterable[tuple[str, str, dict[str, Any]]],
 ) -> None:
     """Register a case for each row of a table.
 
     Args:
         group: group of the cases.
-        find: function that runs a case.
-        table: name, what must hold, and arguments of the function; `slow` is no
-            argument but whether the case is slow.
+        measure: runs a case.
+        rows: name, what must hold, and arguments of the function; `slow` among them is
+            no argument but whether the case is slow.
     """
-    for name, sentence, data in table:
-        arguments = {key: value for key, value in data.items() if key != "slow"}
-        is_slow = bool(data.get("slow"))
+    for name, requirement, options in rows:
+        arguments = {key: value for key, value in options.items() if key != "slow"}
         ALL_CASES.append(
-            Case(name, group, sentence, is_slow, partial(find, **arguments))
+            Case(
+                name=name,
+                group=group,
+                holds=requirement,
+                slow=bool(options.get("slow")),
+                measure=partial(measure, **arguments),
+            )
         )

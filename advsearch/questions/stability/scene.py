@@ -168,7 +168,9 @@ def check_scene(
 ) -> Outcome:
     """Render a scene, differentiate it, and search from there.
 
-    The gradient is compared with differences, which takes most of the time.
+    The gradient is compared with differences, which takes most of the time. Always
+    checked are: the image is in [0, 1], nothing is NaN or infinite; with `compare` the
+    gradient's error and its noise; and whatever bounds are passed.
 
     Args:
         controls: settings of the controls.
@@ -192,18 +194,25 @@ def check_scene(
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     image = render_image(renderer, start, 0, spp)
     _, slope = renderer.gradient(loss, start, 0, spp)
-    relative_error, gradient_checks = _check_derivatives(
-        spp, compare, seeds, repeats, renderer, start
-    )
+    relative_error = None
+    gradient_checks: list[Check] = []
+    if compare:
+        gradient_checks, relative_error = _check_gradient(
+            compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
+        )
     result = search_scene(renderer, loss, start, spp, evaluations)
     in_range = float(image.min()) >= 0.0 and float(image.max()) <= 1.0
-    n_objectives = float(result.non_finite_objectives)
     checks = [
         check_condition("the picture is in [0, 1]", in_range),
         check_range(
             "values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0
         ),
-        check_range("objectives that were NaN or infinite", n_objectives, 0.0, 0.0),
+        check_range(
+            "objectives that were NaN or infinite",
+            float(result.non_finite_objectives),
+            0.0,
+            0.0,
+        ),
         *gradient_checks,
     ]
     measured = {
@@ -220,65 +229,60 @@ def check_scene(
         checks.append(
             check_condition(f"the ending is {ending!r}", result.ending.value == ending)
         )
-    checks += _compare_with_scene(controls, other_scene, apart, renderer, start)
+    if other_scene is not None:
+        other_arguments: dict[str, Any] = {"controls": controls, **other_scene}
+        checks.append(
+            _compare_images(renderer, start, make_renderer(**other_arguments), apart)
+        )
     is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
     is_finite = is_finite and renderer.non_finite == 0
-    return Outcome(checks, is_finite, relative_error, result.ending.value, measured)
+    return Outcome(
+        checks,
+        finite=is_finite,
+        relative_error=relative_error,
+        ending=result.ending.value,
+        measured=measured,
+    )
 
 
 def _make_start(
     u: Sequence[float] | Mapping[int, float] | None, renderer: gradients.Renderer
 ) -> Tensor:
-    """Return the start (d,) with some or all of its values replaced."""
+    """Return the start (d,) with some or all of its values replaced.
+
+    Args:
+        u: values by index, the first values, or None for none.
+        renderer: which has the start.
+    """
     start: Tensor = renderer.start.clone()
-    for index, value in u.items() if isinstance(u, Mapping) else enumerate(u or ()):
+    value_of_index = u if isinstance(u, Mapping) else dict(enumerate(u or ()))
+    for index, value in value_of_index.items():
         start[index] = value
     return start
 
 
-def _check_derivatives(
-    spp: int,
-    compare: bool,
-    seeds: tuple[int, int],
-    repeats: int,
+def _compare_images(
     renderer: gradients.Renderer,
     start: Tensor,
-) -> tuple[Any, list[Check]]:
-    """Compare the gradient with differences, if requested."""
-    relative_error = None
-    gradient_checks = list[Check]()
-    if compare:
-        rows = compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats)
-        gradient_checks, relative_error = _check_gradient(rows)
-    return relative_error, gradient_checks
-
-
-def _compare_with_scene(
-    controls: ControlSettings,
-    other_scene: Mapping[str, object] | None,
-    apart: Bounds,
-    renderer: gradients.Renderer,
-    start: Tensor,
-) -> list[Check]:
-    """Compare the image with that of another scene, if there is one."""
-    checks = list[Check]()
-    if other_scene is not None:
-        other = make_renderer(**{"controls": controls, **other_scene})  # type: ignore[arg-type]
-        difference = mean_difference(
-            render_image(renderer, start), render_image(other, other.start)
-        )
-        checks.append(
-            check_range(
-                "mean difference from the picture beside it", difference, *apart
-            )
-        )
-    return checks
+    other: gradients.Renderer,
+    bounds: Bounds,
+) -> Check:
+    """Check the mean difference of an image from that of another scene's start."""
+    difference = mean_difference(
+        render_image(renderer, start), render_image(other, other.start)
+    )
+    return check_range(
+        "mean difference from the picture beside it", difference, *bounds
+    )
 
 
 def _check_gradient(
     rows: Sequence[results.Measured],
 ) -> tuple[list[Check], float | None]:
-    """Check the largest noise and the largest error; return the latter's bias too."""
+    """Check the largest noise and the largest error; return the latter's bias too.
+
+    Without derivatives there are no checks, and no bias.
+    """
     if not rows:
         return [], None
     worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0))
@@ -366,14 +370,26 @@ def measure_inward_slope(
     """Return the derivative of the smooth linear loss along a direction inwards.
 
     The direction moves values from the start into the range that increase the loss, if
-    `factor` is 1. The derivative is computed by a gradient (d,), and by one-sided
-    differences of second order, since a bound has no other side.
+    `factor` is 1. Other values stay.
+
+    Args:
+        renderer: of the scene.
+        gradient: (d,) of the loss at the start.
+        factor: on the direction.
+        seeds: over which differences are averaged.
+        spp: samples per pixel.
+
+    Returns:
+        The derivative by the gradient, and by one-sided differences of second order,
+        since a bound has no other side.
     """
     linear = renderer.copy_with(transfer="linear")
     u = renderer.start
     step = 0.04
     loss = gradients.make_smooth_loss(linear.formation.resolution)
-    direction = torch.where(u > 0.5, -1.0, 1.0) * (gradient * (0.5 - u) > 0.0) * factor
+    inwards = torch.where(u > 0.5, -1.0, 1.0)
+    increases_loss = gradient * (0.5 - u) > 0.0
+    direction = inwards * increases_loss * factor
     slopes = []
     for seed in range(seeds):
         at_0, at_1, at_2 = (
@@ -387,7 +403,11 @@ def measure_inward_slope(
 def evaluate(
     renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query: workbench.Query
 ) -> policies.Evaluation:
-    """Evaluate a configuration by a loss of the image; above 0 is a success."""
+    """Evaluate a configuration by a loss of the image; above 0 is a success.
+
+    The number of the query is the seed of the noise. It costs the renders that were
+    made, times the samples that it asks for.
+    """
     spp *= query.samples
     non_finite_before = renderer.non_finite
     renders_before = renderer.renders
@@ -401,11 +421,11 @@ def evaluate(
     objective = float(value)
     cost = (renderer.renders - renders_before) * query.samples
     return policies.Evaluation(
-        objective,
-        gradient,
-        objective > 0.0,
-        renderer.non_finite - non_finite_before,
-        cost,
+        objective=objective,
+        gradient=gradient,
+        success=objective > 0.0,
+        non_finite=renderer.non_finite - non_finite_before,
+        cost=cost,
     )
 
 
@@ -419,8 +439,16 @@ def run_search(
     policy: Policy[Any] | None = None,
     **options: Any,
 ) -> workbench.SearchResult:
-    """Search for an image with a loss above 0; `options` are those of
-    `attacks.search`.
+    """Search for an image with a loss above 0.
+
+    Args:
+        renderer: of the scene.
+        loss: of the image, which is maximised.
+        steps: of the search.
+        spp: samples per pixel.
+        start: None for the renderer's.
+        policy: None for "pgd".
+        **options: of `attacks.search`; without them no candidate is rendered again.
     """
     evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
     policy = policy or workbench.make_policy("pgd")

@@ -69,6 +69,10 @@ DARKNESS = make_gray_environment(0.0)
 
 
 def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
+    """Return arguments of `check_scene` at the end of a range of exposures, stops.
+
+    That is the upper end of positive ones, the lower end of negative ones.
+    """
     controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
     return {
         "controls": controls,
@@ -255,6 +259,13 @@ def make_glass_ball() -> dict[str, dict[str, object]]:
 def material_case(
     parameters: tuple[str, ...], slow: bool = True, **values: float
 ) -> dict[str, object]:
+    """Return arguments of `check_scene` for a material.
+
+    Args:
+        parameters: of the material, which vary in [0, 1].
+        slow: whether the case is slow.
+        **values: of the material where it starts.
+    """
     settings = {f"material.{name}": value for name, value in values.items()}
     return {
         "controls": {"material": {name: [0.0, 1.0] for name in parameters}},
@@ -314,11 +325,13 @@ def texels_at_the_ends() -> Outcome:
     raw = renderer.copy_with(transfer="linear")
     start = renderer.start
     loss = gradients.make_smooth_loss(raw.formation.resolution)
-    slope = torch.stack(
+    gradient = torch.stack(
         [raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]
     ).mean(dim=0)
-    gradient, expected = measure_inward_slope(renderer, slope, 1.0, 8, REFERENCE_SPP)
-    error = abs(gradient / expected - 1.0)
+    slope, expected_slope = measure_inward_slope(
+        renderer, gradient, factor=1.0, seeds=8, spp=REFERENCE_SPP
+    )
+    error = abs(slope / expected_slope - 1.0)
     best = run_search(renderer, loss, 3).best_u
     return check_scene(controls, make_checkered_mug, compare=False).with_checks(
         check_range(
@@ -357,6 +370,12 @@ CENTER_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in ran
 def projector_case(
     u: Sequence[float] | Mapping[int, float] = WHITE_PICTURE, **projector: float
 ) -> dict[str, object]:
+    """Return arguments of `check_scene` for a projector whose texels have a gradient.
+
+    Args:
+        u: texels of its picture, the first ones or by index.
+        **projector: settings of the control.
+    """
     controls = {"projector": {"resolution": SIDE, **projector}}
     return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
 
@@ -457,6 +476,12 @@ NO_GROUND = {"ground.size": 0.0}
 def mesh_case(
     thing: assets.ObjectAsset, other_object: assets.ObjectAsset | None = None
 ) -> dict[str, object]:
+    """Return arguments of `check_scene` for a mesh that is painted and moved.
+
+    Args:
+        thing: the object.
+        other_object: looks the same from the front; None compares with none.
+    """
     other_scene: dict[str, object] = {}
     if other_object:
         other_scene["other_scene"] = {"thing": other_object, "settings": FRONT_VIEW}
@@ -498,6 +523,7 @@ def _format_box(points: np.ndarray) -> list[str]:
 
 
 def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
+    """Return arguments of `check_scene` for a file that looks like that of a box."""
     thing = partial(import_box, scale, shift)
     return {
         "controls": SHIFT,
@@ -508,6 +534,7 @@ def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
 
 
 def outline_case(controls: ControlSettings) -> dict[str, object]:
+    """Return arguments of `check_scene` for an outline in front of nothing."""
     return {
         "controls": controls,
         "thing": make_dark_mug,
@@ -748,6 +775,7 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
     progress = context.progress
 
     def measure_rows() -> Iterator[CaseRow]:
+        """Yield the row of each case, stored or measured now, and report the latter."""
         hint = (
             "`register_case` and `group` pick some, `seconds` stops before the next one"
         )
@@ -785,13 +813,13 @@ def select_cases(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[
         ("case", "name", names),
         ("group", "group", groups),
     ):
-        known = dict.fromkeys(getattr(each, attribute) for each in ALL_CASES)
+        known = dict.fromkeys(getattr(case, attribute) for case in ALL_CASES)
         for name in requested:
             if name not in known:
                 raise errors.UnknownNameError(kind, name, known)
     if not names and not groups:
         return list(ALL_CASES)
-    return [each for each in ALL_CASES if each.name in names or each.group in groups]
+    return [case for case in ALL_CASES if case.name in names or case.group in groups]
 
 
 # ---- Controls whose scales differ by a million, and noise
@@ -821,33 +849,34 @@ def estimate_hessian(
         step * direction for step, direction in zip(steps, directions, strict=True)
     ]
     center = value(u)
-    second = torch.zeros(len(moves), len(moves), dtype=torch.float64)
+    hessian = torch.zeros(len(moves), len(moves), dtype=torch.float64)
     for i, move in enumerate(moves):
         curvature = value(u + move) - 2.0 * center + value(u - move)
-        second[i, i] = curvature / steps[i] ** 2
+        hessian[i, i] = curvature / steps[i] ** 2
         for j, other in enumerate(moves[:i]):
-            crossed = value(u + move + other) - value(u + move - other)
-            crossed += value(u - move - other) - value(u - move + other)
-            second[i, j] = crossed / (4.0 * steps[i] * steps[j])
-            second[j, i] = second[i, j]
-    return second
+            mixed = value(u + move + other) - value(u + move - other)
+            mixed += value(u - move - other) - value(u - move + other)
+            hessian[i, j] = mixed / (4.0 * steps[i] * steps[j])
+            hessian[j, i] = hessian[i, j]
+    return hessian
 
 
-def condition_number(second: Tensor) -> float:
+def condition_number(hessian: Tensor) -> float:
     """Return the ratio of the largest to the smallest absolute eigenvalue.
 
-    The matrix (k, k) is symmetric. It is infinite if the smallest is 0.
+    The matrix (k, k) is symmetric. The ratio is infinite if the smallest is 0.
     """
-    sizes = torch.linalg.eigvalsh(second.double()).abs()
-    if not float(sizes.min()) > 0.0:
+    magnitudes = torch.linalg.eigvalsh(hessian.double()).abs()
+    if not float(magnitudes.min()) > 0.0:
         return math.inf
-    return float(sizes.max() / sizes.min())
+    return float(magnitudes.max() / magnitudes.min())
 
 
 @register_case("stiff", "badly-scaled-range")
 def wide_range() -> Outcome:
     """The derivative does not depend on how wide the searched range is."""
-    wide, narrow = ({"pose": {"x": [-reach, reach]}} for reach in (1e4, 0.3))
+    wide = {"pose": {"x": [-1e4, 1e4]}}
+    narrow = {"pose": {"x": [-0.3, 0.3]}}
     slopes = []
     for controls, width in ((wide, 2e4), (narrow, 0.6)):
         renderer = make_renderer(controls)

@@ -134,12 +134,12 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     control_name, dot, rest = name.partition(".")
     # An instance may stand on either side: KIND:INSTANCE.PARAMETER, or
     # KIND.PARAMETER:INSTANCE.
-    parameter_name, colon, suffix = rest.partition(":")
-    kind, prefix_colon, prefix = control_name.partition(":")
+    parameter_name, last_colon, last_instance = rest.partition(":")
+    kind, first_colon, first_instance = control_name.partition(":")
     if control_name in instances:
         instance = control_name
     else:
-        instance = families.make_instance_name(kind, suffix or prefix)
+        instance = families.make_instance_name(kind, last_instance or first_instance)
     if control_name in _LISTED_SETTINGS and not dot:
         raise InputError(
             f"{where}: several of them are given as a list: "
@@ -155,7 +155,9 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
-    families.check_instance_name(where, suffix or prefix, colon or prefix_colon)
+    families.check_instance_name(
+        where, last_instance or first_instance, last_colon or first_colon
+    )
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
@@ -176,7 +178,11 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
 def _find_control(
     instances: Mapping[str, Control], kind: str, instance: str, where: str
 ) -> Any:
-    """Return the class of a control of a kind or an instance."""
+    """Return the class of a control: that of the instance, else that of the kind.
+
+    Raises:
+        UnknownNameError: there is neither.
+    """
     control: Any = CONTROLS.get(kind)
     if instance in instances:
         control = type(instances[instance])
@@ -196,7 +202,16 @@ def _find_parameters(
     parameter_name: str,
     instance: str,
 ) -> dict[str, Any]:
-    """Return the parameters of a control by name."""
+    """Return the parameters of a control by name.
+
+    Args:
+        values: of the axis; a class may declare a parameter by its values.
+        instances: the sampled controls by name.
+        control: the class of the control.
+        parameter_name: of the axis.
+        instance: name of the control; a sampled one adds the parameters that it alone
+            has.
+    """
     declared = [*control.declare_parameters({parameter_name: values})]
     if instance in instances:
         declared += instances[instance].instance_parameters
@@ -279,21 +294,22 @@ def parse_axis_values(
 def _check_different(
     where: str, values: Sequence[ParameterValue], is_angle: bool
 ) -> None:
-    """Check that no value comes twice, and no angle in two forms."""
-    first_values: dict[ParameterValue, ParameterValue] = {}
+    """Check that no value comes twice, and no angle in two forms, such as 0 and 360."""
+    value_of_key: dict[ParameterValue, ParameterValue] = {}
     for value in values:
         key = value
         if is_angle and not isinstance(value, str):
+            # Rounding may give a full turn, which is 0 as well.
             key = round(value % FULL_TURN, 9) % FULL_TURN
-        if key not in first_values:
-            first_values[key] = value
+        if key not in value_of_key:
+            value_of_key[key] = value
             continue
-        first = first_values[key]
-        if first == value:
+        earlier = value_of_key[key]
+        if earlier == value:
             repeated = f"{_format_value(value)} twice"
         else:
             repeated = (
-                f"{_format_value(first)} and {_format_value(value)}, the same angle"
+                f"{_format_value(earlier)} and {_format_value(value)}, the same angle"
             )
         raise InputError(
             f"{where}: expected different values, got {repeated}; leave one of them out"
@@ -425,11 +441,11 @@ class SampledNumber:
         name: of the parameter, with the index of a component.
         unit: of the values.
         column: its index among the draws.
-        parts: what equal parts of [0, 1] stand for: bounds of a range each, or values
-            of a list.
+        parts: what equal parts of [0, 1] stand for: bounds [low, high] of a range each,
+            or values of a list.
         same_in_all_scenes: whether `parts` are the same in every scene.
-        part_of_share: the part that each of more equal shares of [0, 1] stands for,
-            where values have weights.
+        part_of_share: where values have weights, [0, 1] is cut into more equal shares
+            than there are values; the index of the value of each. Else empty.
     """
 
     name: str
@@ -462,6 +478,9 @@ class SampledNumber:
 def choose_n_parts(n_images: int) -> int:
     """Return into how many parts tables and figures cut the range of a parameter.
 
+    As many as leave the map over two parameters `MIN_CELL_DRAWS` draws a cell, but
+    between `MIN_RANGE_PARTS` and `MAX_RANGE_PARTS`.
+
     Args:
         n_images: images of the full sweep.
     """
@@ -473,9 +492,9 @@ class _SampledBlock(NamedTuple):
     """A block of coordinates that is sampled.
 
     Attributes:
-        block: its budget.
-        coordinates: its place in a configuration.
-        columns: its draws.
+        block: the coordinates' norm and budget.
+        coordinates: their columns in a configuration.
+        columns: their columns among the draws; of a ball one more.
     """
 
     block: Block
@@ -506,11 +525,11 @@ class Points:
         domain: the budgets of the controls.
         axes: of the grid.
         samples: at each point of the grid.
-        sampler: how the draws are made.
+        sampler: how the draws are made, "sobol" or "random".
         seed: of the draws.
-        scenes: after so many scenes the draws repeat, so that scenes that are compared
-            have the same ones; 0 for never.
-        among: scenes of the sweep.
+        repeat_after_scenes: after so many scenes the draws repeat, so that scenes that
+            are compared have the same ones; 0 for never.
+        n_scenes: scenes of the sweep.
 
     Attributes:
         count: images of the scene.
@@ -560,12 +579,16 @@ class Points:
         )
         self.is_sampled = small_dimensions + large_dimensions > 0
         # Samples are draws, or differ in noise alone if nothing is sampled.
+        n_draws = samples if self.is_sampled else 1
+        time_axis = next(
+            (index for index, axis in enumerate(axes) if axis.is_time), None
+        )
         self.units = Units(
             self.grid.sizes,
-            next((index for index, axis in enumerate(axes) if axis.is_time), None),
-            samples if self.is_sampled else 1,
+            frames=time_axis,
+            samples=n_draws,
             again=repeat_after_scenes * self.count,
-            noise=1 if self.is_sampled else samples,
+            noise=samples // n_draws,
         )
         numbers = tuple(
             (number.name, number.column, len(number.parts))
@@ -577,7 +600,8 @@ class Points:
     def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
         """Assign each block to the grid, or to columns of the draws.
 
-        Yields the sampled numbers that tables show.
+        Yields the sampled numbers that tables show: those of short blocks, of controls
+        that know their ranges. Large blocks have a sequence of draws of their own.
         """
         controls = {control.name: control for control in self.space.controls}
         for group, (block, coordinates) in zip(
@@ -592,12 +616,14 @@ class Points:
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
             begin = _count_columns(blocks)
-            # A ball takes one number more, for the length.
-            n_columns = block.size + (block.norm == "l2")
+            is_ball = block.norm == "l2"
+            n_columns = block.size
+            if is_ball:
+                n_columns += 1  # for the length
             columns = slice(begin, begin + n_columns)
             blocks.append(_SampledBlock(block, coordinates, columns))
             control = controls[group.control]
-            is_short = block.size <= MAX_TABLE_COMPONENTS and block.norm != "l2"
+            is_short = block.size <= MAX_TABLE_COMPONENTS and not is_ball
             if is_short and control.slots:
                 yield from self._describe_sampled(
                     control, group.parameter, coordinates, begin
@@ -649,11 +675,11 @@ class Points:
             count: of neighbouring images of a scene.
 
         Returns:
-            (count, k) indices among `parts` of each of `drawn`.
+            (count, k) indices among `parts` of each of `sampled_numbers`.
         """
         draws = self._sample(self._small_draws, first, count)
         shares = (draws[:, self._columns] * self._n_shares).astype(np.int64)
-        parts = np.minimum(shares, self._n_shares - 1)
+        parts = np.minimum(shares, self._n_shares - 1)  # a draw may be 1
         for column, number in enumerate(self.sampled_numbers):
             if number.part_of_share:
                 parts[:, column] = np.take(number.part_of_share, parts[:, column])
@@ -665,6 +691,9 @@ class Points:
 
     def _sample(self, draws: SampleSequence, first: int, count: int) -> Float64Array:
         """Return the draws (count, k) of neighbouring images.
+
+        Those of a sweep over frames do not follow one another: all frames of a drive
+        have the same draw.
 
         Args:
             draws: of k numbers.
@@ -702,6 +731,7 @@ class Points:
         u = np.repeat(self._start[None], count, axis=0)
         indices = self._axis_indices(first, count)
         for column, axis in self._grid_coordinates:
+            # The coordinate of a choice is the center of its part of [0, 1].
             u[:, column] = (indices[axis] + 0.5) / self.grid.sizes[axis]
         for draws, blocks in (
             (self._small_draws, self._small_blocks),
@@ -719,11 +749,17 @@ class Points:
     def _transform(self, sampled: _SampledBlock, uniform: Float64Array) -> Float64Array:
         """Return coordinates inside the budget of a block from uniform numbers.
 
-        They are uniform in the box, or in the ball (Muller 1959).
+        They are uniform in the box, or in the ball around the start (Muller 1959): a
+        direction from k normal numbers, and a length. A choice has the center of the
+        part of [0, 1] that its option has.
 
         Args:
             sampled: the block, of k coordinates.
-            uniform: (n, k) in [0, 1]; of a ball (n, k + 1).
+            uniform: (n, k) in [0, 1]; of a ball (n, k + 1), with that of the length
+                last.
+
+        Returns:
+            (n, k).
         """
         block = sampled.block
         if block.options:
@@ -733,8 +769,10 @@ class Points:
             lower = self._lower[sampled.coordinates].astype(np.float64)
             upper = self._upper[sampled.coordinates].astype(np.float64)
             return np.asarray(lower + (upper - lower) * uniform)
+        # 0 and 1 would be infinite.
         direction = ndtri(np.clip(uniform[:, :-1], 1e-12, 1.0 - 1e-12))
         length = block.epsilon * uniform[:, -1:] ** (1.0 / block.size)
+        # not divided by 0, where all numbers are 0.5
         norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
         center = self._start[sampled.coordinates]
         return np.asarray(center + direction * (length / norm))
@@ -793,6 +831,8 @@ class Points:
         axis_points: Sequence[tuple[Axis, int]],
     ) -> Mapping[str, Value]:
         """Return the stored values of a control in one image.
+
+        They are cached where all parameters of the control are in the grid.
 
         Args:
             control: which describes itself.

@@ -76,6 +76,8 @@ SCENE_SETTINGS = (
     "unit",
     "camera",
     "things",
+    "backdrop",
+    "occluder",
     "set_",
     "exposure",
 )
@@ -200,10 +202,7 @@ def sweep(
 
 def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
     """Return the settings that are not None."""
-    set_options: dict[str, Any] = {
-        name: value for name, value in settings.items() if value is not None
-    }
-    return set_options
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _check_can_use_workers(
@@ -254,6 +253,7 @@ def _load_defaults(
         )
     if scene is None:
         return defaults
+    # The scene that the caller passed has settings of its own.
     return {
         name: value for name, value in defaults.items() if name not in SCENE_SETTINGS
     }
@@ -312,7 +312,10 @@ def _find_python_only(
     tracker: object,
     controls: Controls,
 ) -> list[PythonOnly]:
-    """Return what exists in this session only, so that no command can repeat it."""
+    """Return what exists in this session only, so that no command can repeat it.
+
+    That may be models, the scene, the task, metrics, the tracker and controls.
+    """
     parts = [
         PythonOnly("model", get_model_name(model))
         for model in models
@@ -464,11 +467,11 @@ def _add_adversarial_arm(
             "is no adversarial configuration "
             "to sweep"
         )
-    held = make_configured_controls(attack_config, attack_config.controls)
+    fixed_controls = make_configured_controls(attack_config, attack_config.controls)
     varied_names = {control.name for control in sampled}
     varied_names |= {axis.instance for axis in axes}
-    held_names = {control.name for control in held}
-    clashes = sorted(varied_names & held_names)
+    fixed_names = {control.name for control in fixed_controls}
+    clashes = sorted(varied_names & fixed_names)
     if clashes:
         raise InputError(
             f"adversarial_of: the adversarial configuration of {directory} sets "
@@ -476,14 +479,14 @@ def _add_adversarial_arm(
             "out of `grid` and `controls`"
         )
     u = torch.from_numpy(read_configuration(directory))
-    name = directory.resolve().name
-    if name == CLEAN:
-        name = f"{name}'s"
+    arm = directory.resolve().name
+    if arm == CLEAN:
+        arm = f"{arm}'s"  # the two arms need different names
     clean = [
-        replace(named_scene, fixed_controls=held, arm=CLEAN)
+        replace(named_scene, fixed_controls=fixed_controls, arm=CLEAN)
         for named_scene in named_scenes
     ]
-    adversarial = [replace(named_scene, u=u, arm=name) for named_scene in clean]
+    adversarial = [replace(named_scene, u=u, arm=arm) for named_scene in clean]
     return (*clean, *adversarial)
 
 
@@ -515,9 +518,9 @@ def row_parameters(config: SweepConfig) -> set[str]:
     """Load everything that a sweep names, and return the parameters of its rows."""
     job = load_scenes_of_sweep(config).job
     space = job.bind_controls(job.scenes[0], job.image_sizes[0])
-    middle = torch.full_like(space.start, 0.5)
+    center = torch.full_like(space.start, 0.5)
     # A choice may describe other parameters than another one.
-    return {name for u in (space.start, middle) for name in space.describe(u)}
+    return {*space.describe(space.start), *space.describe(center)}
 
 
 def _make_job(
@@ -528,6 +531,9 @@ def _make_job(
     controls: Controls,
 ) -> Job:
     """Load models and tasks, and check that they can be swept over these scenes.
+
+    With a `path`, the frames of drives become an axis; with `adversarial_of`, each
+    scene comes a second time, with the adversarial configuration.
 
     Args:
         config: the settings.
@@ -567,7 +573,13 @@ def _make_job(
     )
     warnings += _find_scene_notes(named_scenes, sampled, axes)
     job = Job(
-        config, named_scenes, networks, tasks, sampled, axes, parse_aovs(config.aov)
+        config=config,
+        scenes=named_scenes,
+        models=networks,
+        tasks=tasks,
+        controls=sampled,
+        axes=axes,
+        aovs=parse_aovs(config.aov),
     )
     for named_scene in named_scenes:
         warnings += job.bind_controls(named_scene, job.image_sizes[0]).list_notes(
@@ -650,7 +662,8 @@ def _find_scene_notes(
 def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
     """Load the scenes of a configuration: every object in every environment.
 
-    A scene that a Python caller passed is returned as it is.
+    They come by object, then by environment. Without an `environment`, each object has
+    that of its own scene. A scene that a Python caller passed is returned as it is.
     """
     passed: Scene | None = config.python_object(naming.SCENE, config.object)
     if passed is not None:

@@ -67,6 +67,10 @@ from advsearch.settings import split_names
 from advsearch.statistics.monotone import Dip, _fit_falling, find_dips
 
 MAX_TICKS = 16  # values of an axis that have a label
+# characters of a label that a figure of the usual size has room for
+USUAL_LABEL_LENGTH = 8
+# characters of all labels of an axis that fit side by side
+MAX_LABELS_LENGTH = 50
 
 
 def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
@@ -84,9 +88,10 @@ def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
     if _are_long(x_axis.values):
         aslant_length = _longest_label(x_axis.values)
     left_length = _longest_label(y_axis.values)
-    # characters that a figure of the usual size has room for
-    extra_left = max(left_length - 8, aslant_length - 8, 0)
-    extra_below = max(aslant_length - 8, 0)
+    # Long labels need room; those of the x axis, aslant, also at the left of it.
+    extra_left = max(max(left_length, aslant_length) - USUAL_LABEL_LENGTH, 0)
+    extra_below = max(aslant_length - USUAL_LABEL_LENGTH, 0)
+    # inches of the frame, of each cell, and of each character
     width = 3.2 + 0.34 * n_columns + 0.09 * extra_left
     height = 1.8 + 0.3 * n_rows + 0.065 * extra_below
     return width, height
@@ -168,8 +173,11 @@ def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) ->
         (index, *row.interval) for index, row in enumerate(rows) if row.interval
     ]
     if intervals:
+        x, lower, upper = zip(*intervals, strict=True)
         axes.vlines(
-            *zip(*intervals, strict=True),
+            x,
+            lower,
+            upper,
             color=BLUE,
             alpha=0.35,
             linewidth=5,
@@ -210,7 +218,8 @@ def _subject(summary: SweepSummary) -> str:
 
 def _are_long(values: Sequence[Any]) -> bool:
     """Return whether the labels of an axis are too long to stand side by side."""
-    return sum(len(label) + 1 for label in _ticks(values)[1]) > 50
+    _, labels = _ticks(values)
+    return sum(len(label) + 1 for label in labels) > MAX_LABELS_LENGTH
 
 
 READING = (
@@ -701,9 +710,13 @@ def drive_title(rates: DriveRates) -> str:
 
 
 def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
-    """Return the rates over drives: name, mean, 95 % interval and worst drive."""
+    """Return the rates over drives: name, mean, 95 % interval and worst drive.
+
+    A rate that is not known has no row; without an interval there is a dash.
+    """
     tracks = drive_rates.tracks
     never = f", never in {drive_rates.never_seen}" if drive_rates.never_seen else ""
+    # name, values, unit and remark on the mean
     rates: list[tuple[str, OverDrives | None, str, str]] = [
         ("frames in which it is right", drive_rates.right, " %", ""),
         (
@@ -869,6 +882,7 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
         default=0,
     )
     falling = _fit_falling(k[first:], n[first:])
+    # n images that are all right differ from one half if 2**-n < significance.
     min_images = math.floor(-math.log2(significance)) + 1
     return DetectionDistance(
         unit=rows[0].unit,
@@ -894,6 +908,10 @@ def _bound_distance(
 ) -> tuple[float | None, float | None]:
     """Return the bounds of the detection distance; None if images do not bound it.
 
+    The lower one is the farthest distance at which significantly more than half of the
+    images are right, the upper one the nearest beyond it at which significantly fewer
+    are.
+
     Args:
         distance: (m,) ascending.
         k: (m,) images that are right.
@@ -902,8 +920,11 @@ def _bound_distance(
     """
     from scipy.special import bdtr, bdtrc  # takes a tenth of a second
 
-    is_above_half = bdtrc(k - 1.0, n, HALF) < significance
-    is_below_half = bdtr(k * 1.0, n, HALF) < significance
+    # probabilities of at least k and of at most k right images, if half of them are
+    p_at_least = bdtrc(k - 1.0, n, HALF)
+    p_at_most = bdtr(k * 1.0, n, HALF)
+    is_above_half = p_at_least < significance
+    is_below_half = p_at_most < significance
     low = max(distance[is_above_half], default=None)
     is_beyond_low = distance > (low or 0.0)
     high = min(distance[is_below_half & is_beyond_low], default=None)
@@ -921,6 +942,7 @@ def _find_crossing(
     """
     if not falling[0] >= HALF > falling[-1]:
         return None
+    # negated, since interp needs ascending abscissae
     return float(np.exp(np.interp(-HALF, -falling, np.log(distance))))
 
 
@@ -999,34 +1021,38 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
 def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     """Return where an object is detected less often than beyond.
 
-    All dips that are not chance, or else the deepest of those that may be.
+    These are all dips that are not chance. Without any, it is the least likely of those
+    that contradict the estimate: fewer than half of the images are right at a distance
+    nearer than the estimate, or below the rise beyond it.
     """
-    proven = [dip for dip in estimate.dips if dip.is_significant]
-    if proven:
-        clauses = "; ".join(_dip_clause(dip, unit) for dip in proven)
+    significant = [dip for dip in estimate.dips if dip.is_significant]
+    if significant:
+        clauses = "; ".join(_dip_clause(dip, unit) for dip in significant)
         return [f"No one distance from which on it is seen: right in {clauses}."]
-    until = (
-        estimate.distances[-1] if estimate.is_above_half else estimate.distance or 0.0
-    )
-    below_half = [
-        dip
-        for dip in estimate.dips
-        if dip.counts[0] < HALF * dip.counts[1]
-        # a rise beyond the estimate counts too
-        and (
-            dip.distance < until or dip.counts_beyond[0] >= HALF * dip.counts_beyond[1]
-        )
-    ]
-    if not below_half:
+    detected_until = estimate.distance or 0.0
+    if estimate.is_above_half:
+        detected_until = estimate.distances[-1]
+    contradicting = list[Dip]()
+    for dip in estimate.dips:
+        n_right, n_images = dip.counts
+        n_right_beyond, n_images_beyond = dip.counts_beyond
+        is_rise_beyond = n_right_beyond >= HALF * n_images_beyond
+        is_below_half = n_right < HALF * n_images
+        if is_below_half and (dip.distance < detected_until or is_rise_beyond):
+            contradicting.append(dip)
+    if not contradicting:
         return []
-    deepest = _dip_clause(min(below_half, key=lambda dip: dip.p_value), unit)
+    deepest = _dip_clause(min(contradicting, key=lambda dip: dip.p_value), unit)
     return [f"Nearer it is right less often: in {deepest}, which may be chance."]
 
 
 def _dip_clause(dip: Dip, unit: str) -> str:
-    at_dip = f"{dip.counts[0]} of {dip.counts[1]} at {dip.distance:.3g} {unit}"
-    n_beyond, n_rows_beyond = dip.counts_beyond
-    beyond = f"{n_beyond} of {n_rows_beyond} beyond it up to {dip.until:.3g} {unit}"
+    n_right, n_images = dip.counts
+    at_dip = f"{n_right} of {n_images} at {dip.distance:.3g} {unit}"
+    n_right_beyond, n_images_beyond = dip.counts_beyond
+    beyond = (
+        f"{n_right_beyond} of {n_images_beyond} beyond it up to {dip.until:.3g} {unit}"
+    )
     return f"{at_dip}, {beyond} (p = {dip.p_value:.2g})"
 
 

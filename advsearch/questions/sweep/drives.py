@@ -30,7 +30,12 @@ from advsearch.questions.sweep.summary import (
     OverDrives,
     TrackRates,
 )
-from advsearch.questions.sweep.tracks import DetectedFrame, read_frame, track_drive
+from advsearch.questions.sweep.tracks import (
+    DetectedFrame,
+    Tracker,
+    read_frame,
+    track_drive,
+)
 from advsearch.report.figures import draw_marks
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
@@ -53,11 +58,16 @@ def add_frames(
     """Return the controls and the grid of a sweep over the frames of a path.
 
     A control that travels along the path is added if there is none, and the times of
-    the frames become the last axis of the grid.
+    the frames become the last axis of the grid, unless it has them already: from 0 to
+    the end of the path, `fps` a second, at least two. Of several paths that nothing
+    chooses among, all are swept if nothing is sampled.
 
     Args:
         config: with a `path`.
         sampled: the controls that are sampled.
+
+    Returns:
+        The controls that are sampled, with the added one, and the grid.
     """
     travelling: Any = next((control for control in sampled if control.travels), None)
     if travelling is None:
@@ -149,9 +159,15 @@ class _CompleteDrives(NamedTuple):
 class Drives:
     """The frames of every drive of a sweep.
 
+    Private arrays have the axes (scenes, the other axes of the grid ..., samples,
+    models, frames), with frames in the order of their times: `_flags` and `_steps`, the
+    numbers of the rows. `_distance` has no axis for models, since all get the same
+    images. Further: `_path_of_step` and `_frame_of_step` have the name of the path and
+    the detected boxes of a row by its number.
+
     Attributes:
         times: (frames,) of the frames, ascending, in seconds.
-        seconds: time of the last frame.
+        seconds: from the first frame to the last.
     """
 
     _units = Units()
@@ -200,8 +216,9 @@ class Drives:
         Args:
             rows: of the sweep.
             instance: name of the control that travels.
-            flags: (scenes, ..., models), which is filled.
-            distance: (scenes, ...), which is filled.
+            flags: (scenes, ..., models), which is filled; a row's number is its index
+                in the flat array.
+            distance: (scenes, ...), which is filled; likewise with an image's number.
         """
         job = self._job
         right_names = self._find_right_names()
@@ -232,7 +249,10 @@ class Drives:
         return right_names
 
     def _select_complete(self, scenes: list[int], model: int) -> _CompleteDrives:
-        """Select the drives in some scenes that have all their frames."""
+        """Select the drives in some scenes that have all their frames.
+
+        Drives without the object in any frame are left out.
+        """
         n_frames = len(self.times)
         flags = self._flags[scenes][..., model, :].reshape(-1, n_frames)
         steps = self._steps[scenes][..., model, :].reshape(-1, n_frames)
@@ -268,7 +288,7 @@ class Drives:
         """Compute the rates of one model over drives; `answer` may be empty."""
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
-        each = self._describe_drives(drives, first_distance)
+        drive_records = self._describe_drives(drives, first_distance)
         has_right = np.asarray((drives.flags == 1).any(axis=1))
 
         # Rows of one draw differ in noise alone: they are one drive.
@@ -300,7 +320,7 @@ class Drives:
                 self._changes_per_second(drives.flags), max, (0.0, max_flicker), drive
             ),
             tracks=self._compute_track_rates(model, drives.steps, drive),
-            each=each,
+            each=drive_records,
         )
 
     def _describe_drives(
@@ -366,6 +386,9 @@ class Drives:
     ) -> TrackRates | None:
         """Compute what a tracker makes of the boxes of drives.
 
+        A frame that is lost has no track on the object; it is loose if a track would be
+        on it with less overlap.
+
         Args:
             model: its index.
             steps: (n, frames) numbers of the rows.
@@ -384,7 +407,7 @@ class Drives:
         drives = [
             track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
         ]
-        lost_loosely = _count_lost_loosely(task, tracker, frames)
+        lost_loosely = _compute_lost_loosely(task, tracker, frames)
         lost = np.array([drive.lost for drive in drives], dtype=float)
         switches = np.array([drive.switches for drive in drives], dtype=float)
         longest_gap = np.array([drive.gap for drive in drives], dtype=float)
@@ -416,10 +439,10 @@ class Drives:
         worst = _right_fraction(drives.flags).argmin()
         numbers = drives.steps[worst] // len(self._job.models)
         frames = []
-        for number in numbers[
-            select_evenly(len(numbers), MAX_ANIMATED_FRAMES)
-        ].tolist():
-            scene, (query, *_) = scenes.make_queries(number)
+        selected = select_evenly(len(numbers), MAX_ANIMATED_FRAMES)
+        for number in numbers[selected].tolist():
+            scene, queries = scenes.make_queries(number)
+            query = queries[0]  # of the first model
             image = scene.render_image(query)
             marks = scene.problems[0].find_marks(image, query.u)
             frames.append(
@@ -428,11 +451,20 @@ class Drives:
         save_drive(run, "drive", frames, self.seconds)
 
 
-def _count_lost_loosely(task: Detection, tracker: Any, frames: Any) -> npt.NDArray[Any]:
-    """Count the tracks that each drive loses if boxes may overlap less."""
+def _compute_lost_loosely(
+    task: Detection, tracker: Tracker, frames: Sequence[Sequence[DetectedFrame]]
+) -> npt.NDArray[np.float64]:
+    """Compute the fraction (n,) of lost frames if tracks may overlap the object less.
+
+    Args:
+        task: of the model; a track is on the object from its `iou` on.
+        tracker: makes the tracker.
+        frames: of each of n drives.
+    """
     loose_iou = min(MIN_OVERLAP, task.iou)
     return np.array(
-        [track_drive(drive_frames, tracker, loose_iou).lost for drive_frames in frames]
+        [track_drive(drive_frames, tracker, loose_iou).lost for drive_frames in frames],
+        dtype=float,
     )
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -55,9 +55,9 @@ class NamedScene:
         environment: its name.
         scene: as it was loaded.
         fixed_controls: controls that do not vary.
-        u: (d,) where they are; None: as the scene is.
-        arm: name of the scene beside the same one without or with the
-            adversarial configuration of a run; empty if nothing is compared.
+        u: (d,) their configuration; None leaves the scene as it is.
+        arm: name of the arm of a comparison without and with the adversarial
+            configuration of a run; empty if nothing is compared.
     """
 
     object: str
@@ -113,7 +113,7 @@ class Job:
 
     @property
     def samples(self) -> int:
-        """Samples at each point of the grid."""
+        """Samples at each point of the grid: by default 1, without a grid more."""
         is_sampled_only = bool(self.controls) and not self.axes
         default = DEFAULT_SAMPLES if is_sampled_only else 1
         return self.config.samples or default
@@ -145,6 +145,7 @@ class Job:
 
     @cached_property
     def seeds(self) -> SeedSequence:
+        """The seeds of the noise, by the number of the image."""
         return SeedSequence(self.config.seed, KIND)
 
     def load_points(self, scene: int) -> dict[ImageSize, Points]:
@@ -169,21 +170,23 @@ class Job:
             numbers: of the images in the sweep.
 
         Returns:
-            The queries by ascending number, with the scene's number as the name of the
-            problem.
+            The queries by ascending number, each as (name of the problem, None, query).
+            The problem's name is the scene's number.
         """
         scene = numbers.start // self.images_per_scene
         images_before = scene * self.images_per_scene
         first_in_scene = numbers.start - images_before
         queries = list[Query]()
         for size, points in self.load_points(scene).items():
-            u = points.make_configurations(first_in_scene, len(numbers), images_before)
-            descriptions = points.describe_images(u, first_in_scene)
-            for number, configuration, values in zip(
-                numbers, u, descriptions, strict=True
+            configurations = points.make_configurations(
+                first_in_scene, len(numbers), images_before
+            )
+            descriptions = points.describe_images(configurations, first_in_scene)
+            for number, u, values in zip(
+                numbers, configurations, descriptions, strict=True
             ):
                 queries += [
-                    self._make_query(number, model, points, configuration, values)
+                    self._make_query(number, model, points, u, values)
                     for model, model_size in enumerate(self.image_sizes)
                     if model_size == size
                 ]
@@ -211,9 +214,9 @@ class Job:
         environment = points.space.find_environment(values)
         return Query(
             u.clone(),
-            self.seeds(points.noise_number(number)),
-            KIND,
-            number * len(self.models) + model,
+            seed=self.seeds(points.noise_number(number)),
+            kind=KIND,
+            number=number * len(self.models) + model,
             spp=self.spp,
             draws_conditions=False,
             values=self._row_values(scene, model, environment, values),
@@ -253,6 +256,9 @@ class Job:
 
     def bind_controls(self, named_scene: NamedScene, size: ImageSize) -> Space:
         """Bind the controls, those of the grid as choices, to a scene.
+
+        Fixed controls come first, and are set to the scene's configuration, so that
+        only the others are left to vary.
 
         Args:
             named_scene: the scene.
@@ -297,18 +303,21 @@ class Job:
     def make_points(self, space: Space) -> Points:
         """Return the configurations of a space.
 
-        Scenes with an adversarial configuration have the draws of those without it.
+        Scenes with an adversarial configuration, which are the second half, have the
+        draws of those without it.
         """
-        is_paired = bool(self.scenes[0].arm)
+        repeat_after_scenes = 0  # never
+        if self.scenes[0].arm:
+            repeat_after_scenes = len(self.scenes) // 2
         return Points(
             space,
             make_domain(space.controls),
             self.axes,
-            self.samples,
-            self.config.sampler,
-            self.config.seed,
-            len(self.scenes) // 2 if is_paired else 0,
-            len(self.scenes),
+            samples=self.samples,
+            sampler=self.config.sampler,
+            seed=self.config.seed,
+            repeat_after_scenes=repeat_after_scenes,
+            n_scenes=len(self.scenes),
         )
 
     def make_facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
@@ -316,8 +325,8 @@ class Job:
         return make_facts(
             named_scene.scene.description,
             named_scene.object,
-            self.config.label,
-            lambda: values,
+            label=self.config.label,
+            describe=lambda: values,
             judge=self.config.judge,
         )
 
@@ -415,6 +424,8 @@ def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
 def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledNumber:
     """Return a sampled number as the table of all scenes shows it.
 
+    Where its range differs between scenes, parts are fractions of the range.
+
     Args:
         versions: the number in each scene.
         n_parts: into which its range is cut.
@@ -451,7 +462,7 @@ class SweptScene:
         # render the scene without its object
         self._empty_renderers: dict[ImageSize, Renderer] = {}
         self.renderers = {size: self._make_renderer(size) for size in self.points}
-        facts = partial(
+        make_scene_facts = partial(
             make_facts,
             named_scene.scene.description,
             named_scene.object,
@@ -460,14 +471,14 @@ class SweptScene:
         )
         self.problems = tuple(
             Problem(
-                self.renderers[size],
-                self.points[size].space,
-                model,
-                task,
-                facts,
-                None,
-                job.spp,
-                config.seed,
+                renderer=self.renderers[size],
+                space=self.points[size].space,
+                model=model,
+                task=task,
+                make_facts=make_scene_facts,
+                objective=None,
+                spp=job.spp,
+                seed=config.seed,
                 metrics=job.metrics,
             )
             for size, model, task in zip(
@@ -477,13 +488,14 @@ class SweptScene:
         light_seed = seeds.stream(config.seed, "sweep light", number)
         self.predictors = dict[ImageSize, SweepPredictor]()
         for size, points in self.points.items():
+            first_model_of_size = job.image_sizes.index(size)
             self.predictors[size] = SweepPredictor(
-                self.problems[job.image_sizes.index(size)],
-                points,
-                job.axes,
-                light_seed,
-                config.specialise,
-                number * points.count,
+                problem=self.problems[first_model_of_size],
+                points=points,
+                axes=job.axes,
+                seed=light_seed,
+                specialise=config.specialise,
+                images_before=number * points.count,
             )
 
     @property
@@ -499,26 +511,28 @@ class SweptScene:
         """Evaluate queries of neighbouring rows.
 
         An image is made once for each size, and a model gets all of its images at once.
+        The last evaluation also has what concerns the batch: what predicted its images,
+        and how many values were not finite.
 
         Args:
             queries: of this scene.
-            prepared: nothing; sweeps prepare nothing.
+            prepared: not used, since sweeps prepare nothing.
         """
         begin = time.perf_counter()
         not_finite_before = self.n_non_finite
         n_models = len(self.job.models)
         images = {size: self._make_images(size, queries) for size in self.points}
         judgements = self._judge(queries, images)
+        # The image of a query is that of its row: rows are numbered by image, model.
         wrong_images = {
-            step // n_models
-            for step, judgement in judgements.items()
+            row_number // n_models
+            for row_number, judgement in judgements.items()
             if not judgement.right
         }
         seconds = (time.perf_counter() - begin) / len(queries)
         evaluations = self._make_evaluations(
-            queries, n_models, images, judgements, seconds, wrong_images
+            queries, images, judgements, seconds, wrong_images
         )
-        # What concerns the batch stands in its last evaluation.
         evaluations[-1] = replace(
             evaluations[-1],
             light=[predictor.summarize() for predictor in self.predictors.values()],
@@ -529,20 +543,31 @@ class SweptScene:
     def _make_evaluations(
         self,
         queries: Sequence[Query],
-        n_models: int,
-        images: Any,
-        judgements: Any,
+        images: Mapping[ImageSize, Mapping[int, SweptImage]],
+        judgements: Mapping[int, Judgement],
         seconds: float,
         wrong_images: Collection[int],
     ) -> list[Evaluation]:
-        """Return the evaluation of each query, with the images of its configuration."""
+        """Return the evaluation of each query.
+
+        That of the first model has the images that are stored. What an image costs
+        counts for the first model that gets it.
+
+        Args:
+            queries: of this scene.
+            images: by size, then by the number of the image.
+            judgements: by the number of the query.
+            seconds: that each query took.
+            wrong_images: numbers of the images in which any model is wrong.
+        """
         evaluations = list[Evaluation]()
         for query in queries:
-            number, model = divmod(query.number, n_models)
+            number, model = divmod(query.number, len(self.job.models))
             image = images[self.job.image_sizes[model]][number]
+            cost = image.n_traced if self.job.is_first_of_size[model] else 0
             evaluation = Evaluation.from_judgement(
                 judgements[query.number],
-                cost=image.n_traced * self.job.is_first_of_size[model],
+                cost=cost,
                 predicted=image.prediction_spp,
                 seconds=seconds,
             )
@@ -565,7 +590,7 @@ class SweptScene:
         """
         job = self.job
         n_models = len(job.models)
-        judgements: dict[int, Judgement] = {}
+        judgement_of_query: dict[int, Judgement] = {}
         for model, problem in enumerate(self.problems):
             size = job.image_sizes[model]
             model_queries = [
@@ -579,15 +604,17 @@ class SweptScene:
                     for query in model_queries
                 ]
             )
-            judged = problem.judge_images(
+            judgements = problem.judge_images(
                 batch,
                 [query.u for query in model_queries],
                 [query.values for query in model_queries],
             )
-            judged = self._add_claims(problem, size, model_queries, batch, judged)
-            for query, judgement in zip(model_queries, judged, strict=True):
-                judgements[query.number] = judgement
-        return judgements
+            judgements = self._add_claims(
+                problem, size, model_queries, batch, judgements
+            )
+            for query, judgement in zip(model_queries, judgements, strict=True):
+                judgement_of_query[query.number] = judgement
+        return judgement_of_query
 
     def _attach_images(
         self, evaluation: Evaluation, query: Query, image: SweptImage, is_wrong: bool
@@ -620,21 +647,22 @@ class SweptScene:
         size: ImageSize,
         queries: Sequence[Query],
         images: Tensor,
-        judged: list[Judgement],
+        judgements: list[Judgement],
     ) -> list[Judgement]:
         """Return judgements with a metric for each claim about changed images.
 
-        It is 1 where the prediction is as claimed. The ground truth stays what it was
-        before the change.
+        Its name is the claim and the change, as "must_change black"; it is 1 where the
+        prediction is as claimed, else 0. The ground truth stays what it was before the
+        change.
 
         Args:
             problem: of the model.
             size: (height, width) of its images.
             queries: n of them.
             images: (n, H, W, 3).
-            judged: of the unchanged images.
+            judgements: of the unchanged images.
         """
-        judged = list(judged)
+        judgements = list(judgements)
         configurations = [query.u for query in queries]
         values = [query.values for query in queries]
         for claim, change in self.job.config.claims:
@@ -647,19 +675,19 @@ class SweptScene:
                         for image in images
                     ]
                 )
-            changed_judged = problem.judge_images(
+            changed_judgements = problem.judge_images(
                 changed_images, configurations, values
             )
             for index, (before, after) in enumerate(
-                zip(judged, changed_judged, strict=True)
+                zip(judgements, changed_judgements, strict=True)
             ):
                 is_claimed = meets_claim(claim, before.prediction, after.prediction)
                 metrics = {
                     **(before.metrics or {}),
                     f"{claim} {change}": float(is_claimed),
                 }
-                judged[index] = replace(before, metrics=metrics)
-        return judged
+                judgements[index] = replace(before, metrics=metrics)
+        return judgements
 
     def _render_empty(self, size: ImageSize, queries: Sequence[Query]) -> Tensor:
         """Render the scene without its object, with the noise of each query.
@@ -735,13 +763,14 @@ class SceneLoader:
 
     def make_queries(self, number: int) -> tuple[SweptScene, list[Query]]:
         """Load the scene of an image; return it and the queries of all models."""
-        sent = self.job.make_queries(range(number, number + 1))
-        return self.load_by_name(str(sent[0][0])), [query for _, _, query in sent]
+        items = self.job.make_queries(range(number, number + 1))
+        scene_name = str(items[0][0])
+        return self.load_by_name(scene_name), [query for _, _, query in items]
 
     def render_image(self, number: int) -> Tensor:
         """Render an image (H, W, 3) as the first model gets it."""
-        scene, (query, *_) = self.make_queries(number)
-        return scene.render_image(query)
+        scene, queries = self.make_queries(number)
+        return scene.render_image(queries[0])
 
     def render_thumbnail(self, number: int) -> bytes:
         """Render an image as the first model gets it, as a small JPEG."""
@@ -769,7 +798,9 @@ def verify_worst(
 ) -> WorstVerified | None:
     """Render the worst configuration again, and count wrong predictions.
 
-    Renders that the run has stored already are not made again.
+    The samples per pixel are chosen first; they have converged if the ladder has one
+    step, or if more samples leave the margin's sign. Renders that the run has stored
+    already are not made again.
 
     Args:
         problem: of its scene and model.

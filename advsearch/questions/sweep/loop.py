@@ -144,10 +144,11 @@ class Sweep:
         else:
             self._executor = executor
         self.journal = Journal(run, ParallelEvaluator(None, executor))
-        self._n_rendered = 0  # images, by this process or its workers
-        self._n_traced = 0  # images of the full sweep, as its rows state them
-        self._n_predicted = 0
-        self._n_lost = 0
+        self._n_rendered = 0  # images made now, by this process or its workers
+        # of the full sweep, as its rows state them: also those of a run before
+        self._n_traced = 0  # images that were rendered, with those of predictors
+        self._n_predicted = 0  # images that were predicted from rendered ones
+        self._n_lost = 0  # rows whose worker died
         # what predicted images, by worker and scene
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._has_non_finite = (
@@ -243,6 +244,7 @@ class Sweep:
                 for query in queries
             )
             scene = self._scene_of(queries[0].number)
+            # What concerns a batch stands in its last evaluation.
             self._transport[done.worker, scene] = evaluations[-1].light or []
             if any(evaluation.non_finite for evaluation in evaluations):
                 self._note_non_finite()
@@ -252,7 +254,11 @@ class Sweep:
         self.journal.rows.sort(key=lambda row: row.step)
 
     def _sweep_hint(self) -> str:
-        """Return what the progress says of the work ahead."""
+        """Return what the progress says of the work ahead.
+
+        That is the number of predictions, and about how large stored thumbnails are:
+        as a typical one, scaled by the pixels that they have.
+        """
         hint = (
             f"{self.n_rows} predictions, pictures of "
             f"{format_count(self.job.spp, 'sample')} "
@@ -262,6 +268,7 @@ class Sweep:
         if self.run is None or keep == "none":
             return hint
         height, width = self.job.image_sizes[0]
+        # A thumbnail is at most THUMBNAIL_SIZE wide and high, and never enlarged.
         scale = min(1.0, thumbnails.THUMBNAIL_SIZE / max(height, width))
         size_fraction = scale**2 * height * width / thumbnails.THUMBNAIL_SIZE**2
         n_images = self.n_rows // self.n_models
@@ -297,7 +304,11 @@ class Sweep:
         """Yield the queries of missing rows in batches, none over two scenes.
 
         A batch begins at a multiple of its size in the scene, whatever is missing, so
-        that its evaluations don't depend on where a sweep was stopped.
+        that its evaluations don't depend on where a sweep was stopped. Of an image
+        that has some of its rows, only the missing ones are yielded.
+
+        Args:
+            missing: ranges of row numbers.
         """
         batch_size = self.job.config.batch
         for rows in missing:
@@ -311,13 +322,13 @@ class Sweep:
                     batch_size,
                 )
                 for batch in images:
-                    queries = self.job.make_queries(
+                    items = self.job.make_queries(
                         range(scene_begin + batch.start, scene_begin + batch.stop)
                     )
                     yield [
-                        sent
-                        for sent in queries
-                        if rows.start <= sent[2].number < rows.stop
+                        (problem_name, u, query)
+                        for problem_name, u, query in items
+                        if query.number in rows
                     ]
                 image = scene_begin + self.images_per_scene
 
@@ -332,10 +343,11 @@ class Sweep:
         if n_counted:
             n_right = int((predictions.is_right & predictions.is_counted).sum())
             values["accuracy"] = n_right / n_counted
-        facts = self._executor.stats
-        if facts is not None:
-            seconds = max(1e-9, now - self._sweep_begin)
-            values |= {**facts.progress_counts, "a second": self._n_rendered / seconds}
+        worker_stats = self._executor.stats
+        if worker_stats is not None:
+            seconds = max(1e-9, now - self._sweep_begin)  # not divided by 0
+            speed = self._n_rendered / seconds
+            values |= {**worker_stats.progress_counts, "a second": speed}
         self.stages.progress.advance(self._n_unreported, **values)
         self._last_report = now
         self._n_unreported = 0
@@ -356,13 +368,21 @@ class Sweep:
         return self.journal.rows if self.run is None else self.run.store.rows(KIND)
 
     def _add_costs(self, rows: Sequence[Row]) -> None:
-        """Count the images that rows took."""
+        """Count the traced and the predicted images of rows, and the lost rows.
+
+        Models of one image size get the same image, which counts for the first of them.
+        """
         for row in rows:
-            is_first = self.job.is_first_of_size[row.step % self.n_models]
-            # Rows of old versions don't state their renders.
-            self._n_traced += int(is_first) if row.renders is None else row.renders
-            self._n_predicted += row.seed is None and is_first
-            self._n_lost += row.label == LOST_LABEL
+            is_first_of_size = self.job.is_first_of_size[row.step % self.n_models]
+            if row.renders is not None:
+                self._n_traced += row.renders
+            elif is_first_of_size:  # rows of old versions don't state their renders
+                self._n_traced += 1
+            # A predicted image has no noise of its own, and so no seed.
+            if row.seed is None and is_first_of_size:
+                self._n_predicted += 1
+            if row.label == LOST_LABEL:
+                self._n_lost += 1
 
     def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[TableAxis]:
         """Return what tables are by: all axes with several values.
@@ -375,14 +395,22 @@ class Sweep:
         model_names = [network.name for network in self.job.models]
         axes = [
             *self._scene_axes(scene),
-            TableAxis("model", "", model_names, model),
+            TableAxis("model", "", model_names, value_index=model),
             *self._grid_axes(image_in_scene),
         ]
         if self._sampled_numbers and len(rows):
-            parts = self._find_parts(image)
+            parts = self._find_parts(image)  # (n, k)
             axes += [
-                TableAxis(number.name, number.unit, number.parts, index, "drawn")
-                for number, index in zip(self._sampled_numbers, parts.T, strict=True)
+                TableAxis(
+                    name=number.name,
+                    unit=number.unit,
+                    values=number.parts,
+                    value_index=part_of_row,
+                    kind="drawn",
+                )
+                for number, part_of_row in zip(
+                    self._sampled_numbers, parts.T, strict=True
+                )
             ]
         return [axis for axis in axes if len(axis.values) > 1]
 
@@ -403,15 +431,24 @@ class Sweep:
         grid_point = image // self.job.samples
         indices = np.unravel_index(grid_point, self.points.grid.sizes)
         return [
-            TableAxis(axis.name, axis.unit, axis.values, index, "grid")
-            for axis, index in zip(self.job.axes, indices, strict=True)
+            TableAxis(
+                name=axis.name,
+                unit=axis.unit,
+                values=axis.values,
+                value_index=value_of_row,
+                kind="grid",
+            )
+            for axis, value_of_row in zip(self.job.axes, indices, strict=True)
         ]
 
     def _find_parts(self, images: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Return the part of each of k sampled numbers that images lie in, (n, k).
 
+        The parts of all images up to the last one are computed, in batches, since draws
+        follow from the number of the image.
+
         Args:
-            images: (n,) their numbers, ascending.
+            images: (n,) their numbers in the sweep, ascending, at least one.
         """
         last_image = int(images[-1])
         parts = list[npt.NDArray[np.int64]]()
@@ -427,6 +464,8 @@ class Sweep:
     ) -> WorstConfiguration | None:
         """Return the configuration with the smallest margin; None if there is none.
 
+        Its values, seed and right names are those of the query, which is made again.
+
         Args:
             predictions: of all rows.
             verify: also renders it again, and saves its image.
@@ -439,7 +478,7 @@ class Sweep:
             rows = [self.run.store.read_row(KIND, row_number)]
         row = next(row for row in rows if row is not None and row.step == row_number)
         image, model = divmod(row_number, self.n_models)
-        query = self.job.make_queries(range(image, image + 1))[model][2]
+        _, _, query = self.job.make_queries(range(image, image + 1))[model]
         scene = self._scene_of(row_number)
         worst = WorstConfiguration(
             configuration=row_number,
@@ -485,8 +524,8 @@ class Sweep:
         image = problem.picture(u, worst.seed, max(SAVED_IMAGE_SPP, verified_spp))
         self.run.save_image("worst", image)
         save_with_marks(self.run, "worst", image, problem.find_marks(image, u))
-        pictured = _to_claim(problem.judge(image, u))
-        return worst.model_copy(update={"verified": verified, "pictured": pictured})
+        image_claim = _to_claim(problem.judge(image, u))
+        return worst.model_copy(update={"verified": verified, "pictured": image_claim})
 
     def _finish(
         self, predictions: Predictions, ending: str, worst: WorstConfiguration | None
@@ -563,10 +602,11 @@ class Sweep:
         )
 
     def _describe_formation(self) -> tuple[Formation | None, dict[str, float]]:
-        """Return how images are formed, and the gain of each scene.
+        """Return how images are formed, and the gain of each scene by its names.
 
-        The formation states a gain if all scenes have the same; there are no gains of
-        very many scenes.
+        The formation states a gain if all scenes have the same. Of more than
+        `MAX_LISTED_GAINS` scenes there are no gains. Without a loaded scene, nothing is
+        known of either.
         """
         gains: dict[str, float] = {}
         if self._scenes.scene is None:
@@ -619,7 +659,11 @@ class Sweep:
         return self._n_rendered / sweep_seconds
 
     def _compute_change_rates(self) -> list[ChangeRates]:
-        """Return how often predictions of changed images are as claimed."""
+        """Return how often predictions of changed images are as claimed.
+
+        There are rates for each claim, change and model. Their `row` is the first in
+        which the prediction is not as claimed. Rows without the object do not count.
+        """
         rates = list[ChangeRates]()
         for claim, change in self.job.config.claims:
             metric = f"{claim} {change}"
@@ -733,7 +777,14 @@ def _make_axis_rows(
     units: npt.NDArray[np.int64],
     outcome: npt.NDArray[np.uint8],
 ) -> list[AxisRow]:
-    """Return the rows of the tables of all axes."""
+    """Return the rows of the tables of all axes.
+
+    Args:
+        axes: of the tables.
+        right: (n,) whether each prediction is right.
+        units: (n,) the unit of each.
+        outcome: (n,) indices among `result.OUTCOMES`.
+    """
     return [row for axis in axes for row in axis.make_rows(right, units, outcome)]
 
 

@@ -164,8 +164,10 @@ def make_sweep_page(
 def _describe_runs(
     explored: Sequence[tuple[SweepSource, Path, SweepSummary | None]],
 ) -> tuple[list[JsonObject], list[Html], list[Html]]:
-    """Return the descriptions of runs, the rows that the page embeds, and notes on
-    images.
+    """Return what the explorer reads of runs: descriptions, rows, and notes on images.
+
+    A description has either "embedded", the id of the element with the rows, or "rows",
+    their address. Notes say which images the page leaves out.
     """
     descriptions = list[JsonObject]()
     embedded_rows = list[Html]()
@@ -326,6 +328,9 @@ def verdict_text(summary: SweepSummary) -> str:
 
 def _still_html(path: Path, summary: SweepSummary) -> Html:
     """Return what a page without a script shows in the explorer's place.
+
+    These are the figure of the accuracy (of the margin where no cell has two
+    configurations) and the worst image, as far as the run has them.
 
     Args:
         path: the run directory.

@@ -73,14 +73,17 @@ class Groups:
         grid: of the sweep.
         samples: at each point of the grid.
         within: whether images of a group may differ along each axis of the grid.
-        is_sampled: whether they may differ in what is sampled.
-        frames: the axis with the frames of a drive, which have one draw.
+        is_sampled: whether they may differ in what is sampled. If not, they differ
+            along no axis but `frames`, since other images have other draws.
+        frames: the index of the axis with the frames of a drive, which have one draw;
+            None without a drive.
 
     Attributes:
         group_size: images of a group.
         n_groups: groups.
         n_cached_groups: groups that have to be cached, so that no predictor is made
-            twice.
+            twice, when images come in order: 1 if the images of a group follow each
+            other.
     """
 
     def __init__(
@@ -100,21 +103,22 @@ class Groups:
             for axis, may_differ in enumerate(within)
         ]
         self._is_within = (*axis_is_within, is_sampled)
-        within_sizes = self._select(self._all_axes.sizes, True)
-        between_sizes = self._select(self._all_axes.sizes, False)
+        within_sizes = self._select(self._all_axes.sizes, is_within=True)
+        between_sizes = self._select(self._all_axes.sizes, is_within=False)
         self._within = ProductIndex(tuple(within_sizes))
         self._between = ProductIndex(tuple(between_sizes))
         self.group_size = self._within.count
         self.n_groups = self._between.count
         self.n_cached_groups = 1
         if True in self._is_within:
-            # Groups differ along slower axes one after the other.
+            # Groups that differ in axes slower than all of those within come one after
+            # the other; those that differ in faster ones alternate.
             first_within = self._is_within.index(True)
             for axis in range(first_within, len(self._is_within)):
                 if not self._is_within[axis]:
                     self.n_cached_groups *= self._all_axes.sizes[axis]
 
-    def _select(self, values: Sequence[int], is_within: bool) -> list[int]:
+    def _select(self, values: Sequence[int], *, is_within: bool) -> list[int]:
         """Return the values of the axes within groups, or of those between."""
         return [
             value
@@ -125,7 +129,7 @@ class Groups:
     def find_group(self, number: int) -> int:
         """Return the index of the group of an image of the scene."""
         digits = self._all_axes.digits(number)
-        return self._between.index(self._select(digits, False))
+        return self._between.index(self._select(digits, is_within=False))
 
     def find_member(self, number: int, index: int) -> int:
         """Return the number of another image of the group of an image.
@@ -134,17 +138,16 @@ class Groups:
             number: of the image.
             index: index of the other one in the group.
         """
-        within_digits = iter(self._within.digits(index))
-        digits = self._all_axes.digits(number)
-        return self._all_axes.index(
-            [
-                next(within_digits) if is_within else digit
-                for digit, is_within in zip(digits, self._is_within, strict=True)
-            ]
-        )
+        member_digits = list(self._all_axes.digits(number))
+        within_axes = [
+            axis for axis, is_within in enumerate(self._is_within) if is_within
+        ]
+        for axis, digit in zip(within_axes, self._within.digits(index), strict=True):
+            member_digits[axis] = digit
+        return self._all_axes.index(member_digits)
 
 
-Fall = Callable[[frozenset[str]], Groups]
+MakeGroups = Callable[[frozenset[str]], Groups]
 """Makes the groups whose images may differ in some groups of coordinates
 (`control.parameter`).
 """
@@ -166,23 +169,26 @@ class BasisPictures:
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
         self._renderer = renderer
-        self._moving = find_lighting(renderer)
-        self.follows = frozenset(self._moving.groups)
-        self.moves = any(self._moving.groups.values())
+        self._lighting = find_lighting(renderer)
+        self.follows = frozenset(self._lighting.groups)
+        self.moves = any(self._lighting.groups.values())
 
-    def find_refusal(self, fall: Fall, spp: int) -> Refusal | None:
+    def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
         """Return why images are rendered; None if they are predicted.
 
+        They are predicted if that takes at most 1 / `MIN_SAVING_FACTOR` of the samples
+        of rendering a group, and the basis images fit into memory.
+
         Args:
-            fall: makes the groups.
+            make_groups: makes the groups.
             spp: samples per pixel of the images.
         """
         renderer = self._renderer
-        groups = fall(self.follows)
+        groups = make_groups(self.follows)
         if renderer.formation.denoiser != "oidn":
             return NOISE
         inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-        n_lights = len(LightBasis(renderer, self._moving, inputs).inputs_of_light)
+        n_lights = len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
         prediction_samples = n_lights * COLLECTED_SPP + N_VIEWS * (2 * CHECK_SPP + spp)
         min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
         if groups.group_size < min_images:
@@ -207,7 +213,7 @@ class BasisPictures:
             u: (d,) configuration of one of them.
             seed: of its light paths.
         """
-        return BasisRenderer(self._renderer, u, seed, changing=self._moving)
+        return BasisRenderer(self._renderer, u, seed, changing=self._lighting)
 
 
 ARRANGEMENT_SAMPLES = 2_200_000
@@ -224,18 +230,19 @@ LIGHT_BYTES = 4_000_000  # memory of the light of an environment besides its map
 def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
     """Return how many images under one light make light on surfaces pay.
 
+    Preparing the light and comparing it with traced images takes a fixed number of
+    samples per pixel; each image that is predicted saves `spp - PREDICTION_SPP`.
+
     Args:
         renderer: of the images.
         spp: samples per pixel of the images.
         arrangements: arrangements that are found for each light.
     """
     height, width = renderer.formation.resolution
-    light_samples = (ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES) / (
-        height * width
-    )
-    check_samples = N_VIEWS * (2 * CHECK_SPP + spp)
-    samples = light_samples + check_samples
-    return math.ceil(MIN_SAVING_FACTOR * samples / (spp - PREDICTION_SPP))
+    light_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
+    check_spp = N_VIEWS * (2 * CHECK_SPP + spp)
+    fixed_spp = light_samples / (height * width) + check_spp
+    return math.ceil(MIN_SAVING_FACTOR * fixed_spp / (spp - PREDICTION_SPP))
 
 
 class LightOnSurfaces:
@@ -277,19 +284,22 @@ class LightOnSurfaces:
             name for name, changed in self._changed_inputs.items() if changed <= allowed
         )
 
-    def find_refusal(self, fall: Fall, spp: int) -> Refusal | None:
+    def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
         """Return why images are rendered; None if they are predicted.
 
+        Also sets how many arrangements are cached.
+
         Args:
-            fall: makes the groups.
+            make_groups: makes the groups.
             spp: samples per pixel of the images.
         """
-        groups = fall(self.follows)
-        arranged = fall(self._find_groups_changing_only(FREE_INPUTS - {COLOR_INPUT}))
-        self._max_arrangements = arranged.n_cached_groups
-        min_images = find_break_even(
-            self._renderer, spp, arranged.n_groups / groups.n_groups
+        groups = make_groups(self.follows)
+        arrangement_groups = make_groups(
+            self._find_groups_changing_only(FREE_INPUTS - {COLOR_INPUT})
         )
+        self._max_arrangements = arrangement_groups.n_cached_groups
+        arrangements_per_light = arrangement_groups.n_groups / groups.n_groups
+        min_images = find_break_even(self._renderer, spp, arrangements_per_light)
         if groups.group_size < min_images:
             return Refusal(
                 f"light on surfaces pays where {min_images} pictures differ in the "
@@ -303,7 +313,7 @@ class LightOnSurfaces:
             + 4 * self._renderer.scene.get_base_value(ENVIRONMENT_INPUT).numel()
         )
         n_bytes = (
-            arranged.n_cached_groups * ARRANGEMENT_BYTES
+            arrangement_groups.n_cached_groups * ARRANGEMENT_BYTES
             + groups.n_cached_groups * light_bytes
         )
         if n_bytes > scale_limit(MAX_BYTES):
@@ -315,6 +325,9 @@ class LightOnSurfaces:
 
     def make_predictor(self, u: Tensor, seed: int) -> Predictor:
         """Return the predictor of the images of a group.
+
+        It uses a cached arrangement that fits. Else a new one is made and cached, for
+        which the oldest is released if there are too many.
 
         Args:
             u: (d,) configuration of one of them.
@@ -366,8 +379,9 @@ class SweepPredictor:
         images_before: images of the scenes before this one.
         deviations: of the predictors that were compared with traced images.
         seconds: that making and comparing them took.
-        rendered_groups: groups whose images are rendered because predictions deviated
-            too much.
+        rendered_groups: indices of the groups whose images are rendered because
+            predictions deviated too much.
+        renderer: of the problem.
         method: how images are predicted, or would be.
         refusal: why all images are rendered; None if they are predicted.
     """
@@ -381,9 +395,9 @@ class SweepPredictor:
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
     rendered_groups: set[int] = field(default_factory=set)
-    # images that were traced for each group
+    # images that were traced for each group, by its index
     _traced: dict[int, int] = field(default_factory=dict)
-    # None where the images of a group are rendered
+    # of the groups that are cached, by index; None where images are rendered
     _predictors: dict[int, Predictor | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -427,14 +441,16 @@ class SweepPredictor:
         )
         return Groups(
             self.points.grid,
-            self.points.samples,
-            tuple(name in follows for name in axis_names),
-            follows_all_sampled,
-            self.points.units.frames,
+            samples=self.points.samples,
+            within=tuple(name in follows for name in axis_names),
+            is_sampled=follows_all_sampled,
+            frames=self.points.units.frames,
         )
 
     def make_images(self, query_of_image: Mapping[int, Query]) -> dict[int, SweptImage]:
         """Render or predict images.
+
+        A predictor makes all images of its group at once.
 
         Args:
             query_of_image: the queries by the number of the image in the scene.
@@ -477,7 +493,8 @@ class SweepPredictor:
         """Return the predictor of a group; None if its images are rendered.
 
         It is made by the group alone, so that a sweep that was stopped goes on with the
-        same.
+        same. A new one is compared with traced images first, and not used where it
+        deviates too much; for it the oldest that is cached is released.
 
         Args:
             group: its index.
@@ -501,6 +518,8 @@ class SweepPredictor:
 
     def _compare(self, predictor: Predictor, number: int, seed: int) -> Deviation:
         """Compare predicted images of a group with traced ones.
+
+        The images and the noise of the traced ones follow from `seed`.
 
         Args:
             predictor: of the group.
@@ -579,9 +598,13 @@ def combine_transport(
 ) -> LinearTransport | None:
     """Combine what predicted the images of several scenes.
 
+    Args:
+        all_summaries: of each scene; None where nothing moves.
+
     Returns:
-        The worst error, the largest memory, and all seconds; None if nothing moves in
-        any scene.
+        The worst error, the largest memory, all seconds and the first reason, of the
+        scenes with predicted images. If none has them, the last summary; None if
+        nothing moves in any scene.
     """
     summaries = [summary for summary in all_summaries if summary is not None]
     used = [summary for summary in summaries if summary.used]

@@ -81,12 +81,16 @@ def count_by_unit(
     interval = None
     if len(unit_size) > 1 or len(right) == 1:
         interval = rate_interval(right_in_unit, unit_size)
+    outcome_counts = None
+    if outcome is not None:
+        is_wrong = right == 0
+        outcome_counts = _count_outcomes(outcome[is_wrong])
     return CountedPredictions(
         configurations=len(right),
         correct=int(right.sum()),
         accuracy=mean_rate(right_in_unit, unit_size),
         interval=interval,
-        outcomes=None if outcome is None else _count_outcomes(outcome[right == 0]),
+        outcomes=outcome_counts,
     )
 
 
@@ -95,6 +99,7 @@ def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
     counts = np.bincount(outcome, minlength=len(OUTCOMES))
     count_by_name = {
         known.value: int(count)
+        # not strict: there may be a count of `UNKNOWN_OUTCOME`
         for known, count in zip(OUTCOMES, counts, strict=False)
         if count
     }
@@ -132,7 +137,8 @@ class Predictions:
         is_known: (n,) whether there is a prediction.
         is_right: (n,) whether it is right.
         is_hidden: (n,) whether nothing of what is judged is in the image.
-        margin: (n,) NaN where it is not a number.
+        margin: (n,) NaN where it is not a number; then a prediction is neither right
+            nor, in `_wrong`, wrong.
         outcome: (n,) of a detector, indices among `OUTCOMES`.
     """
 
@@ -143,6 +149,7 @@ class Predictions:
         self._wrong: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.margin = np.full(n_rows, np.nan)
         self.outcome = np.full(n_rows, UNKNOWN_OUTCOME, np.uint8)
+        # of each row, the index of its label in the order of `_index_by_label`
         self._label_index = np.zeros(n_rows, np.uint32)
         self._index_by_label = dict[str, int]()
 
@@ -207,7 +214,7 @@ class Predictions:
             models: their names.
             units: how rows follow from draws.
         """
-        by_arm = (2, -1, len(models))
+        by_arm = (2, -1, len(models))  # arms, images, models
         right = self.is_right.reshape(by_arm)
         outcome = self.outcome.reshape(by_arm)
         both_counted = np.asarray(self.is_counted.reshape(by_arm).all(axis=0))
@@ -327,12 +334,13 @@ def make_map(
     height = len(y_axis.values)
     if width * height > MAX_CELLS:
         return None
-    cell = y_axis.value_index * width + x_axis.value_index
+    cell = y_axis.value_index * width + x_axis.value_index  # (n,) row by row
 
     def sum_over_cells(
         cells: npt.NDArray[np.integer[Any]],
         weights: npt.NDArray[np.float64] | None = None,
     ) -> Any:
+        """Return the sum of the weights in each cell, (height, width)."""
         sums = np.bincount(cells, weights, minlength=width * height)
         return sums.reshape(height, width)
 
@@ -354,7 +362,11 @@ def make_map(
 
 
 def _order_for_map(axes: Sequence[TableAxis]) -> list[TableAxis]:
-    """Return the axes in the order in which a map takes them."""
+    """Return the axes in the order in which a map takes them.
+
+    Axes of the grid come first, then those outside of the scene, the last one first.
+    Sampled ones are taken only if there are none of these.
+    """
     grid = [axis for axis in axes if axis.kind == "grid"]
     outside = [axis for axis in axes if axis.kind == "outside"]
     sampled = [axis for axis in axes if axis.kind == "drawn"]
@@ -516,8 +528,10 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
 def _join_names(rows: pd.DataFrame, column: str) -> str:
     """Return the names in a column, the first 20; "unknown" if there is none."""
     names = rows[column].unique().tolist() if column in rows else []
+    if not names:
+        return "unknown"
     more = f" and {len(names) - 20} more" if len(names) > 20 else ""
-    return ",".join(map(str, names[:20])) + more or "unknown"
+    return ",".join(map(str, names[:20])) + more
 
 
 def read_image(path: Path) -> object:

@@ -256,7 +256,7 @@ class SweepConfig(SceneConfig):
 
     @field_validator("must_change", "must_not_change")
     @classmethod
-    def _known_changes(cls, value: str | None, info: Any) -> str | None:
+    def _check_changes(cls, value: str | None, info: Any) -> str | None:
         known = BLIND if info.field_name == "must_change" else HARMLESS
         if value is not None and not set(split_names(value)) <= set(known):
             raise ValueError("no such change")
@@ -271,13 +271,18 @@ class SweepConfig(SceneConfig):
         return split_names(self.environment_name)
 
     def find_control_type(self, instance: str) -> type[Control] | None:
-        """Return the class of a control by the name of its instance.
+        """Return the class of a control by its name; None if there is none.
 
-        None if no control has that name.
+        The settings of the control may state its kind. Else the name is the kind, or
+        ``KIND:INSTANCE``.
+
+        Args:
+            instance: name of the control.
         """
         from advsearch.controls import CONTROLS  # imports torch
 
-        kind = str(self.controls.get(instance, {}).get("kind", instance))
+        control_settings = self.controls.get(instance, {})
+        kind = str(control_settings.get("kind", instance))
         if kind not in CONTROLS:
             kind = kind.partition(":")[0]
         return CONTROLS.get(kind)
@@ -324,12 +329,12 @@ class SweepConfig(SceneConfig):
 
     @field_validator("adversarial_of", mode="before")
     @classmethod
-    def _run_as_text(cls, value: Any) -> Any:
+    def _convert_path_to_text(cls, value: Any) -> Any:
         return str(value) if isinstance(value, Path) else value
 
     @field_validator("trials")
     @classmethod
-    def _none_or_enough(cls, value: int) -> int:
+    def _check_trials(cls, value: int) -> int:
         if 0 < value < MIN_TRIALS:
             raise ValueError("too few to verify anything")
         return value
@@ -347,7 +352,14 @@ class SweepConfig(SceneConfig):
 
 
 def _parse_axis(axis: Any) -> str | list[Any]:
-    """Return the values of an axis as a list, or FIRST:LAST:COUNT as text."""
+    """Return the values of an axis as a list, or FIRST:LAST:COUNT as text.
+
+    Text may have brackets, as in a YAML file. A single value is a list of one; arrays
+    and their elements become Python's numbers.
+
+    Raises:
+        ValueError: there are no values, or some are lists, mappings, booleans or None.
+    """
     if isinstance(axis, Mapping) and set(axis) == {"choices"}:
         axis = axis["choices"]
     if isinstance(axis, str):

@@ -34,7 +34,7 @@ from advsearch.report.figures import render_figure
 from advsearch.report.wording import shorten_name
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
-from advsearch.scene.assets import BoolArray, IntArray, ObjectAsset
+from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import Surfaces
 from advsearch.scene.geometry import camera_to_world
@@ -59,9 +59,11 @@ class PartCounts:
         n_failures: images whose prediction is wrong.
         visible_counts: (n,) images that show each part.
         wrong_counts: (n,) failures among these.
-        permuted_counts: (SHARINGS, n) the same after each permutation of the failures.
-        permuted_failures: bits of (SHARINGS, images), packed along the first axis: the
-            permuted failures, from `permute_draws`; None permutes single images.
+        permuted_counts: (N_PERMUTATIONS, n) the same after each permutation of the
+            failures.
+        permuted_failures: bits of (N_PERMUTATIONS, images), packed along the first
+            axis: the permuted failures, from `permute_draws`; None permutes single
+            images.
     """
 
     def __init__(
@@ -83,7 +85,14 @@ class PartCounts:
         self._random = np.random.default_rng(seed)
 
     def add(self, parts: Int64Array, failed: bool) -> None:
-        """Count an image, by the indices of the parts that it shows, each once."""
+        """Count an image, and say in which permutations it is a failure.
+
+        Images are added in the order of `permuted_failures`, `n_images` in all.
+
+        Args:
+            parts: indices of the parts that it shows, each once.
+            failed: whether its prediction is wrong.
+        """
         self.visible_counts[parts] += 1
         self.wrong_counts[parts] += failed
         if self.permuted_failures is not None:
@@ -91,7 +100,9 @@ class PartCounts:
             bits = np.unpackbits(self.permuted_failures[:, image], count=N_PERMUTATIONS)
             permuted_failure = bits.astype(bool)
         else:
-            # Sequential sampling: each choice of images is equally likely.
+            # Sequential sampling (Knuth's algorithm S): an image is a failure with the
+            # probability failures left / images left, so that each choice of
+            # `n_failures` images is equally likely.
             draw = self._random.random(N_PERMUTATIONS) * self._images_left
             permuted_failure = draw < self._failures_left
         self._images_left -= 1
@@ -122,18 +133,15 @@ def compare_parts(
         Without an interval `strength` is the absolute difference.
     """
     n_visible = counts.visible_counts[part_slice]
-    wrong = counts.wrong_counts[part_slice]
-    n_images = counts.n_images
-    n_failures = counts.n_failures
-    is_compared = (n_visible >= min_images) & (n_images - n_visible >= min_images)
+    n_hidden = counts.n_images - n_visible
+    is_compared = (n_visible >= min_images) & (n_hidden >= min_images)
     nan_columns = dict.fromkeys(("difference", "low", "high", "p"), np.nan)
     part_indices = np.arange(len(counts.visible_counts))[part_slice]
     parts = pd.DataFrame(nan_columns, index=part_indices).assign(compared=is_compared)
     if is_compared.any():
-        columns = _compute_comparison(
-            counts, n_visible, is_compared, wrong, n_failures, n_images, part_indices
-        )
+        columns = _compute_comparison(counts, part_indices[is_compared])
         parts.loc[is_compared, list(nan_columns)] = columns
+    # above 0 if both bounds are on the same side of 0
     nearer_bound = np.where(
         parts.low.isna(), parts.difference.abs(), np.maximum(parts.low, -parts.high)
     )
@@ -143,25 +151,24 @@ def compare_parts(
     )
 
 
-def _compute_comparison(
-    counts: PartCounts,
-    n_visible: IntArray,
-    is_compared: BoolArray,
-    wrong: IntArray,
-    n_failures: int,
-    n_images: int,
-    part_indices: IntArray,
-) -> Float64Array:
-    """Return difference, lower and upper bound and p-value of each compared part, (n,
-    4).
+def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
+    """Compute difference, lower and upper bound and p-value of parts, (m, 4).
+
+    Where images share a draw, the bounds are NaN.
+
+    Args:
+        counts: of all parts.
+        parts: (m,) indices of those that are compared.
     """
-    n = n_visible[is_compared]
-    k = wrong[is_compared]
-    difference, low, high = _newcombe(k, n, n_failures - k, n_images - n)
+    n = counts.visible_counts[parts]
+    k = counts.wrong_counts[parts]
+    difference, low, high = _newcombe(
+        k, n, other_k=counts.n_failures - k, other_n=counts.n_images - n
+    )
     if counts.permuted_failures is not None:
         low = np.full(len(n), np.nan)
         high = low
-    p_value = _permutation_p_value(counts, k, n, part_indices[is_compared])
+    p_value = _permutation_p_value(counts, k, n, parts)
     return np.stack([difference, low, high, p_value], axis=1)
 
 
@@ -169,6 +176,9 @@ def _permutation_p_value(
     counts: PartCounts, k: Int64Array, n: Int64Array, parts: Int64Array
 ) -> Float64Array:
     """Compute how likely it is that any part stands out as far as each by chance.
+
+    That is the fraction of the permutations in which the largest statistic of all parts
+    reaches that of the part; the data themselves count as one more permutation.
 
     Args:
         counts: with the permuted failures of all parts.
@@ -188,6 +198,7 @@ def _permutation_p_value(
     )
     statistic = _likelihood_ratio(k, n, failures, images)
     n_permutations = len(max_statistics)
+    # 1e-9: equal statistics may differ by rounding.
     n_above = n_permutations - np.searchsorted(max_statistics, statistic - 1e-9)
     return np.asarray((1 + n_above) / (1 + n_permutations))
 
@@ -330,7 +341,11 @@ class SurfaceCounts:
         )
 
     def _select_spread(self, candidates: pd.DataFrame) -> list[int]:
-        """Select the strongest parts of which none is close to another."""
+        """Select the strongest parts of which none is close to another.
+
+        Of two parts within `MIN_PART_DISTANCE` the weaker one is left out; at most
+        `MAX_LISTED_PARTS` are selected.
+        """
         extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
         position = self.parts.centers
         selected: list[int] = []
@@ -344,13 +359,13 @@ class SurfaceCounts:
         return selected
 
     def _describe_part(
-        self, part: int, tally: PartCounts, compared: pd.DataFrame
+        self, part: int, counts: PartCounts, compared: pd.DataFrame
     ) -> SurfacePart:
         """Return the counts and the comparison of one part, as the summary has them."""
-        n_visible = int(tally.visible_counts[part])
-        n_visible_wrong = int(tally.wrong_counts[part])
-        n_hidden = tally.n_images - n_visible
-        n_hidden_wrong = tally.n_failures - n_visible_wrong
+        n_visible = int(counts.visible_counts[part])
+        n_visible_wrong = int(counts.wrong_counts[part])
+        n_hidden = counts.n_images - n_visible
+        n_hidden_wrong = counts.n_failures - n_visible_wrong
         u, v = self.parts.center_uvs[part].tolist()
         return SurfacePart(
             face=int(self.parts.face[part]),
@@ -474,6 +489,9 @@ def _count_scene(
 ) -> None:
     """Trace the surface in every image of a scene and count it.
 
+    Small images are traced with several rays per pixel; see `MIN_RAYS`. Models of one
+    image size share them.
+
     Args:
         scenes: of the sweep.
         scene: the index of the scene.
@@ -510,7 +528,7 @@ def _select_known(
 def permute_draws(
     wrong: npt.NDArray[np.int8], draws: Int64Array, seed: int
 ) -> npt.NDArray[np.uint8] | None:
-    """Permute the predictions of full draws among the draws, SHARINGS times.
+    """Permute the predictions of full draws among the draws, N_PERMUTATIONS times.
 
     Args:
         wrong: (n,) whether each prediction is wrong, or UNKNOWN; every draw has as
@@ -527,12 +545,14 @@ def permute_draws(
     n_draws = len(draw_sizes)
     if draw_sizes.max(initial=1) == 1:
         return None
+    is_wrong = wrong == 1
+    # (draws, images of a draw)
     images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
     generator = np.random.default_rng(seed)
     permuted = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
     for permutation in permuted:
         order = generator.permutation(n_draws)
-        permutation[images_of_draw] = (wrong == 1)[images_of_draw[order]]
+        permutation[images_of_draw] = is_wrong[images_of_draw[order]]
     return np.packbits(permuted[:, is_known], axis=0)
 
 
@@ -558,8 +578,8 @@ def _write_map(
     }
     for number, (name, object_counts) in enumerate(counts.items()):
         comparisons = [
-            _compare_kinds(tally, object_counts.parts)
-            for tally in object_counts.part_counts
+            _compare_kinds(model_counts, object_counts.parts)
+            for model_counts in object_counts.part_counts
         ]
         for array_name, array in _stored_arrays(object_counts, comparisons).items():
             arrays[f"{array_name}_{number}"] = array
@@ -571,16 +591,28 @@ def _write_map(
 
 
 def _make_tables(
-    models: Sequence[str], object_counts: SurfaceCounts, comparisons: Any, name: str
+    models: Sequence[str],
+    object_counts: SurfaceCounts,
+    comparisons: Sequence[Mapping[str, pd.DataFrame]],
+    object_name: str,
 ) -> list[SurfaceTable]:
-    """Return the tables of an object: one for each model and kind of part."""
+    """Return the tables of an object: one for each model and kind of part.
+
+    Args:
+        models: their names.
+        object_counts: of the object.
+        comparisons: from `_compare_kinds`, for each model.
+        object_name: its name.
+    """
     tables = list[SurfaceTable]()
-    for model, tally, frames in zip(
+    for model, model_counts, compared_by_kind in zip(
         models, object_counts.part_counts, comparisons, strict=True
     ):
         tables += [
-            object_counts.summarize_kind(name, model, tally, kind, frame)
-            for kind, frame in frames.items()
+            object_counts.summarize_kind(
+                object_name, model, model_counts, kind, compared
+            )
+            for kind, compared in compared_by_kind.items()
         ]
     return tables
 
@@ -617,15 +649,15 @@ def _make_panels(
         models: their names.
     """
     views = tuple(_render_views(asset, counts.parts))
-    for model, tally, frames in zip(
+    for model, model_counts, compared_by_kind in zip(
         models, counts.part_counts, comparisons, strict=True
     ):
-        cells = frames["cell"]
+        cells = compared_by_kind["cell"]
         yield Panel(
-            f"{shorten_name(object_name)}, {shorten_name(model)}",
-            _grey_colors(counts.parts, tally, cells),
-            cells.difference.where(cells.significant).to_numpy(),
-            views,
+            title=f"{shorten_name(object_name)}, {shorten_name(model)}",
+            grey_colors=_grey_colors(counts.parts, model_counts, cells),
+            difference=cells.difference.where(cells.significant).to_numpy(),
+            views=views,
         )
 
 
@@ -644,31 +676,43 @@ def _stored_arrays(
     Args:
         counts: of the object.
         comparisons: from `compare_parts`, by the kind of part, for each model.
+
+    Returns:
+        Arrays whose first axis is the models, (models,) or (models, parts); "map" has
+        the corners of the parts.
     """
-    tallies = counts.part_counts
+    model_counts = counts.part_counts
     arrays: dict[str, npt.NDArray[Any]] = {
-        "pictures": np.stack([tally.n_images for tally in tallies]),
-        "failures": np.stack([tally.n_failures for tally in tallies]),
-        "seen": np.stack([tally.visible_counts for tally in tallies]),
-        "wrong": np.stack([tally.wrong_counts for tally in tallies]),
+        "pictures": np.stack([part_counts.n_images for part_counts in model_counts]),
+        "failures": np.stack([part_counts.n_failures for part_counts in model_counts]),
+        "seen": np.stack([part_counts.visible_counts for part_counts in model_counts]),
+        "wrong": np.stack([part_counts.wrong_counts for part_counts in model_counts]),
     }
     for column in ("difference", "low", "high", "p"):
-        values = [
-            np.concatenate([frame[column] for frame in frames.values()])
-            for frames in comparisons
+        column_of_model = [
+            np.concatenate([compared[column] for compared in compared_by_kind.values()])
+            for compared_by_kind in comparisons
         ]
-        arrays[column] = np.stack(values).astype(np.float32)
+        arrays[column] = np.stack(column_of_model).astype(np.float32)
     arrays["map"] = counts.parts.corners.astype(np.float32)
     return arrays
 
 
 def _grey_colors(
-    parts: SurfaceParts, tally: PartCounts, cells: pd.DataFrame
+    parts: SurfaceParts, counts: PartCounts, cells: pd.DataFrame
 ) -> Float64Array:
-    """Return the colors (cells, 3) of cells without a significant difference."""
-    has_surface = parts.is_covered.ravel() | (
-        tally.visible_counts[parts.part_slices["cell"]] > 0
-    )
+    """Return the colors (cells, 3) of cells without a significant difference.
+
+    A cell without surface is white, one that was not compared dark grey, the others
+    light grey.
+
+    Args:
+        parts: of the object.
+        counts: of one model.
+        cells: from `compare_parts`, of the cells.
+    """
+    was_visible = counts.visible_counts[parts.part_slices["cell"]] > 0
+    has_surface = parts.is_covered.ravel() | was_visible
     is_compared = cells.compared.to_numpy()
     colors = np.where(is_compared[:, None], NOT_SIGNIFICANT_GREY, NOT_COMPARED_GREY)
     return np.where(has_surface[:, None], colors, WHITE)
@@ -743,7 +787,7 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
         cells = np.full(is_object.shape, -1, np.int64)
         cells[is_object] = parts.find_cells(face, uv)
         cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
-        shade = 0.7 + 0.3 * cosine
+        shade = 0.7 + 0.3 * cosine  # never so dark that colors are hard to tell apart
         yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
 
 
@@ -792,6 +836,7 @@ def _find_scale_limit(panels: Sequence[Panel]) -> float:
         (float(np.nanmax(np.abs(panel.difference), initial=0.0)) for panel in panels),
         default=0.0,
     )
+    # 1e-9: a multiple of 10 % may be larger by rounding.
     return max(ceil(10.0 * max_difference - 1e-9) / 10.0, 0.1)
 
 

@@ -62,9 +62,10 @@ class _Track:
 
     Attributes:
         number: which stays the same.
-        box: (4,) in the last frame, or the predicted one.
+        box: (4,) in the last frame: a detected one, or, where the track was missed, the
+            last detected one moved by `missed` times its speed.
         speed: (4,) change of the box per frame.
-        missed: frames since it had a box.
+        missed: frames since it had a detected box.
     """
 
     number: int
@@ -78,11 +79,12 @@ class ConstantVelocity:
 
     Boxes are assigned to the tracks whose predicted boxes they overlap most, all
     jointly (Kuhn 1955): first those with a score of `sure`, then the others, which
-    begin no track (Zhang et al. 2022, *ByteTrack*, section 3).
+    begin no track (Zhang et al. 2022, *ByteTrack*, section 3). A sure box without a
+    track begins a new one, at speed 0.
 
     Args:
         sure: score of a box that begins a track.
-        overlap: least intersection over union of a box with the predicted one.
+        overlap: minimum intersection over union of a box with the predicted one.
         patience: frames in which a track may be missed; after more it has ended.
     """
 
@@ -132,6 +134,7 @@ class ConstantVelocity:
         for track_index, box_index in box_of_track.items():
             track = tracks[track_index]
             box = boxes[box_index]
+            # the box that was detected last, `missed` frames ago
             last_box = track.box - track.speed * track.missed
             speed = (box - last_box) / track.missed
             assigned.append(_Track(track.number, box, speed))
@@ -180,18 +183,21 @@ def track_drive(
 ) -> DriveTracking:
     """Track the boxes of a drive, and compare the tracks with the true boxes.
 
+    Of several tracks on the object, the one of the last frame counts if it is among
+    them, else the one that overlaps most: then the identity has switched.
+
     Args:
         frames: of the drive, in their order.
         tracker: makes the tracker.
         iou: intersection over union with the true box from which on a track is on the
             object.
     """
-    step = tracker()
+    track_frame = tracker()
     last_number: int | None = None
     is_lost = list[bool]()
     n_switches = 0
     for frame in frames:
-        tracks = step(frame.boxes, frame.scores)
+        tracks = track_frame(frame.boxes, frame.scores)
         is_visible = frame.true is not None
         on_object = _find_tracks_on(tracks, frame.true, iou)
         is_lost.append(is_visible and not on_object)
@@ -199,13 +205,16 @@ def track_drive(
             continue
         if any(number == last_number for _, number in on_object):
             continue
-        _, number = max(on_object)
-        n_switches += last_number is not None
+        _, number = max(on_object)  # the largest overlap
+        if last_number is not None:
+            n_switches += 1
         last_number = number
     gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
     n_visible = sum(frame.true is not None for frame in frames)
     return DriveTracking(
-        sum(is_lost) / max(1, n_visible), n_switches, max(gaps, default=0)
+        lost=sum(is_lost) / max(1, n_visible),
+        switches=n_switches,
+        gap=max(gaps, default=0),
     )
 
 

@@ -55,18 +55,19 @@ def test(
     from advsearch.questions.test.carry_out import try_suite  # imports torch
 
     config = context.config
-    files = {
-        name: Path(file) for name in FILE_FORMATS if (file := getattr(config, name))
-    }
+    files: dict[str, Path] = {}
+    for name in FILE_FORMATS:
+        file = getattr(config, name)
+        if file:
+            files[name] = Path(file)
     for name, path in files.items():
         if path.is_dir() or not path.absolute().parent.is_dir():
             raise InputError(
                 f"{name}: expected a file in a folder that is there, got "
                 f"{path}; make the folder first"
             )
-    result = try_suite(
-        context, None if suite is None else parse_suite(suite, config.suite)
-    )
+    parsed_suite = None if suite is None else parse_suite(suite, config.suite)
+    result = try_suite(context, parsed_suite)
     for name, path in files.items():
         writing.write_text(path, FILE_FORMATS[name](result), durable=False)
     return result

@@ -68,6 +68,9 @@ def try_suite(
 ) -> SuiteResult:
     """Test the claims of a suite; what a resumed run decided is not tested again.
 
+    With `add` it tests nothing but the new counterexample, which is deleted again
+    unless the model fails on it.
+
     Args:
         context: of the experiment; its settings name the suite.
         suite: instead of the one that the settings name.
@@ -96,8 +99,8 @@ def try_suite(
     _note_settings(context, loaded_suite, planned)
     for remark in remarks:
         context.progress.message(remark)
-    trial = ClaimTester(context, loaded_suite, start, remarks)
-    suite_run = _SuiteRun(trial, planned, counterexamples.read_expected(config.suite))
+    tester = ClaimTester(context, loaded_suite, start_time=start, warnings=remarks)
+    suite_run = _SuiteRun(tester, planned, counterexamples.read_expected(config.suite))
     context.ending = suite_run.run_claims()
     if added is not None and suite_run.results[0].answer != FAILED:
         counterexamples.delete_counterexample(added)
@@ -156,27 +159,37 @@ def _note_settings(
 
 @dataclass
 class _SuiteRun:
-    """The state of a suite that is being tested: what is planned, and results so
-    far.
+    """The state of a suite that is being tested.
+
+    Attributes:
+        tester: tests claims.
+        planned: all claims, counterexamples first.
+        expected: the expected verdict of each claim that is not expected to be held.
+        results: so far, in the order of what is planned.
     """
 
-    trial: ClaimTester
+    tester: ClaimTester
     planned: Sequence[PlannedClaim]
     expected: Mapping[str, str]
     results: list[ClaimResult] = field(default_factory=list)
 
     def run_claims(self) -> str:
-        """Test every claim, and return the status of the run."""
-        trial = self.trial
-        with trial.context.until_interrupted():
+        """Test every claim, and return the status of the run.
+
+        After an interrupt the others get results without a verdict.
+        """
+        tester = self.tester
+        with tester.context.until_interrupted():
             for number, claim in enumerate(self.planned, start=1):
                 self._add_result(claim, self._test_claim(claim))
                 last = self.results[-1]
-                trial.progress.message(f"{claim.name}: {last.answer}: {last.reason}")
+                tester.progress.message(f"{claim.name}: {last.answer}: {last.reason}")
                 if number < len(self.planned):
                     # for a run that is killed
-                    trial.run.write_summary(self.make_result(results.INTERRUPTED, None))
-        if trial.context.ending == results.INTERRUPTED:
+                    tester.run.write_summary(
+                        self.make_result(results.INTERRUPTED, None)
+                    )
+        if tester.context.ending == results.INTERRUPTED:
             for claim in self.planned[len(self.results) :]:
                 untested = self._make_untested(
                     claim, INTERRUPTED_REASON, Cause.INTERRUPTED
@@ -185,26 +198,31 @@ class _SuiteRun:
             return results.INTERRUPTED
         causes = {tested.cause for tested in self.results}
         if Cause.COUNTEREXAMPLE_FAILED in causes:
-            trial.warnings.append(
+            tester.warnings.append(
                 "A counterexample failed, so that no claim was "
                 "tried; `all` goes on with them."
             )
         return results.OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
 
     def _test_claim(self, claim: PlannedClaim) -> ClaimResult:
-        """Test a claim, or return why it is not tested, or its noted result."""
+        """Test a claim, or return its noted result, or why it is not tested.
+
+        It is not tested if an unexpected counterexample failed (unless the settings ask
+        for all), the time is over, or a counterexample does not suit the model. A
+        result is noted unless the time ended the test.
+        """
         key = f"claim {claim.name}"
-        trial = self.trial
-        noted = trial.run.store.read_json_note(key)
+        tester = self.tester
+        noted = tester.run.store.read_json_note(key)
         if noted is not None:
             return ClaimResult.of(noted)
         counterexample_failed = any(
             known.kind == "counterexample" and not known.accepted
             for known in self.results
         )
-        if counterexample_failed and claim.example is None and not trial.config.all:
+        if counterexample_failed and claim.example is None and not tester.config.all:
             return self._make_untested(claim, NOT_TESTED, Cause.COUNTEREXAMPLE_FAILED)
-        if trial.out_of_time:
+        if tester.out_of_time:
             return self._make_untested(
                 claim, f"{OUT_OF_TIME_REASON} before it began", Cause.OUT_OF_TIME
             )
@@ -213,17 +231,17 @@ class _SuiteRun:
         pending = self._make_untested(claim, "")
         start = time.perf_counter()
         if claim.example is None:
-            tested = trial.test_claim(
-                pending, trial.suite.claims[claim.name], claim.config
+            tested = tester.test_claim(
+                pending, tester.suite.claims[claim.name], claim.config
             )
         else:
             assert isinstance(claim.config, AttackConfig)
-            tested = trial.test_counterexample(pending, claim.example, claim.config)
+            tested = tester.test_counterexample(pending, claim.example, claim.config)
         if tested.cause is Cause.INTERRUPTED:
             raise KeyboardInterrupt
         tested = tested.model_copy(update={"seconds": time.perf_counter() - start})
         if tested.cause is not Cause.OUT_OF_TIME:
-            trial.run.store.write_note(key, json.dumps(tested.to_dict()))
+            tester.run.store.write_note(key, json.dumps(tested.to_dict()))
         return tested
 
     def _make_untested(
@@ -232,7 +250,7 @@ class _SuiteRun:
         """Make the result of a claim that is not tested, or not yet."""
         text = ""
         if claim.example is None:
-            text = describe_claim(self.trial.suite.claims[claim.name], claim.config)
+            text = describe_claim(self.tester.suite.claims[claim.name], claim.config)
         return ClaimResult(
             name=claim.name,
             kind=claim.kind,
@@ -257,22 +275,26 @@ class _SuiteRun:
 
         It changes nothing but its own run. None if no command can.
         """
-        config = self.trial.config
-        command = config.command_line(self.trial.run.path)
+        config = self.tester.config
+        command = config.command_line(self.tester.run.path)
         if command is None:
             return None
         arguments = list(changes)
         if config.fresh:
-            arguments += ["fresh=false", f"seed={self.trial.suite.seed}"]
+            arguments += ["fresh=false", f"seed={self.tester.suite.seed}"]
         for power in config.powers:
             if power.name not in ("run", "overwrite"):
                 arguments.append(f"{power.name}={json.dumps(power.default)}")
         return f"{command} {shlex.join(arguments)}".rstrip()
 
     def make_result(self, ending: str, added: Counterexample | None) -> SuiteResult:
-        """Make the result of the claims so far; `update` stores what is expected."""
-        trial = self.trial
-        config = trial.config
+        """Make the result of the claims so far; `update` stores what is expected.
+
+        With `update`, a run that is done stores its verdicts as expected, except for
+        claims that were not tested since a counterexample failed.
+        """
+        tester = self.tester
+        config = tester.config
         configs = [claim.config for claim in self.planned]
         controls = [name for config in configs for name in config.controls]
         changes = list[str]()
@@ -293,22 +315,22 @@ class _SuiteRun:
                 for claim in claims
             ]
         return SuiteResult(
-            run=str(trial.run.path),
+            run=str(tester.run.path),
             suite=config.suite,
-            title=trial.suite.title,
+            title=tester.suite.title,
             object=_join_distinct(config.object for config in configs),
             model=_join_distinct(config.model for config in configs),
             environment=_join_distinct(config.environment_name for config in configs),
             controls=list(dict.fromkeys(controls)),
             answer=combine_verdicts(claims),
-            confidence=trial.suite.confidence,
+            confidence=tester.suite.confidence,
             claims=claims,
             ending=ending,
             added=None if added is None else str(added.path),
             changes=changes,
-            warnings=list(dict.fromkeys(trial.warnings)),
-            seconds={"total": trial.elapsed_seconds},
-            seed=trial.suite.seed,
+            warnings=list(dict.fromkeys(tester.warnings)),
+            seconds={"total": tester.elapsed_seconds},
+            seed=tester.suite.seed,
             command_line=self._repeat_command(),
             python_only=config.python_only,
         )
@@ -363,17 +385,16 @@ def _select_claims(
     for name in config.selected_claims:
         if name not in known:
             raise errors.UnknownNameError("claim in `only`", name, known)
-    selected = []
-    for claim in planned:
-        is_example = (
-            claim.example is not None and ALL_COUNTEREXAMPLES in config.selected_claims
-        )
-        if (
-            not config.selected_claims
-            or claim.name in config.selected_claims
-            or is_example
-        ):
-            selected.append(claim)
+    if not config.selected_claims:
+        selected = list(planned)
+    else:
+        all_examples = ALL_COUNTEREXAMPLES in config.selected_claims
+        selected = [
+            claim
+            for claim in planned
+            if claim.name in config.selected_claims
+            or (all_examples and claim.example is not None)
+        ]
     if not selected:
         raise InputError(
             f"only: expected {ALL_COUNTEREXAMPLES} in "
@@ -394,7 +415,13 @@ def _plan_example(
     except InputError as error:
         config = example.config
         refusal = describe_unsuitable(str(error))
-    return PlannedClaim(example.name, "counterexample", config, example, refusal)
+    return PlannedClaim(
+        name=example.name,
+        kind="counterexample",
+        config=config,
+        example=example,
+        refusal=refusal,
+    )
 
 
 def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:

@@ -77,14 +77,14 @@ class _PictureSample:
     """What the pictures show that a claim was tested with.
 
     Attributes:
-        values: score of each picture that counts.
+        scores: of each picture that counts, from 0 to 1; see `score_picture`.
         wrong_payloads: what the task recorded of wrong predictions.
         n_hidden: pictures without the object in view, which do not count.
         verdict: what they decide.
         worst: of the worst wrong picture: how bad it is, its query, and its text.
     """
 
-    values: list[float] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
     wrong_payloads: list[Any] = field(default_factory=list)
     n_hidden: int = 0
     verdict: str = UNDECIDED
@@ -152,8 +152,10 @@ class ClaimTester:
     def _test_by_search(
         self, pending: ClaimResult, config: AttackConfig
     ) -> ClaimResult:
-        """Test by a search, which runs as a part of this run, that nothing breaks a
-        model.
+        """Test by a search, as a part of this run, that nothing breaks a model.
+
+        The picture of a claim that fails is the adversarial one, or the clean one if
+        that is wrong already.
         """
         search = self._make_search(config)
         summary = self.context.run_part(pending.name, search)
@@ -200,7 +202,7 @@ class ClaimTester:
         claim: ShareClaim | NoWorseClaim,
         config: SceneConfig,
     ) -> ClaimResult:
-        """Sample pictures until they decide a claim.
+        """Sample pictures until they decide a claim, or all of them are sampled.
 
         It is about the predictions of a model alone, or compared with those of another
         model or about changed pictures.
@@ -214,14 +216,8 @@ class ClaimTester:
 
         example, picture = self._save_example(pending, sample.worst, problem)
         is_late = sample.verdict == UNDECIDED and self.out_of_time
-        reason = _picture_reason(
-            claim,
-            sample.verdict,
-            sample.values,
-            sequence.interval,
-            example,
-            sample.wrong_payloads,
-            problem,
+        reason = _describe_sample(
+            claim, sample, sequence.interval, example, problem.task.name
         )
         if sample.n_hidden:
             reason += (
@@ -230,17 +226,18 @@ class ClaimTester:
             )
         if is_late:
             reason += f"; {OUT_OF_TIME_REASON}"
+        rate = None
+        if sample.scores:
+            (rate,) = _to_claim_scale(claim, sequence.mean)
         return pending.model_copy(
             update={
                 "answer": sample.verdict,
                 "reason": reason,
                 "cause": Cause.OUT_OF_TIME if is_late else None,
                 "interval": _to_claim_scale(claim, *sequence.interval),
-                "pictures": len(sample.values),
+                "pictures": len(sample.scores),
                 "spp": samples_per_pixel(config),
-                "rate": _to_claim_scale(claim, sequence.mean)[0]
-                if sample.values
-                else None,
+                "rate": rate,
                 "picture": picture,
             }
         )
@@ -254,17 +251,17 @@ class ClaimTester:
         """Add pictures to a confidence sequence until it decides the claim."""
         sample = _PictureSample()
         for query, evaluation, other in evaluated:
-            value, badness, text = score_picture(claim, evaluation, other)
-            if value is None:
+            score, badness, text = score_picture(claim, evaluation, other)
+            if score is None:
                 sample.n_hidden += 1
                 continue
             judgement = evaluation.required_judgement
             if not judgement.right:
                 sample.wrong_payloads.append(judgement.payload)
-            sequence.add(value)
-            sample.values.append(value)
-            worst = sample.worst
-            if value == 0.0 and (worst is None or badness > worst[0]):
+            sequence.add(score)
+            sample.scores.append(score)
+            is_worst = sample.worst is None or badness > sample.worst[0]
+            if score == 0.0 and is_worst:
                 sample.worst = (badness, query, text)
             sample.verdict = _decide(sequence, threshold_mean(claim))
             if sample.verdict != UNDECIDED:
@@ -294,8 +291,18 @@ class ClaimTester:
         config: SceneConfig,
         problem: Problem,
     ) -> Iterator[Iterator[Evaluated]]:
-        """Open the workers that evaluate sampled pictures, of one or of two models."""
-        shared = AttackConfig.from_config(
+        """Open the workers that evaluate sampled pictures, of one or of two models.
+
+        A claim that pictures are right has no other side. Else the other side is the
+        other model, or the same one on changed pictures.
+
+        Args:
+            name: of the claim.
+            claim: the claim.
+            config: settings of its pictures.
+            problem: of the model under test.
+        """
+        worker_config = AttackConfig.from_config(
             config, workers=self.config.workers, cluster=self.config.cluster
         )
         worker = ATTACK_WORKER
@@ -306,7 +313,9 @@ class ClaimTester:
         if isinstance(claim, NoWorseClaim):
             worker = CLAIM_WORKER
             other = self._load_problem(config.model_copy(update={"model": claim.than}))
-            shared = shared.model_copy(update={"model": f"{config.model},{claim.than}"})
+            worker_config = worker_config.model_copy(
+                update={"model": f"{config.model},{claim.than}"}
+            )
             if other.renderer.formation == problem.renderer.formation:
                 change = _same_picture
         elif isinstance(claim, ChangeClaim):
@@ -321,7 +330,8 @@ class ClaimTester:
         queries = sample_queries(
             problem, f"claim {name}", claim.pictures, samples_per_pixel(config)
         )
-        with workbench.open_executor(shared, worker, self.progress) as executor:
+        with workbench.open_executor(worker_config, worker, self.progress) as executor:
+            # Workers find the problem of a model by its index; see `claim_worker`.
             problem_name = "0" if has_two_models else ""
             evaluator = workbench.ParallelEvaluator(problem, executor, problem_name)
             journal = workbench.Journal(self.run, evaluator)
@@ -363,11 +373,12 @@ class ClaimTester:
             change: makes the other side's picture of the first one; without it, the
                 other side renders its own.
         """
-        pictures: dict[int, Tensor | None] = {}
+        pictures: dict[int, Tensor | None] = {}  # of a batch, by number
 
         def evaluate(
             queries: Sequence[workbench.Query],
         ) -> Iterator[policies.Evaluation]:
+            """Evaluate queries, and keep their pictures if they are to be changed."""
             evaluations = journal.evaluator(
                 [replace(query, with_image=change is not None) for query in queries]
             )
@@ -378,6 +389,7 @@ class ClaimTester:
         def evaluate_other(
             queries: Sequence[workbench.Query],
         ) -> Iterable[policies.Evaluation]:
+            """Evaluate the other side: on changed pictures, or on its own ones."""
             assert other_journal is not None
             if change is None:
                 yield from other_journal.evaluator(queries)
@@ -389,20 +401,20 @@ class ClaimTester:
                 picture = pictures.get(query.number)
                 if picture is None:
                     picture = problem.picture(query.u, query.seed, query.spp)
-                judgement = other.judge(
-                    change(query, picture), other.add_conditions(query.u)
-                )
+                changed_picture = change(query, picture)
+                judgement = other.judge(changed_picture, other.add_conditions(query.u))
                 yield policies.Evaluation.from_judgement(judgement)
 
         batch_size = 1
         if journal.evaluator.executor is not None:
+            # of a cluster the number of workers is not known
             batch_size = BATCHES_AHEAD * (self.config.workers or 8)
         while batch := list(islice(queries, batch_size)):
             pictures.clear()
             evaluations = journal.evaluate_all(batch, evaluate)
             others: Iterable[policies.Evaluation | None] = repeat(None)
             if other_journal is not None:
-                # all pictures are there before they are changed
+                # evaluates all, so that the pictures are there before they are changed
                 evaluations = iter(list(evaluations))
                 other_queries = [
                     replace(query, kind=f"{query.kind} beside") for query in batch
@@ -420,6 +432,9 @@ class ClaimTester:
         self, pending: ClaimResult, example: Counterexample, config: AttackConfig
     ) -> ClaimResult:
         """Test a counterexample: the model should be right on it.
+
+        One whose files or scene have changed, or that does not suit the model, stays
+        undecided, with the reason.
 
         Args:
             pending: the result without a verdict.
@@ -463,8 +478,9 @@ class ClaimTester:
         *,
         over: bool,
     ) -> ClaimResult:
-        """Test a counterexample by fresh renders; with `over`, under many
-        conditions.
+        """Test a counterexample by fresh renders; with `over`, under many conditions.
+
+        Its picture is that of the first wrong trial.
         """
         u = problem.domain.project(example.make_configuration(problem.domain.start))
         # trials by which it is added are not repeated as trials of the suite
@@ -652,8 +668,10 @@ def score_picture(
         other: evaluation of the other side, if there is one.
 
     Returns:
-        The score from 0 to 1, None if the object is out of view; how bad an example
-        against the claim it is; and a description of that.
+        The score from 0 to 1: whether the model is right, or predicts as claimed; of
+        two models 1 if only the first is right, 0 if only the other is, else 1/2. None
+        if the object is out of view. How bad an example against the claim it is: the
+        task's score. And a description of that.
     """
     before = evaluation.required_judgement.prediction
     # pictures of two sizes need not show the same
@@ -673,11 +691,9 @@ def score_picture(
         after = other.required_judgement.prediction
         text = f"{before.label} before and {after.label} after"
         return float(workbench.meets_claim(claim.claim, before, after)), 0.0, text
-    return (
-        (evaluation.required_judgement.right - other.required_judgement.right + 1) / 2,
-        0.0,
-        "",
-    )
+    is_right = int(evaluation.required_judgement.right)
+    is_other_right = int(other.required_judgement.right)
+    return (is_right - is_other_right + 1) / 2, 0.0, ""
 
 
 def _decide(
@@ -698,46 +714,53 @@ def _to_claim_scale(
     return means
 
 
-def _picture_reason(
+def _describe_sample(
     claim: ShareClaim | NoWorseClaim,
-    verdict: str,
-    values: Sequence[float],
+    sample: _PictureSample,
     interval: tuple[float, float],
     example: str,
-    wrong_payloads: Sequence[Any],
-    problem: Problem,
+    task: str,
 ) -> str:
     """Describe why sampled pictures decide a claim, or don't.
 
     Args:
         claim: what is claimed.
-        verdict: HELD, FAILED or UNDECIDED.
-        values: scores of the pictures.
-        interval: interval of their mean.
+        sample: the pictures.
+        interval: of the mean of their scores.
         example: the worst example against the claim.
-        wrong_payloads: payloads of the wrong predictions.
-        problem: the problem of the model under test.
+        task: name of the task.
     """
+    n_pictures = len(sample.scores)
+    n_for = sample.scores.count(1.0)
+    n_against = sample.scores.count(0.0)
     if isinstance(claim, NoWorseClaim):
         lower, upper = _to_claim_scale(claim, *interval)
-        counts = (len(values), values.count(1.0), values.count(0.0))
-        return words.describe_difference(verdict, counts, (lower, upper), claim.than)
+        return words.describe_difference(
+            sample.verdict,
+            (n_pictures, n_for, n_against),
+            (lower, upper),
+            claim.than,
+        )
     what = "as claimed"
     outcomes = ""
     if isinstance(claim, RightClaim):
         what = "right"
-        outcomes = wording.format_outcomes(
-            workbench.count_outcomes(wrong_payloads), problem.task.name
-        )
+        outcome_counts = workbench.count_outcomes(sample.wrong_payloads)
+        outcomes = wording.format_outcomes(outcome_counts, task)
     return words.describe_fraction(
-        what, verdict, values.count(1.0), len(values), interval, example, outcomes
+        what, sample.verdict, n_for, n_pictures, interval, example, outcomes
     )
 
 
 def _has_enough_trials(outcomes: Sequence[bool | None], *, over: bool) -> bool:
     """Return whether further trials of a counterexample change nothing.
 
-    One scene that is right and wrong depends on the noise already.
+    One scene that is right and wrong depends on the noise already. Otherwise it takes
+    `N_TRIALS` that count.
+
+    Args:
+        outcomes: whether the model is right in each; None does not count.
+        over: whether conditions vary.
     """
     n_right = outcomes.count(True)
     n_wrong = outcomes.count(False)
@@ -753,7 +776,15 @@ def _trials_result(
     *,
     over: bool,
 ) -> dict[str, Any]:
-    """Return what trials decide: fields of a `ClaimResult`."""
+    """Return what trials decide: fields of a `ClaimResult`.
+
+    Args:
+        outcomes: whether the model is right in each; None does not count.
+        label: of the first wrong prediction; empty without one.
+        wrong_payloads: payloads of the wrong predictions.
+        problem: of the model.
+        over: whether conditions vary.
+    """
     n_right = outcomes.count(True)
     n_wrong = outcomes.count(False)
     total = n_right + n_wrong

@@ -118,7 +118,12 @@ Every other one may decide a verdict; a new setting is stored unless it is liste
 
 
 class _Block(BaseModel):
-    """Quantized offsets of some values from the clean scene; see `FORMS`."""
+    """Quantized offsets of some values from the clean scene; see `FORMS`.
+
+    `numbers` is how many values there are, `step` the size of a quantization step,
+    `signs` whether a value is -1, 0 or 1 steps, `square` the side of the squares of
+    texels that share a value, and `offsets` the compressed steps as base 85.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     numbers: int = Field(ge=1, le=MAX_SIZE)
@@ -146,18 +151,20 @@ class _Block(BaseModel):
         if is_small:
             step = FINE_STEP
         elif signs:
-            step = float(np.abs(values).max())
+            # 1.0 where nothing differs: a step of 0 is none
+            step = float(np.abs(values).max()) or 1.0
         if square > 1:
-            squares = values.reshape(side // square, square, side // square, square, 3)
+            n_squares = side // square  # along each side
+            squares = values.reshape(n_squares, square, n_squares, square, 3)
             values = squares.mean(axis=(1, 3)).ravel()
-        steps = np.round(values / (step or 1.0)).astype("<i2")
+        steps = np.round(values / step).astype("<i2")
         data = steps.tobytes()
         if signs and not is_small:
             data = _pack_signs(steps)
         compressed = lzma.compress(data, lzma.FORMAT_ALONE)
         return cls(
             numbers=len(values) * square**2,
-            step=step or 1.0,
+            step=step,
             signs=not is_small and signs,
             square=square,
             offsets=base64.b85encode(compressed).decode("ascii"),
@@ -170,7 +177,9 @@ class _Block(BaseModel):
             ValueError, LZMAError: if they are corrupt.
         """
         n_steps = self.numbers // self.square**2
-        n_bytes = -(-n_steps // 3) if self.signs else 2 * n_steps
+        n_bytes = 2 * n_steps
+        if self.signs:
+            n_bytes = -(-n_steps // 3)  # three in a byte, rounded up
         decompressor = lzma.LZMADecompressor(memlimit=MAX_MEMORY)
         # more than what is expected shows that it is another block
         max_bytes = 2 * n_steps + 1
@@ -182,18 +191,18 @@ class _Block(BaseModel):
         else:
             steps = np.frombuffer(data, "<i2")
         if self.square > 1:
-            side = isqrt(self.numbers // 3)
-            squares = steps.reshape(side // self.square, side // self.square, 3)
+            n_squares = isqrt(self.numbers // 3) // self.square  # along each side
+            squares = steps.reshape(n_squares, n_squares, 3)
             texels = squares.repeat(self.square, axis=0).repeat(self.square, axis=1)
             steps = texels.ravel()
-        moved: Floats = steps.astype(np.float32) * np.float32(self.step)
-        return moved
+        offsets: Floats = steps.astype(np.float32) * np.float32(self.step)
+        return offsets
 
 
 def _pack_signs(steps: np.ndarray[Any, Any]) -> bytes:
     """Pack three values from -1 to 1 into each byte, as digits of base 3."""
     threes = np.pad(steps, (0, -len(steps) % 3)).reshape(-1, 3)
-    packed = threes @ (9, 3, 1) + 13
+    packed = threes @ (9, 3, 1) + 13  # 13: adds 1 to each digit, so that none is -1
     return bytes(packed.astype(np.uint8).tobytes())
 
 
@@ -205,7 +214,13 @@ def _unpack_signs(data: bytes, n_steps: int) -> np.ndarray[Any, Any]:
 
 
 class _File(BaseModel):
-    """The content of a counterexample's file."""
+    """The content of a counterexample's file.
+
+    `run` is the name of the run, `said` the wrong prediction, `settings` those that
+    decide a verdict, `files` the SHA-256 of the files that these name, `scene` the
+    digest of the scene, `spp` the samples per pixel, and `blocks` the offsets from the
+    clean scene.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     schema_: int = Field(alias="schema", ge=1, le=1)
@@ -243,8 +258,15 @@ class Counterexample:
     clean_offsets: Floats
 
     def make_config(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
-        """Return the settings that test it: its own, with the suite's network and
-        machine.
+        """Return the settings that test it: its own, with the suite's network.
+
+        Settings of the network are replaced all together, if the suite or the changes
+        name a model, else none. Settings of the machine are always the defaults, with
+        the changes.
+
+        Args:
+            suite: the suite.
+            changes: settings of the command line; None is no setting.
 
         Raises:
             InputError: if its settings do not suit that network.
@@ -344,7 +366,9 @@ def evaluate_trial(
     It does not count if the object is out of view, or the model is wrong on the clean
     scene under the same conditions.
     """
-    if trial.prediction.is_out_of_view or (clean is not None and not clean.right):
+    if trial.prediction.is_out_of_view:
+        return None
+    if clean is not None and not clean.right:
         return None
     return trial.right
 
@@ -358,7 +382,8 @@ def decide_trials(right: int, wrong: int, *, over: bool) -> str:
     """
     total = right + wrong
     if not over:
-        if total < N_TRIALS[over] or (right and wrong):
+        depends_on_noise = right > 0 and wrong > 0
+        if total < N_TRIALS[over] or depends_on_noise:
             return UNDECIDED
         return HELD if right else FAILED
     if total:
@@ -374,8 +399,10 @@ def decide_trials(right: int, wrong: int, *, over: bool) -> str:
 def _is_wrong_on(
     example: Counterexample, problem: Problem, trials: int, *, over: bool
 ) -> bool:
-    """Return whether the run's own model fails on the stored scene, with fresh
-    seeds.
+    """Return whether the run's own model fails on the stored scene, with fresh seeds.
+
+    With `over` the clean scene is rendered too, under the same conditions. Without it,
+    the first trial that is right decides.
     """
     start = problem.domain.start
     u = problem.domain.project(example.make_configuration(start))
@@ -383,12 +410,14 @@ def _is_wrong_on(
     for index in range(trials):
         seed = seeds.stream(problem.seed, "kept", index)
         judgements = []
-        for configuration in [u, start] if over else [u]:
+        configurations = [u, start] if over else [u]
+        for configuration in configurations:
             picture = problem.picture(configuration, seed, example.spp)
             full = problem.add_conditions(configuration, seed)
             judgements.append(problem.judge(picture, full))
         outcomes.append(evaluate_trial(*judgements))
-        if outcomes[-1] and not over:
+        is_right = outcomes[-1]
+        if is_right and not over:
             return False
     n_right = outcomes.count(True)
     n_wrong = outcomes.count(False)
@@ -564,14 +593,14 @@ def _read(path: Path) -> Counterexample:
     except InputError as error:
         raise errors.FileFormatError(f"{path}: settings: {error}") from None
     return Counterexample(
-        path.stem,
-        path,
-        config,
-        content.said,
-        content.files,
-        content.scene,
-        content.spp,
-        offsets,
+        name=path.stem,
+        path=path,
+        config=config,
+        wrong_label=content.said,
+        files=content.files,
+        scene_digest=content.scene,
+        spp=content.spp,
+        clean_offsets=offsets,
     )
 
 

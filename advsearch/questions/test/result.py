@@ -293,8 +293,15 @@ def describe_difference(
 def evaluate_search(
     summary: workbench.AttackSummary, config: AttackConfig
 ) -> tuple[str, str, Cause | None]:
-    """Return the verdict of a search, its reason, and the cause if it is not
-    finished.
+    """Return the verdict of a search, its reason, and the cause if it is not finished.
+
+    A claim fails if the clean scene is wrong already, or a wrong prediction is
+    verified. It is undecided if what was found is wrong in some trials only, or the
+    time ended the search; else it is held.
+
+    Args:
+        summary: of the search.
+        config: its settings, with the steps that were planned.
     """
     verified = summary.verified
     if summary.ending == "already wrong":

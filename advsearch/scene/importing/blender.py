@@ -76,9 +76,9 @@ def convert_blend(path: Path, data: bytes) -> bytes:
                 f"{program[0]}"
             ) from error
         if process.returncode or not target.is_file():
-            last = reading.last_line(process.stdout + process.stderr)
+            last_line = reading.get_last_line(process.stdout + process.stderr)
             raise errors.FileFormatError(
-                f"{path}: Blender could not read it{last}; export glTF (.glb) from it "
+                f"{path}: Blender could not read it{last_line}; export glTF (.glb) from it "
                 "yourself"
             )
         return reading.read_bytes(target, "object", (".glb",))

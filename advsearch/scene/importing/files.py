@@ -107,24 +107,24 @@ def find_advice(path: Path) -> str | None:
     suffix = path.suffix.lower()
     for kind, (operator, blender_suffixes) in BLENDER_IMPORTERS.items():
         if suffix in blender_suffixes:
-            return f"{kind}: {_blender_advice(path, operator)}"
+            return f"{kind}: {_make_blender_advice(path, operator)}"
     if suffix == ".bin":
         gltf_file = ""
         if path.parent.is_dir():
             names = sorted(other.name for other in path.parent.glob("*.gltf"))
             gltf_file = f", {names[0]}" if names else ""
         return f"a buffer, as a .gltf file has beside it: name that file{gltf_file}"
-    targets = {
+    output_files = {
         name: shlex.quote(f"{path.stem}.{name}") for name in ("obj", "stl", "glb")
     }
     for kind, (instructions, suffixes) in FORMAT_ADVICE.items():
         if suffix in suffixes:
-            text = instructions.format(file=shlex.quote(path.name), **targets)
+            text = instructions.format(file=shlex.quote(path.name), **output_files)
             return f"{kind}: {text}"
     return None
 
 
-def _blender_advice(path: Path, operator: str) -> str:
+def _make_blender_advice(path: Path, operator: str) -> str:
     """Return the command by which Blender converts a file to glTF."""
     target = json.dumps(f"{path.stem}.glb")
     script = (
@@ -180,7 +180,7 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
         _check_suffix(path, what, suffixes)
         data = stored_files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
-        hint = _missing_file_hint(path, suffixes)
+        hint = _make_missing_file_hint(path, suffixes)
         raise FileFormatError(
             f"{path}: no such {what} file.{hint} Check the path"
         ) from error
@@ -197,7 +197,11 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
 
 
 def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
-    """Raise FileFormatError for a directory, or a file with another suffix."""
+    """Raise FileFormatError for a directory, or a file with another suffix.
+
+    The message has advice: to leave out a `#part` that the kind of file cannot have, or
+    how to convert the file.
+    """
     if path.is_dir():
         raise FileFormatError(
             f"{path}: expected a file with an {what}, got a "
@@ -205,15 +209,15 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
         )
     if path.suffix.lower() in suffixes:
         return
-    file, _, part = str(path).rpartition("#")
-    if part and Path(file).suffix.lower() in suffixes:
+    file_part, _, part_name = str(path).rpartition("#")
+    if part_name and Path(file_part).suffix.lower() in suffixes:
         raise FileFormatError(
-            f"{file}: has no parts by name, got "
-            f"#{format_name(part, quoted=False)}; leave it out"
+            f"{file_part}: has no parts by name, got "
+            f"#{format_name(part_name, quoted=False)}; leave it out"
         )
     conversion = None
     if what != "environment":
-        conversion = find_advice(Path(file) if file else path)
+        conversion = find_advice(Path(file_part) if file_part else path)
     if conversion is not None:
         raise FileFormatError(f"{path}: {conversion} (read are {either(suffixes)})")
     got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
@@ -223,23 +227,24 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     )
 
 
-def _missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
+def _make_missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
     """Return a sentence that helps to find a missing file, with a blank before it."""
     hint = ""
     if not path.parent.is_dir():
         hint = f" The folder {path.parent} does not exist either."
+    # A folder that does not exist, or may not be read, has no similar names to offer.
     with suppress(OSError):
-        candidates = {
+        name_by_lower_case = {
             file.name.lower(): file.name
             for file in path.parent.iterdir()
             if file.suffix.lower() in suffixes
         }
         matches = difflib.get_close_matches(
-            path.name.lower(), sorted(candidates), n=3, cutoff=0.5
+            path.name.lower(), sorted(name_by_lower_case), n=3, cutoff=0.5
         )
         hint = ""
         if matches:
-            names = " or ".join(repr(candidates[match]) for match in matches)
+            names = " or ".join(repr(name_by_lower_case[match]) for match in matches)
             hint = f" Did you mean {names}?"
     return hint
 
@@ -316,7 +321,7 @@ def make_safe_name(path: Path) -> str:
 
 
 class UniqueNames:
-    """Makes names unique, and valid in a setting; names in `taken` are not given
+    """Makes names unique, and valid in a setting; names in `reserved` are not given
     out.
     """
 
@@ -328,11 +333,11 @@ class UniqueNames:
         """Return a name, with the first free number behind it if it is used already."""
         base = sanitize_name(requested)
         name = base
-        number = self._last.get(base, 1)
+        suffix_number = self._last.get(base, 1)
         while name in self._used:
-            number += 1
-            name = f"{base}-{number}"
-        self._last[base] = number
+            suffix_number += 1
+            name = f"{base}-{suffix_number}"
+        self._last[base] = suffix_number
         self._used.add(name)
         return name
 
@@ -356,9 +361,9 @@ class Notes:
     """Warnings about one file, the things in it that were not read, and its errors.
 
         notes = Notes("chair.ply")
-        notes.say("the alpha of 'wood.png' is left out")
-        notes.has("property", "confidence")
-        notes.take("property", "x")
+        notes.warn("the alpha of 'wood.png' is left out")
+        notes.record("property", "confidence")
+        notes.mark_read("property", "x")
         list(notes)   # [..., "chair.ply: property 'confidence' is left out"]
 
     A thing in a file is a kind (a word of the format: ``"property"``, ``"keyword"``)
@@ -412,7 +417,7 @@ class Notes:
                 yield f"{self.source}: {kind} {format_name(name)}{times} is left out"
 
 
-def last_line(output: str) -> str:
+def get_last_line(output: str) -> str:
     """Return the last line of a program's output after a colon, "" if there is none."""
     lines = [line for line in output.splitlines() if line.strip()]
     return f": {format_name(lines[-1].strip(), quoted=False)}" if lines else ""

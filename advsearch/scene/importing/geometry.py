@@ -41,7 +41,10 @@ normals to be used.
 
 @dataclass(frozen=True, eq=False)
 class Soup:
-    """Triangles with welded points and per-corner attributes."""
+    """Triangles with welded points and per-corner attributes.
+
+    P points, F faces; the corner k of face f is entry (f, k).
+    """
 
     points: Float64Array  # (P, 3), the largest extent 1
     faces: IntArray  # (F, 3) points
@@ -78,7 +81,7 @@ class Soup:
             self, **{name: getattr(self, name)[rows, order] for name in names}
         )
 
-    def face_vectors(self) -> Float64Array:
+    def compute_face_vectors(self) -> Float64Array:
         """Return face normals (F, 3), as long as twice the faces' areas."""
         return compute_area_vectors(self.points[self.faces])
 
@@ -86,7 +89,7 @@ class Soup:
 def compute_rotation(up: str, front: str) -> Float64Array:
     """Return the rotation (3, 3) from a file's axes to ours (front +x, up +z).
 
-    `up` is "y" or "z", `front` one of `FACINGS` along another axis.
+    `up` is "y" or "z", `front` one of `FRONT_AXES` along another axis.
     """
     front_axis = np.eye(3)["xyz".index(front[1])]
     front_axis = front_axis * (-1.0 if front[0] == "-" else 1.0)
@@ -99,6 +102,9 @@ def compute_rotation(up: str, front: str) -> Float64Array:
 def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -> Soup:
     """Join parts into one soup of unit extent with welded points.
 
+    The lowest corner of its box becomes the origin before it is turned. Vertices that
+    no face has count neither for the extent nor for the corner.
+
     Args:
         parts: at least one.
         source: name of the file, for messages.
@@ -109,21 +115,25 @@ def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -
     """
     vertices = np.concatenate([part.vertices for part in parts])
     _check_finite(vertices, source)
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    vertex_starts = np.cumsum([0] + [len(part.vertices) for part in parts])
     faces = np.concatenate(
-        [part.faces + start for part, start in zip(parts, starts[:-1], strict=True)]
+        [
+            part.faces + start
+            for part, start in zip(parts, vertex_starts[:-1], strict=True)
+        ]
     )
-    low = vertices[np.unique(faces)].min(axis=0)
-    size = compute_extent(parts)
-    if not 0.0 < size < np.inf:
+    lower_corner = vertices[np.unique(faces)].min(axis=0)
+    extent = compute_extent(parts)
+    if not 0.0 < extent < np.inf:
         problem = "its extent is too large to compute with"
-        if size == 0.0:
+        if extent == 0.0:
             problem = "all vertices coincide"
         raise InputError(
             f"{source}: expected an object with a size, got a mesh in "
             f"which {problem}; export it again"
         )
-    points, index = _weld((vertices - low) / size @ turn.T + 0.0)
+    # Adding 0 turns -0.0 into 0.0, so that both are one point.
+    points, point_of_vertex = _weld((vertices - lower_corner) / extent @ turn.T + 0.0)
     n_faces = [len(part.faces) for part in parts]
     normals = np.concatenate(
         [_gather_at_corners(part.normals, part.faces, 3) for part in parts]
@@ -135,7 +145,7 @@ def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -
     has_movable = any(part.movable is not None for part in parts)
     return Soup(
         points=points,
-        faces=index[faces],
+        faces=point_of_vertex[faces],
         part=np.arange(len(parts)).repeat(n_faces),
         normals=normalize_vectors(normals) @ turn.T,
         uvs=np.concatenate(
@@ -148,13 +158,14 @@ def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -
 
 
 def _check_finite(vertices: Float64Array, source: str) -> None:
+    """Raise InputError if vertices (V, 3) are NaN or infinite."""
     is_bad = ~np.isfinite(vertices).all(axis=1)
     if is_bad.any():
-        first = int(is_bad.argmax())
+        first_bad = int(is_bad.argmax())
         raise InputError(
             f"{source}: expected finite vertices, got {int(is_bad.sum())} of "
             f"{len(vertices)} with NaN or infinite"
-            f" coordinates (the first: {vertices[first].tolist()}); repair the mesh or "
+            f" coordinates (the first: {vertices[first_bad].tolist()}); repair the mesh or "
             "export it again"
         )
 
@@ -168,8 +179,8 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
     # Imported late, as in `parts`.
     from scipy.spatial import cKDTree
 
-    points, index = np.unique(vertices, axis=0, return_inverse=True)
-    index = index.reshape(-1)
+    points, point_of_vertex = np.unique(vertices, axis=0, return_inverse=True)
+    point_of_vertex = point_of_vertex.reshape(-1)
     pairs = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
     if len(pairs):
         cluster = find_components(len(points), pairs[:, 0], pairs[:, 1])
@@ -177,19 +188,20 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
             cluster, return_index=True, return_inverse=True
         )
         points = points[first_of_cluster]
-        index = cluster_of_point[index].astype(np.int64)
-    return points, index
+        point_of_vertex = cluster_of_point[point_of_vertex].astype(np.int64)
+    return points, point_of_vertex
 
 
 def compute_extent(parts: Sequence[ImportedPart]) -> float:
     """Return the largest extent of all faces along an axis, in the file's unit.
 
-    It is infinite beyond float64.
+    It is infinite beyond float64. Halves are subtracted, so that the difference itself
+    does not overflow.
     """
-    used = [part.vertices[np.unique(part.faces)] for part in parts]
-    low = np.min([points.min(axis=0) for points in used], axis=0)
-    high = np.max([points.max(axis=0) for points in used], axis=0)
-    return float((high / 2 - low / 2).max()) * 2
+    used_vertices = [part.vertices[np.unique(part.faces)] for part in parts]
+    lower = np.min([points.min(axis=0) for points in used_vertices], axis=0)
+    upper = np.max([points.max(axis=0) for points in used_vertices], axis=0)
+    return float((upper / 2 - lower / 2).max()) * 2
 
 
 def repair(soup: Soup, source: str, notes: Notes) -> Soup:
@@ -201,7 +213,9 @@ def repair(soup: Soup, source: str, notes: Notes) -> Soup:
     Raises:
         InputError: no face has an area; the message names the file, `source`.
     """
-    has_no_area = np.linalg.norm(soup.face_vectors(), axis=1) <= MIN_DOUBLED_AREA
+    has_no_area = (
+        np.linalg.norm(soup.compute_face_vectors(), axis=1) <= MIN_DOUBLED_AREA
+    )
     if has_no_area.all():
         raise InputError(
             f"{source}: expected faces with an area, got {len(has_no_area)} "
@@ -219,29 +233,36 @@ def assemble(soup: Soup) -> tuple[Mesh, IntArray | None]:
     Corners with the same point, normal and UV, and the same stored vertex if that is
     known, become one vertex.
     """
+    # Adding 0 turns -0.0 into 0.0, which has other bits.
     normals = (soup.normals.astype(np.float32) + np.float32(0.0)).reshape(-1, 3)
     uvs = (soup.uvs.astype(np.float32) + np.float32(0.0)).reshape(-1, 2)
     corners = soup.faces.reshape(-1)
     keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
     if soup.stored is not None:
         keys = np.column_stack([keys, soup.stored.reshape(-1)])
-    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    _, first_corner, vertex_of_corner = np.unique(
+        keys, axis=0, return_index=True, return_inverse=True
+    )
     mesh = Mesh(
-        vertices=soup.points[corners[first]].astype(np.float32),
-        faces=index.reshape(-1, 3).astype(np.uint32),
-        normals=normals[first],
-        uvs=uvs[first],
+        vertices=soup.points[corners[first_corner]].astype(np.float32),
+        faces=vertex_of_corner.reshape(-1, 3).astype(np.uint32),
+        normals=normals[first_corner],
+        uvs=uvs[first_corner],
     )
     if soup.stored is None:
         return mesh, None
-    return mesh, soup.stored.reshape(-1)[first]
+    return mesh, soup.stored.reshape(-1)[first_corner]
 
 
 # ---- Winding ----
 
 
 def _fix_winding(soup: Soup, notes: Notes) -> Soup:
-    """Return the soup with consistent and outward winding, and note the changes."""
+    """Return the soup with consistent and outward winding, and note the changes.
+
+    Faces wound against their neighbours are turned over first, then shells that are
+    inside out.
+    """
     is_turned, shell, has_moebius_strip = _find_turned_faces(soup)
     if is_turned.any():
         notes.warn(
@@ -266,30 +287,33 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """Find the edges that belong to exactly two faces (F, 3).
 
     Returns:
-        For each edge the corner in either face at which it starts (3 face + k); and
-        whether both faces run along it in the same direction, that is, disagree in
+        For each edge (E,) the corner in either face at which it starts (3 face + k);
+        and whether both faces run along it in the same direction, that is, disagree in
         winding.
     """
     start = faces.reshape(-1)
     end = np.roll(faces, -1, axis=1).reshape(-1)
     lower = np.minimum(start, end)
     upper = np.maximum(start, end)
+    # Sorted by their ends, the sides of faces that are one edge follow one another.
     order = np.lexsort((upper, lower))
     is_new_edge = np.concatenate(
         [[True], (np.diff(lower[order]) != 0) | (np.diff(upper[order]) != 0)]
     )
-    first = np.flatnonzero(is_new_edge)
-    edge_counts = np.diff(np.append(first, len(order)))
-    pairs = first[edge_counts == 2]
-    left = order[pairs]
-    right = order[pairs + 1]
-    return left, right, start[left] == start[right]
+    edge_entry = np.flatnonzero(is_new_edge)
+    edge_counts = np.diff(np.append(edge_entry, len(order)))
+    pair_entry = edge_entry[edge_counts == 2]
+    left_corner = order[pair_entry]
+    right_corner = order[pair_entry + 1]
+    return left_corner, right_corner, start[left_corner] == start[right_corner]
 
 
 def _link_windings(
     left_face: IntArray, right_face: IntArray, same_direction: BoolArray
 ) -> tuple[IntArray, IntArray]:
     """Return the links between the nodes "as it is" (2 f) and "turned" (2 f + 1).
+
+    Each edge has two links: between the nodes of its faces that agree with one another.
 
     Args:
         left_face: one face of each shared edge.
@@ -315,16 +339,20 @@ def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
         Which faces (F,) to turn over; the shell of each face (F,); and whether some
         shell is one-sided.
     """
-    left, right, same_direction = find_shared_edges(soup.faces)
-    area = np.linalg.norm(soup.face_vectors(), axis=1)
-    starts, ends = _link_windings(left // 3, right // 3, same_direction)
+    left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
+    area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
+    starts, ends = _link_windings(left_corner // 3, right_corner // 3, same_direction)
     component = find_components(2 * len(area), starts, ends)
     as_is = component[0::2]
     turned = component[1::2]
-    votes = np.bincount(as_is, weights=area, minlength=int(component.max()) + 1)
-    is_turned = (votes[turned] > votes[as_is]) | (
-        (votes[turned] == votes[as_is]) & (turned < as_is)
+    # Of two windings that have the same area, the one of the first face is left.
+    component_area = np.bincount(
+        as_is, weights=area, minlength=int(component.max()) + 1
     )
+    is_turned = (component_area[turned] > component_area[as_is]) | (
+        (component_area[turned] == component_area[as_is]) & (turned < as_is)
+    )
+    # A shell is one component, or two that are each other's reverse.
     _, shell = np.unique(np.minimum(as_is, turned), return_inverse=True)
     return is_turned, shell.astype(np.int64), bool((as_is == turned).any())
 
@@ -355,23 +383,26 @@ def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
 
     A closed shell, all of whose edges belong to exactly two of its faces, is turned if
     its signed volume is negative, unless it lies within another closed shell (then it
-    is the wall of a hollow) and the file's normals do not object. An open sheet is
-    turned if the file's normals point away from its front.
+    is the wall of a hollow) and the file's normals do not object. If most of the volume
+    is negative, the whole object counts as inside out: everything is turned, and the
+    rule holds for the result. An open sheet is turned if the file's normals point away
+    from its front.
 
     Args:
         soup: a soup whose neighbours agree in winding.
         shell: the shell of each face, (F,).
     """
     face_counts = np.bincount(shell)
-    vectors = soup.face_vectors()
+    vectors = soup.compute_face_vectors()
     n_shells = len(face_counts)
     is_closed = _find_closed_shells(soup, shell, face_counts)
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
-    toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
+    face_agreement = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(
+        axis=1
+    )
     # Agreement with the file's normals; 0 if it has none.
-    agreement = np.bincount(shell, weights=toward, minlength=n_shells)
+    agreement = np.bincount(shell, weights=face_agreement, minlength=n_shells)
     lower, upper = _compute_shell_bounds(soup, shell, n_shells)
-    # If so, the whole object is inside out, hollows included.
     mostly_negative = volume[is_closed].sum() < 0.0
     is_inverted = (volume < 0.0) ^ mostly_negative
     for index in np.flatnonzero(is_closed & is_inverted):
@@ -392,14 +423,20 @@ def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
 def _compute_signed_volumes(
     soup: Soup, shell: IntArray, vectors: Float64Array, face_counts: IntArray
 ) -> Float64Array:
-    """Return six times the signed volume of each shell, (S,)."""
+    """Return six times the signed volume of each shell, (S,).
+
+    It is the sum of tetrahedra from the shell's center to its faces, which is accurate
+    far from the origin too.
+    """
     corners = soup.points[soup.faces]
-    sums = [
+    coordinate_sums = [
         np.bincount(shell, weights=coordinate) for coordinate in corners.mean(axis=1).T
     ]
-    center = np.stack(sums, axis=1) / face_counts[:, None]
-    heights = ((corners[:, 0] - center[shell]) * vectors).sum(axis=1)
-    return np.asarray(np.bincount(shell, weights=heights, minlength=len(face_counts)))
+    center = np.stack(coordinate_sums, axis=1) / face_counts[:, None]
+    tetrahedra = ((corners[:, 0] - center[shell]) * vectors).sum(axis=1)
+    return np.asarray(
+        np.bincount(shell, weights=tetrahedra, minlength=len(face_counts))
+    )
 
 
 # ---- Normals ----
@@ -408,16 +445,19 @@ def _compute_signed_volumes(
 def _fix_normals(soup: Soup, notes: Notes) -> Soup:
     """Return the soup with a normal on the front of its face at every corner.
 
-    The file's normals are kept if they agree with the faces on most of the surface.
+    The file's normals are kept if they agree with the faces on most of the surface. If
+    they disagree on most of it they are all reversed; otherwise all are computed anew.
+    What is missing, or on the back of its face, is computed: smooth, or that of the
+    face where a part is flat.
     """
-    vectors = soup.face_vectors()
+    vectors = soup.compute_face_vectors()
     area = np.linalg.norm(vectors, axis=1)
     is_known = np.isfinite(soup.normals).all(axis=2)
     is_front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
     normals = soup.normals
     if is_known.any():
-        weight = np.where(is_known, area[:, None], 0.0)
-        front_fraction = float((weight * is_front).sum() / weight.sum())
+        known_area = np.where(is_known, area[:, None], 0.0)
+        front_fraction = float((known_area * is_front).sum() / known_area.sum())
         if front_fraction < 1.0 - MIN_NORMAL_AGREEMENT:
             notes.warn("its normals pointed inwards and were turned around")
             normals = -normals
@@ -441,24 +481,27 @@ def compute_smooth_normals(soup: Soup) -> Float64Array:
     than the crease angle share one normal: the mean of their normals weighted by their
     angles at that point (Thuermer and Wuethrich 1998).
     """
-    face_normals = normalize_vectors(soup.face_vectors())
-    left, right, same_direction = find_shared_edges(soup.faces)
-    cosine = (face_normals[left // 3] * face_normals[right // 3]).sum(axis=1)
-    is_smooth = cosine >= np.cos(np.radians(CREASE_DEGREES))
-    left = left[is_smooth & ~same_direction]
-    right = right[is_smooth & ~same_direction]
-    # At either end of the edge, a corner of one face meets a corner of the other.
-    starts = np.concatenate([left, _get_next_corner(left)])
-    ends = np.concatenate([_get_next_corner(right), right])
-    group = find_components(soup.faces.size, starts, ends)
-    weighted = face_normals[:, None] * _compute_corner_angles(soup)[:, :, None]
-    sums: Float64Array = np.stack(
-        [np.bincount(group, weighted[:, :, k].ravel()) for k in range(3)], axis=1
+    face_normals = normalize_vectors(soup.compute_face_vectors())
+    left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
+    cosine = (face_normals[left_corner // 3] * face_normals[right_corner // 3]).sum(
+        axis=1
     )
-    smooth = normalize_vectors(sums)[group].reshape(-1, 3, 3)
+    is_smooth = cosine >= np.cos(np.radians(CREASE_DEGREES))
+    left_corner = left_corner[is_smooth & ~same_direction]
+    right_corner = right_corner[is_smooth & ~same_direction]
+    # At either end of the edge, a corner of one face meets a corner of the other.
+    starts = np.concatenate([left_corner, _get_next_corner(left_corner)])
+    ends = np.concatenate([_get_next_corner(right_corner), right_corner])
+    smoothing_group = find_components(soup.faces.size, starts, ends)
+    weighted = face_normals[:, None] * _compute_corner_angles(soup)[:, :, None]
+    normal_sums: Float64Array = np.stack(
+        [np.bincount(smoothing_group, weighted[:, :, k].ravel()) for k in range(3)],
+        axis=1,
+    )
+    smooth_normals = normalize_vectors(normal_sums)[smoothing_group].reshape(-1, 3, 3)
     # False also for NaN, where normals cancel.
-    is_valid = (smooth * face_normals[:, None]).sum(axis=2, keepdims=True) > 0.0
-    return np.where(is_valid, smooth, face_normals[:, None])
+    is_valid = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True) > 0.0
+    return np.where(is_valid, smooth_normals, face_normals[:, None])
 
 
 def _get_next_corner(corner: IntArray) -> IntArray:
@@ -491,10 +534,13 @@ def normalize_vectors(vectors: Float64Array) -> Float64Array:
     Vectors without a direction become NaN.
     """
     with np.errstate(all="ignore"):
+        # First by the largest entry, so that squares neither overflow nor vanish.
         largest = np.abs(vectors).max(axis=-1, keepdims=True)
         scaled = vectors / largest
-        result = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
-    return np.where(np.isfinite(result).all(axis=-1, keepdims=True), result, np.nan)
+        unit_vectors = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return np.where(
+        np.isfinite(unit_vectors).all(axis=-1, keepdims=True), unit_vectors, np.nan
+    )
 
 
 def find_components(count: int, edge_starts: IntArray, edge_ends: IntArray) -> IntArray:
@@ -525,9 +571,11 @@ _MIN_AREA = 1e-9
 def triangulate_and_note(
     points: Float64Array, counts: IntArray, notes: Notes
 ) -> tuple[IntArray, IntArray]:
-    """Triangulate polygons, and note those that may be wrong.
+    """Triangulate polygons, and note those that may be wrong or have fewer than 3
+    corners.
 
-    Arguments and results are those of `triangulate`.
+    Arguments and results are those of `triangulate`, without the number of wrong
+    polygons.
     """
     n_degenerate = int((counts < 3).sum())
     if n_degenerate:
@@ -572,14 +620,17 @@ def triangulate(
             continue
         polygons = np.flatnonzero(counts == count)
         corners = starts[polygons, None] + np.arange(count)
-        cut, n_failed, used = _triangulate_equal(points, corners, budget)
-        budget = budget - used
+        equal_triangles, n_failed, n_compared = _triangulate_equal(
+            points, corners, budget
+        )
+        budget = budget - n_compared
         n_wrong = n_wrong + n_failed
-        triangles.append(cut.reshape(-1, 3))
+        triangles.append(equal_triangles.reshape(-1, 3))
         owners.append(np.repeat(polygons, count - 2))
     if not owners:
         return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), n_wrong
     owner = np.concatenate(owners)
+    # Polygons were taken by their number of corners; back to their own order.
     order = np.argsort(owner, kind="stable")
     return np.concatenate(triangles)[order], owner[order], n_wrong
 
@@ -599,32 +650,37 @@ def _triangulate_equal(
         number of comparisons made.
     """
     count = corners.shape[1]
-    first = corners[:, :1].repeat(count - 2, axis=1)
-    fans = np.stack([first, corners[:, 1:-1], corners[:, 2:]], axis=2)
+    fan_tips = corners[:, :1].repeat(count - 2, axis=1)
+    fans = np.stack([fan_tips, corners[:, 1:-1], corners[:, 2:]], axis=2)
     if count == 3:
         return fans, 0, 0
-    flat = _project_to_planes(points[corners])
-    areas = _compute_doubled_areas(flat[:, :1], flat[:, 1:-1], flat[:, 2:])
+    projected = _project_to_planes(points[corners])
+    areas = _compute_doubled_areas(
+        projected[:, :1], projected[:, 1:-1], projected[:, 2:]
+    )
     min_area = _MIN_AREA * np.abs(areas.sum(axis=1))[:, None]
     concave = np.flatnonzero((areas <= min_area).any(axis=1))
     if not len(concave):
         return fans, 0, 0
-    ears, n_failed, used = _cut_ears(flat[concave], budget)
-    rows = np.arange(len(concave))[:, None, None]
-    fans[concave] = corners[concave][rows, ears]
-    return fans, n_failed, used
+    ears, n_failed, n_compared = _cut_ears(projected[concave], budget)
+    # ears are (concave, n - 2, 3) positions in their polygon
+    polygon_rows = np.arange(len(concave))[:, None, None]
+    fans[concave] = corners[concave][polygon_rows, ears]
+    return fans, n_failed, n_compared
 
 
 def _project_to_planes(corners: Float64Array) -> Float64Array:
     """Project polygons (P, n, 3) to their planes, (P, n, 2).
 
-    They are counter-clockwise and about 1 large.
+    They are counter-clockwise and about 1 large. The plane is the one whose normal is
+    the sum of the cross products of successive corners (Newell).
     """
     corners = corners - corners.mean(axis=1, keepdims=True)
     sizes = np.abs(corners).max(axis=(1, 2), keepdims=True)
     corners = corners / np.maximum(sizes, 1e-300)
     normal = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    # the axis that is the least parallel to the normal
     other_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
     x_axis = np.cross(other_axis, normal)
     x_axis /= np.maximum(np.linalg.norm(x_axis, axis=1, keepdims=True), 1e-300)
@@ -645,6 +701,10 @@ class _EarCutter:
     """Polygons (P, n, 2) from which ears are cut off, all in parallel.
 
     Attributes:
+        flat: (P, n, 2) the corners.
+        dent: (P, d) the corners that are not convex, and could lie in an ear.
+        is_present: (P, d) which of these are dents, and are not cut off.
+        dent_points: (P, d, 2) where they are.
         triangles: (P, n - 2, 3), the corners of the ears that were cut off.
         n_cut: (P,) how many of them each polygon has so far.
         next_corner: (P, n), a linked list of the corners that are left.
@@ -658,6 +718,7 @@ class _EarCutter:
     """
 
     def __init__(self, flat: Float64Array) -> None:
+        """Start with all corners of all polygons, the first of which is tried first."""
         count, n_corners = flat.shape[:2]
         corner = np.arange(n_corners)
         self.flat = flat
@@ -668,6 +729,7 @@ class _EarCutter:
         self.tip = np.zeros(count, dtype=np.int64)
         self.n_tries = np.zeros(count, dtype=np.int64)
         self.is_failed = np.zeros(count, dtype=np.bool_)
+        # areas of the triangles from the origin to each side add up to the polygon's
         successors = np.roll(flat, -1, axis=1)
         doubled_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
         self.area = np.abs(doubled_areas.sum(axis=1))
@@ -695,7 +757,11 @@ class _EarCutter:
     def _decide_cuts(
         self, a: IntArray, b: IntArray, c: IntArray, budget: int
     ) -> BoolArray:
-        """Return which active polygons lose their corner b, between a and c."""
+        """Return which active polygons lose their corner b, between a and c.
+
+        These are ears, the last three corners, and, as failures, corners of polygons
+        that have no ear, and all corners once the budget is spent.
+        """
         active = self.active
         n_left = self.flat.shape[1] - self.n_cut[active]
         is_cut = n_left == 3
@@ -712,7 +778,7 @@ class _EarCutter:
         return np.asarray(is_cut | is_hopeless)
 
     def _cut(self, rows: IntArray, a: IntArray, b: IntArray, c: IntArray) -> None:
-        """Cut the ears a, b, c off the polygons in `rows`."""
+        """Cut the ears a, b, c off the polygons in `rows`; b is no corner any more."""
         self.triangles[rows, self.n_cut[rows]] = np.stack([a, b, c], axis=1)
         self.is_present[rows] &= self.dent[rows] != b[:, None]
         self.next_corner[rows, a] = c
@@ -746,10 +812,11 @@ def _cut_ears(flat: Float64Array, budget: int) -> tuple[IntArray, int, int]:
 def _find_dents(flat: Float64Array, area: Float64Array) -> tuple[IntArray, BoolArray]:
     """Find the corners of polygons (P, n, 2) that are not convex.
 
-    Only these can lie in an ear.
+    Only these can lie in an ear. `area` is twice the area of each polygon.
 
     Returns:
-        Corners (P, d), as many as any polygon has; and which are not convex.
+        Corners (P, d), d as many as any polygon has, those that are not convex first;
+        and which are not convex.
     """
     previous = np.roll(flat, 1, axis=1)
     following = np.roll(flat, -1, axis=1)
@@ -783,6 +850,7 @@ def _is_ear(
         x0, y0 = start[is_ear, :, None].swapaxes(0, 1)
         x1, y1 = end[is_ear, :, None].swapaxes(0, 1)
         is_inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
+        # A point at a corner of the triangle is not in it.
         is_inside &= (x != x0) | (y != y0)
     is_ear[is_ear] = ~is_inside.any(axis=1)
     return is_ear

@@ -95,14 +95,18 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
 
 def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
     """Return the error for the first entry of a header that is invalid."""
-    first = error.errors(include_url=False)[0]
-    keys = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in first["loc"])
+    first_error = error.errors(include_url=False)[0]
+    keys = (
+        f"[{key}]" if isinstance(key, int) else f".{key}" for key in first_error["loc"]
+    )
     location = "".join(keys).lstrip(".")
-    if first["type"] == "missing":
+    if first_error["type"] == "missing":
         return damaged(path, f"glTF with {location}", "nothing")
-    needed = first["msg"].removeprefix("Input should be ").removeprefix("Field ")
-    got = format_name(json.dumps(first["input"], default=str))
-    return damaged(path, f"glTF whose {location} is {needed}", got)
+    requirement = (
+        first_error["msg"].removeprefix("Input should be ").removeprefix("Field ")
+    )
+    got = format_name(json.dumps(first_error["input"], default=str))
+    return damaged(path, f"glTF whose {location} is {requirement}", got)
 
 
 def _find_extensions(path: Path, content: JsonValue) -> set[str]:
@@ -112,31 +116,36 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
         FileFormatError: some are no objects.
     """
     extensions: set[str] = set()
-    stack: list[JsonValue] = [content]
-    while stack:
-        entry = stack.pop()
+    pending: list[JsonValue] = [content]
+    while pending:
+        entry = pending.pop()
         if isinstance(entry, list):
-            stack.extend(entry)
+            pending.extend(entry)
         elif isinstance(entry, dict):
-            held = entry.get("extensions")
-            if held is None:
-                held = {}
-            are_objects = isinstance(held, dict) and all(
-                isinstance(held.get(name) or {}, dict) for name in SUPPORTED_EXTENSIONS
+            entry_extensions = entry.get("extensions")
+            if entry_extensions is None:
+                entry_extensions = {}
+            are_objects = isinstance(entry_extensions, dict) and all(
+                isinstance(entry_extensions.get(name) or {}, dict)
+                for name in SUPPORTED_EXTENSIONS
             )
-            if not isinstance(held, dict) or not are_objects:
+            if not isinstance(entry_extensions, dict) or not are_objects:
                 raise damaged(
                     path,
                     "glTF whose extensions are objects",
-                    format_name(json.dumps(held)),
+                    format_name(json.dumps(entry_extensions)),
                 )
-            extensions.update(held)
-            stack.extend(value for key, value in entry.items() if key != "extras")
+            extensions.update(entry_extensions)
+            pending.extend(value for key, value in entry.items() if key != "extras")
     return extensions
 
 
 def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the JSON of a file, and the binary chunk of a .glb file or None."""
+    """Return the JSON of a file, and the binary chunk of a .glb file or None.
+
+    A .glb has 12 bytes of header, then chunks with 8 bytes of header each (glTF 2.0,
+    section 4.4). Raises FileFormatError if it is shorter than it states.
+    """
     if path.suffix.lower() == ".gltf":
         return data, None
     has_magic = data.startswith(b"glTF")
@@ -225,14 +234,14 @@ def check_header(path: Path, header: Header) -> None:
         FileFormatError: the header needs an extension that is not supported, refers to
             what is not there, or is over a limit.
     """
-    needed = sorted(
+    unsupported = sorted(
         name
         for name in header.extensionsRequired
         if name not in SUPPORTED_EXTENSIONS
         and not name.startswith(_APPEARANCE_PREFIXES)
     )
-    if needed:
-        raise _make_unsupported_error(path, needed)
+    if unsupported:
+        raise _make_unsupported_error(path, unsupported)
     _check_references(path, header)
     accessor_sizes = (
         entry.count
@@ -274,7 +283,11 @@ def find_unread_extensions(entry: Entry) -> list[str]:
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
-    """Check the accessors of a primitive; raise FileFormatError if one is wrong."""
+    """Check the accessors of a primitive; raise FileFormatError if one is wrong.
+
+    Their types, that attributes have as many values as positions, and that indices are
+    unsigned integers. Numbers that only an unsupported extension has are an error too.
+    """
     accessors = {
         name: header.accessors[index] for name, index in primitive.attributes.items()
     }
@@ -299,12 +312,14 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
             raise damaged(path, expected, f"{accessor.count:,}")
     indices = None if primitive.indices is None else header.accessors[primitive.indices]
     unread = find_unread_extensions(primitive)
-    is_packed = unread and not any(map(is_splat_name, unread))
+    may_be_compressed = unread and not any(map(is_splat_name, unread))
     for values in (*accessors.values(), indices):
         has_no_data = (
             values is not None and values.bufferView is None and values.sparse is None
         )
-        if has_no_data and is_packed:  # an extension has the numbers, such as Draco's
+        if (
+            has_no_data and may_be_compressed
+        ):  # an extension has the numbers, such as Draco's
             raise _make_unsupported_error(path, unread)
     if indices is not None and indices.type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", indices.type)
@@ -313,12 +328,16 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
 
 
 def _check_tree(path: Path, header: Header) -> None:
-    """Check the number of triangles and primitives, and that nodes form trees."""
-    triangles = [
+    """Check the number of triangles and primitives, and that nodes form trees.
+
+    A mesh counts as often as nodes draw it. Nodes have one parent at most, no cycles,
+    and are at most `DEEPEST_TREE` deep. Raises FileFormatError.
+    """
+    triangles_of_mesh = [
         sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
         for mesh in header.meshes
     ]
-    primitives = [len(mesh.primitives) for mesh in header.meshes]
+    primitives_of_mesh = [len(mesh.primitives) for mesh in header.meshes]
     instanced_meshes = [node.mesh for node in header.nodes if node.mesh is not None]
     children: set[int] = set()
     for node in header.nodes:
@@ -328,12 +347,12 @@ def _check_tree(path: Path, header: Header) -> None:
                     path, "nodes with one parent each", f"two for node {child}"
                 )
             children.add(child)
-    n_instanced_triangles = sum(triangles[mesh] for mesh in instanced_meshes)
-    check_faces(path, max(n_instanced_triangles, sum(triangles)))
-    n_instanced = sum(primitives[mesh] for mesh in instanced_meshes)
+    n_instanced_triangles = sum(triangles_of_mesh[mesh] for mesh in instanced_meshes)
+    check_faces(path, max(n_instanced_triangles, sum(triangles_of_mesh)))
+    n_instanced = sum(primitives_of_mesh[mesh] for mesh in instanced_meshes)
     check_most(
         path,
-        max(n_instanced, sum(primitives), len(header.nodes)),
+        max(n_instanced, sum(primitives_of_mesh), len(header.nodes)),
         LARGEST_TREE,
         "glTF of at most {} nodes and pieces",
     )
@@ -350,7 +369,11 @@ def _check_tree(path: Path, header: Header) -> None:
 
 
 def _count_max_triangles(header: Header, primitive: Primitive) -> int:
-    """Return an upper bound of the number of triangles of a primitive."""
+    """Return an upper bound of the number of triangles of a primitive.
+
+    Triangles have three corners of their own (mode 4); strips and fans one for each
+    further corner.
+    """
     index = primitive.indices
     if index is None:
         index = primitive.attributes.get("POSITION")
@@ -375,6 +398,11 @@ class GltfFile:
 
     Data may be in other files, which `references` finds.
 
+    Attributes:
+        path: the file.
+        header: its checked header.
+        references: finds files beside it.
+
     Raises:
         FileFormatError: as `read_header`.
     """
@@ -385,7 +413,7 @@ class GltfFile:
         self.references = References(path)
         _, self._chunk = _split_chunks(path, data)
         self._buffers: dict[int, bytes] = {}
-        self._with_sparse: dict[int, npt.NDArray[Any]] = {}
+        self._sparse_filled: dict[int, npt.NDArray[Any]] = {}
 
     def load_uri(self, uri: str) -> bytes:
         """Return the content of a data URI, or of the file in the folder that it names.
@@ -419,14 +447,18 @@ class GltfFile:
         return memoryview(data)[view.byteOffset : end]
 
     def _load_buffer(self, index: int) -> bytes:
-        """Return the bytes of a buffer, which are loaded on first use."""
+        """Return the bytes of a buffer, which are loaded on first use.
+
+        They are those of its URI, or for the first buffer of a .glb file its binary
+        chunk. Raises FileFormatError if there are none.
+        """
         if index in self._buffers:
             return self._buffers[index]
         uri = self.header.buffers[index].uri
         try:
             if uri is not None:
                 data = self.load_uri(uri)
-            elif index == 0 and self._chunk is not None:
+            elif index == 0 and self._chunk is not None:  # of a .glb file
                 data = self._chunk
             else:
                 raise self._make_empty_buffer_error(index)
@@ -467,8 +499,8 @@ class GltfFile:
         Raises:
             FileFormatError: they reach beyond their view.
         """
-        if index in self._with_sparse:
-            return self._with_sparse[index]
+        if index in self._sparse_filled:
+            return self._sparse_filled[index]
         accessor = self.header.accessors[index]
         values = np.zeros(
             (accessor.count, accessor.width), _COMPONENT_TYPES[accessor.componentType]
@@ -491,26 +523,26 @@ class GltfFile:
             raise damaged(
                 self.path, f"at most {accessor.count:,} sparse values", f"{count:,}"
             )
-        rows = self._make_array(
+        sparse_rows = self._make_array(
             sparse_indices.bufferView,
             sparse_indices.byteOffset,
             (count, 1),
             np.dtype(_COMPONENT_TYPES[sparse_indices.componentType]),
         )[:, 0]
-        if rows.max() >= accessor.count:
+        if sparse_rows.max() >= accessor.count:
             raise damaged(
                 self.path,
                 f"sparse values at places under {accessor.count:,}",
-                f"{int(rows.max()):,}",
+                f"{int(sparse_rows.max()):,}",
             )
         values = np.array(values)
-        values[rows] = self._make_array(
+        values[sparse_rows] = self._make_array(
             sparse_values.bufferView,
             sparse_values.byteOffset,
             (count, accessor.width),
             values.dtype,
         )
-        self._with_sparse[index] = values
+        self._sparse_filled[index] = values
         return values
 
     def _make_array(
@@ -528,14 +560,14 @@ class GltfFile:
         """
         data = self.get_view(view)
         row_size = shape[1] * kind.itemsize
-        step = stride or row_size
-        end = offset + (shape[0] - 1) * step + row_size
+        row_stride = stride or row_size
+        end = offset + (shape[0] - 1) * row_stride + row_size
         if end > len(data):
             raise damaged(
                 self.path, f"a view of at least {end:,} bytes", f"{len(data):,}"
             )
         values: npt.NDArray[Any] = np.ndarray(
-            shape, kind, data, offset, (step, kind.itemsize)
+            shape, kind, data, offset, (row_stride, kind.itemsize)
         )
         return values
 

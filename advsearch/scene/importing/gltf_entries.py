@@ -99,7 +99,11 @@ class Entry(BaseModel):
         return keys_of_extension
 
     def iterate_references(self) -> Iterator[tuple[str, int]]:
-        """Yield a list of the header, and an index in it, for each reference."""
+        """Yield a list of the header, and an index in it, for each reference.
+
+        References are fields named in `REFERENCED_LISTS`: an index, or lists or
+        dictionaries of some.
+        """
         for name, value in vars(self).items():
             queue: list[Any] = [value] if name in REFERENCED_LISTS else []
             for item in queue:  # it grows
@@ -109,7 +113,7 @@ class Entry(BaseModel):
                     queue.extend(item.values() if isinstance(item, dict) else item)
 
 
-def _extension_field(*path: str, default: Any = None) -> Any:
+def _make_extension_field(*path: str, default: Any = None) -> Any:
     """Return a field whose value is in an extension of the entry."""
     return Field(default=default, validation_alias=AliasPath("extensions", *path))
 
@@ -187,7 +191,7 @@ class Node(Entry):
     camera: Index | None = None
     skin: Index | None = None
     # Index of the light of the node.
-    lamp: Index | None = _extension_field("KHR_lights_punctual", "light")
+    lamp: Index | None = _make_extension_field("KHR_lights_punctual", "light")
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
@@ -291,7 +295,7 @@ class TextureUse(Entry):
     texCoord: UvSetIndex = 0
     transform: Annotated[
         TextureTransform, BeforeValidator(lambda value: value or {})
-    ] = _extension_field("KHR_texture_transform", default=TextureTransform())
+    ] = _make_extension_field("KHR_texture_transform", default=TextureTransform())
     """Transform of the texture coordinates."""
 
     @property
@@ -352,10 +356,10 @@ class MaterialEntry(Entry):
     alphaCutoff: float = DEFAULT_ALPHA_CUTOFF
     doubleSided: Unread = None
     occlusionTexture: Unread = None
-    strength: Annotated[float, Field(ge=0.0)] = _extension_field(
+    strength: Annotated[float, Field(ge=0.0)] = _make_extension_field(
         "KHR_materials_emissive_strength", "emissiveStrength", default=1.0
     )
-    glossiness: SpecularGlossiness | None = _extension_field(
+    glossiness: SpecularGlossiness | None = _make_extension_field(
         "KHR_materials_pbrSpecularGlossiness"
     )
 
@@ -394,7 +398,7 @@ class MaterialEntry(Entry):
         )
 
     def can_read(self, use: TextureUse | None) -> bool:
-        """Return whether a texture has the coordinates of `layout`, or is None.
+        """Return whether a texture has the coordinates of `layout_texture`, or is None.
 
         Others are left out.
         """
@@ -428,7 +432,7 @@ class Sampler(Entry):
 class Texture(Entry):
     source: Index | None = None
     sampler: Index | None = None
-    webp: Index | None = _extension_field("EXT_texture_webp", "source")
+    webp: Index | None = _make_extension_field("EXT_texture_webp", "source")
 
     @property
     def image(self) -> int | None:
@@ -460,14 +464,14 @@ class Header(Entry):
     cameras: List[CameraEntry] = []
     skins: List[Skin] = []
     animations: List[Animation] = []
-    vrm: dict[str, HumanBone] = _extension_field(
+    vrm: dict[str, HumanBone] = _make_extension_field(
         "VRMC_vrm", "humanoid", "humanBones", default={}
     )
     """The bones of a person by the names of VRM 1."""
-    vrm_0: List[HumanBone] = _extension_field(
+    vrm_0: List[HumanBone] = _make_extension_field(
         "VRM", "humanoid", "humanBones", default=[]
     )
-    lights: List[LightEntry] = _extension_field(
+    lights: List[LightEntry] = _make_extension_field(
         "KHR_lights_punctual", "lights", default=[]
     )
     """The lights that nodes may carry."""

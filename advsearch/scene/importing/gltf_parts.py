@@ -87,7 +87,9 @@ DIRECTIONAL_LIGHT_DISTANCE = 1000.0  # distance of a directional light, in objec
 def note_left_out(header: Header, notes: Notes) -> None:
     """Note what a file has that is not imported.
 
-    It is the same whether one node of the file or all of it is the object.
+    These are sentences of the converter from OpenUSD, extensions, and then maps,
+    materials, scenes, nodes and keys that are not read. It is the same whether one node
+    of the file or all of it is the object.
     """
     is_converted = header.asset.generator == GENERATOR
     if is_converted and isinstance(header.asset.extras, dict):
@@ -99,21 +101,24 @@ def note_left_out(header: Header, notes: Notes) -> None:
                     str(sentence), quoted=False, max_length=MAX_SENTENCE_LENGTH
                 )
             )
-    used = {*header.extensionsUsed, *header.extensionsRequired}
-    if any(map(is_splat_name, used)):
+    used_extensions = {*header.extensionsUsed, *header.extensionsRequired}
+    if any(map(is_splat_name, used_extensions)):
         notes.warn(
             f" has Gaussian splats, which are left out: a model that {SPLATS_ADVICE}"
         )
-    for name in sorted(used & set(EXTENSION_NOTES) | used - set(SUPPORTED_EXTENSIONS)):
+    for name in sorted(
+        used_extensions & set(EXTENSION_NOTES)
+        | used_extensions - set(SUPPORTED_EXTENSIONS)
+    ):
         if not is_splat_name(name):
             sentence = EXTENSION_NOTES.get(name, UNKNOWN_EXTENSION_NOTE)
             notes.warn(sentence.format(name=format_name(name, quoted=False)))
     roots: Iterable[int] = range(len(header.nodes))
     if header.scenes:
         roots = header.scenes[header.scene or 0].nodes
-    in_scene = header.find_descendants(roots)
+    scene_nodes = header.find_descendants(roots)
     materials = header.materials
-    kinds = {
+    counted_phrases = {
         "occlusion map{s}: left out": (
             material.occlusionTexture is not None for material in materials
         ),
@@ -133,10 +138,10 @@ def note_left_out(header: Header, notes: Notes) -> None:
         "node{s} with a mesh outside of its scene: left out": (
             node.mesh is not None
             for index, node in enumerate(header.nodes)
-            if index not in in_scene
+            if index not in scene_nodes
         ),
     }
-    for sentence in _count_phrases(kinds):
+    for sentence in _count_phrases(counted_phrases):
         notes.warn(sentence)
     _note_unread(header, notes)
 
@@ -164,7 +169,11 @@ them.
 
 
 def _note_unread(header: Header, notes: Notes) -> None:
-    """Note the keys of entries, and the attributes of primitives, that are not read."""
+    """Note the keys of entries, and the attributes of primitives, that are not read.
+
+    Extensions that are understood have their own keys; others are noted elsewhere, by
+    their names.
+    """
     for entry in header.iterate_entries():
         kind = ENTRY_KINDS.get(type(entry).__name__)
         if kind is None:
@@ -193,16 +202,16 @@ def _note_unread(header: Header, notes: Notes) -> None:
 
 def _note_unread_attributes(header: Header, primitive: Primitive, notes: Notes) -> None:
     """Note the vertex attributes of a primitive that are not read."""
-    read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0"}
+    read_names = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0"}
     if primitive.material is not None:
         material = header.materials[primitive.material]
-        read.add(material.uv_attribute)
-        packed = material.surface.metallicRoughnessTexture
-        if packed is not None:
-            read.add(packed.uv_attribute)
+        read_names.add(material.uv_attribute)
+        roughness_texture = material.surface.metallicRoughnessTexture
+        if roughness_texture is not None:
+            read_names.add(roughness_texture.uv_attribute)
     for name in primitive.attributes:
         is_of_skin = header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))
-        if name not in read and not is_of_skin and not is_splat_name(name):
+        if name not in read_names and not is_of_skin and not is_splat_name(name):
             notes.record("attribute", name)
 
 
@@ -214,12 +223,12 @@ def describe_left_out(header: Header, file: str) -> list[str]:
     """
     has_light = [node.lamp is not None for node in header.nodes]
     has_camera = [node.camera is not None for node in header.nodes]
-    counts = _count_phrases({"light{s}": has_light, "camera{s}": has_camera})
-    if not counts:
+    phrases = _count_phrases({"light{s}": has_light, "camera{s}": has_camera})
+    if not phrases:
         return []
     verb = "is" if sum(has_light) + sum(has_camera) == 1 else "are"
     advice = "name one node as the object, FILE#NODE, to keep the rest around it"
-    return [f"{file}: {' and '.join(counts)} {verb} left out of the object; {advice}"]
+    return [f"{file}: {' and '.join(phrases)} {verb} left out of the object; {advice}"]
 
 
 def describe_changed_lights(header: Header, file: str) -> list[str]:
@@ -229,14 +238,15 @@ def describe_changed_lights(header: Header, file: str) -> list[str]:
         f"{DIRECTIONAL_LIGHT_DISTANCE:g} object sizes away"
     )
     ranged = "light{s} with a range, which is left out: light reaches beyond it"
-    kinds = {
+    # Each phrase is counted over the lights or cameras for which it holds.
+    phrases = {
         directional: (light.type == "directional" for light in header.lights),
         ranged: (light.range is not None for light in header.lights),
         "camera{s} without perspective: left out": (
             camera.perspective is None for camera in header.cameras
         ),
     }
-    return [f"{file}: {sentence}" for sentence in _count_phrases(kinds)]
+    return [f"{file}: {sentence}" for sentence in _count_phrases(phrases)]
 
 
 def _count_phrases(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
@@ -249,11 +259,16 @@ def _count_phrases(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
     phrases = []
     for phrase, is_of_kind in kinds.items():
         count = sum(is_of_kind)
-        if count == 1:
-            phrases.append(f"{count} {phrase.format(s='', es='')}")
-        elif count:
-            phrases.append(f"{count} {phrase.format(s='s', es='es')}")
+        if count:
+            phrases.append(_format_count(count, phrase))
     return phrases
+
+
+def _format_count(count: int, phrase: str) -> str:
+    """Return a count and a phrase, whose {s} and {es} are endings of the plural."""
+    if count == 1:
+        return f"{count} {phrase.format(s='', es='')}"
+    return f"{count} {phrase.format(s='s', es='es')}"
 
 
 # How far texture coordinates may lie outside [0, 1] before the wrap mode matters.
@@ -283,7 +298,7 @@ class GltfSurfaces:
 
     def __post_init__(self) -> None:
         materials = len(self.file.header.materials)
-        self._pictures = FileImages(
+        self._images = FileImages(
             materials, self.file.references, self.notes, self.texture_limit
         )
 
@@ -298,8 +313,8 @@ class GltfSurfaces:
                 format has them.
 
         Returns:
-            The surface; and the scale (2,) and the shift (2,), applied after it, that
-            fit texture coordinates to its images.
+            The surface; and the scale (2,) and the shift (2,), added after scaling,
+            that fit texture coordinates to its images.
         """
         material = MaterialEntry()
         name = ""
@@ -309,13 +324,13 @@ class GltfSurfaces:
         color, texture = self._make_base_color(material)
         roughness, metallic = self._compute_roughness_and_metallic(material, pieces)
         surface = ImportedSurface(
-            color,
-            texture,
-            clip_to_unit(roughness),
-            clip_to_unit(metallic),
-            self._make_normal_map(material),
-            self._make_emission(material),
-            name,
+            color=color,
+            texture=texture,
+            roughness=clip_to_unit(roughness),
+            metallic=clip_to_unit(metallic),
+            normal_map=self._make_normal_map(material),
+            emission=self._make_emission(material),
+            name=name,
         )
         uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
         return self._fit_images(surface, material, uvs)
@@ -323,7 +338,12 @@ class GltfSurfaces:
     def _make_base_color(
         self, material: MaterialEntry
     ) -> tuple[Float32Array | None, Float32Array | None]:
-        """Return the base color (3 or 4,) and its texture (H, W, 3 or 4), in sRGB."""
+        """Return the base color (3 or 4,) and its texture (H, W, 3 or 4), in sRGB.
+
+        The factor multiplies the texture; opacity counts only in the modes that have
+        some. The color is None if it is plain white and there is a texture, even one
+        that is missing.
+        """
         entry = material.surface
         stated_factor = entry.baseColorFactor
         if stated_factor is None:
@@ -332,9 +352,12 @@ class GltfSurfaces:
         color_factor = factor[:3]
         has_alpha = material.alphaMode in TRANSPARENT_MODES
         color = linear_to_srgb(color_factor)
+        image_kind: ImageKind = "colours"
+        if has_alpha:
+            image_kind = "colours and alpha"
         texture = self._load_image(
             entry.baseColorTexture,
-            "colours and alpha" if has_alpha else "colours",
+            image_kind,
             f" names the texture {{name}}, which {{why}}; {describe_substitute(color)} "
             "is used instead",
         )
@@ -399,18 +422,22 @@ class GltfSurfaces:
         self.notes.warn(
             "textures of roughness and metallic are replaced by their means"
         )
-        mapped = [
+        mapped_parts = [
             (piece.part, piece.packed_uvs)
             for piece in pieces
             if piece.packed_uvs is not None
         ]
         mean = np.asarray(image.mean(axis=(0, 1), dtype=np.float64), np.float32)
-        if mapped:
+        if mapped_parts:
             corner_uvs = np.concatenate(
-                [uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped]
+                # v points up in an image that is averaged, and down in a file.
+                [
+                    uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0]
+                    for part, uvs in mapped_parts
+                ]
             )
             vectors = compute_area_vectors(
-                np.concatenate([part.vertices[part.faces] for part, _ in mapped])
+                np.concatenate([part.vertices[part.faces] for part, _ in mapped_parts])
             )
             mean = average_over_faces(
                 image, corner_uvs, np.linalg.norm(vectors, axis=1)
@@ -423,13 +450,15 @@ class GltfSurfaces:
     ) -> Float32Array | None:
         """Return the texels (H, W, C) of a texture; None, and a note, if it has none.
 
-        A texture that is not to be filtered is enlarged by repeating its texels.
+        `words` is the note, with `{name}` for the image and `{why}` for the reason. Of
+        a texture that is not to be filtered each texel is repeated, so that filtering
+        is not visible; a large one is filtered, with a note.
         """
         if use is None:
             return None
         image_index = self.file.header.textures[use.index].image
         if image_index is None:
-            self._pictures.note_missing(
+            self._images.note_missing(
                 "(embedded)", "has a picture of a kind that is not understood", words
             )
             return None
@@ -444,21 +473,22 @@ class GltfSurfaces:
                 return b""
             return bytes(self.file.get_view(entry.bufferView))
 
-        texels = self._pictures.load(
+        texels = self._images.load(
             (entry.uri, entry.bufferView), load_content, kind, name, words
         )
         is_sharp = self._get_sampler(use).magFilter == gltf_entries.NEAREST
         if texels is None or not is_sharp or texels.shape[:2] == (1, 1):
             return texels
         # At this size, filtering is not visible.
-        sharp_size = min(self._pictures.max_side, TEXTURE_LIMIT) // 2
-        repeats = sharp_size // max(texels.shape[:2])
+        max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
+        repeats = max_sharp_size // max(texels.shape[:2])
         if repeats < 2:
-            self.notes.warn(BLURRED_NOTE.format(most=sharp_size // 2))
+            self.notes.warn(BLURRED_NOTE.format(most=max_sharp_size // 2))
             return texels
         return texels.repeat(repeats, axis=0).repeat(repeats, axis=1)
 
     def _get_sampler(self, use: TextureUse) -> Sampler:
+        """Return the sampler of a texture, which has defaults if the file states none."""
         sampler_index = self.file.header.textures[use.index].sampler
         if sampler_index is None:
             return Sampler()
@@ -478,22 +508,22 @@ class GltfSurfaces:
         Returns:
             The surface, and the scale (2,) and shift (2,) of texture coordinates.
         """
-        coordinates = np.concatenate([*uvs, np.zeros((0, 2))])
+        all_uvs = np.concatenate([*uvs, np.zeros((0, 2))])
         scale = np.ones(2)
         shift = np.zeros(2)
         # The texture whose coordinates the mesh has is first.
-        uses = (
+        texture_uses = (
             material.surface.baseColorTexture,
             material.normalTexture,
             material.emissiveTexture,
         )
         samplers = [
             self._get_sampler(use)
-            for use in uses
+            for use in texture_uses
             if use is not None and material.can_read(use)
         ]
         images = list(surface.images)
-        if not images or not len(coordinates) or not np.isfinite(coordinates).all():
+        if not images or not len(all_uvs) or not np.isfinite(all_uvs).all():
             return surface, scale, shift
         normals_index = None
         if surface.normal_map is not None:
@@ -504,8 +534,8 @@ class GltfSurfaces:
         )
         for axis, wraps in enumerate(wraps_by_axis):
             bounds = (
-                float(coordinates[:, axis].min()),
-                float(coordinates[:, axis].max()),
+                float(all_uvs[:, axis].min()),
+                float(all_uvs[:, axis].max()),
             )
             images, scale[axis], shift[axis] = self._fit_axis(
                 images, 1 - axis, wraps, bounds, normals_index
@@ -522,6 +552,11 @@ class GltfSurfaces:
     ) -> tuple[list[Float32Array], float, float]:
         """Fit images (H, W, C) along one axis to the wrap mode of the first of them.
 
+        Repeated images stay. Mirrored ones are doubled if texture coordinates reach
+        outside [0, 1]. Clamped ones and those with a border are padded, and so are
+        mirrored ones inside [0, 1], if coordinates reach outside or opposite edges
+        would blend visibly.
+
         Args:
             images: the images of a surface.
             axis: axis of their arrays, 0 for rows.
@@ -534,25 +569,25 @@ class GltfSurfaces:
         """
         reaches_out = bounds[0] < -WRAP_TOLERANCE or bounds[1] > 1.0 + WRAP_TOLERANCE
         edges_differ = any(_edges_differ(image, axis) for image in images)
-        wrap = wraps[0]
+        first_wrap = wraps[0]
         if reaches_out and len(set(wraps)) > 1:
             self.notes.warn(EDGES_NOTE)
-        if wrap == gltf_entries.BORDER and reaches_out:
+        if first_wrap == gltf_entries.BORDER and reaches_out:
             images = [_enlarge(image, axis) for image in images]
-        if wrap == gltf_entries.MIRRORED and reaches_out:
+        if first_wrap == gltf_entries.MIRRORED and reaches_out:
             mirrored = [
                 np.concatenate([image, np.flip(image, axis)], axis=axis)
                 for image in images
             ]
             return mirrored, 0.5, 0.0
-        is_padded = wrap in (
+        is_padded = first_wrap in (
             gltf_entries.CLAMPED,
             gltf_entries.BORDER,
             gltf_entries.MIRRORED,
         )
         if not is_padded or not (reaches_out or edges_differ):
             return images, 1.0, 0.0
-        has_border = wrap == gltf_entries.BORDER and reaches_out
+        has_border = first_wrap == gltf_entries.BORDER and reaches_out
         return self._pad_images(images, axis, bounds, normals_index, has_border)
 
     def _pad_images(
@@ -565,17 +600,19 @@ class GltfSurfaces:
     ) -> tuple[list[Float32Array], float, float]:
         """Pad images along an axis as far as texture coordinates reach.
 
-        Arguments and result are those of `_fit_axis`; `has_border` is whether pads are
-        black (flat in a normal map), and otherwise repeat the edge.
+        Images that would become too large stay as they are, with a note. Arguments and
+        result are those of `_fit_axis`; `has_border` is whether pads are black (flat in
+        a normal map), and otherwise repeat the edge.
         """
-        low, high = bounds
+        min_uv, max_uv = bounds
         sizes = [image.shape[axis] for image in images]
-        # A pad is an integer number of texels in every image.
+        # A pad is an integer number of units, each as many texels in every image: the
+        # images have `unit_size` units.
         unit_size = int(np.gcd.reduce(sizes))
-        before = max(0, int(np.ceil(-low * unit_size))) + 1
-        after = max(0, int(np.ceil((high - 1.0) * unit_size))) + 1
-        total = unit_size + before + after
-        if total * (max(sizes) // unit_size) > 2 * self._pictures.max_side:
+        units_before = max(0, int(np.ceil(-min_uv * unit_size))) + 1
+        units_after = max(0, int(np.ceil((max_uv - 1.0) * unit_size))) + 1
+        total_units = unit_size + units_before + units_after
+        if total_units * (max(sizes) // unit_size) > 2 * self._images.max_side:
             self.notes.warn(EDGES_NOTE)
             return images, 1.0, 0.0
         padded = []
@@ -590,12 +627,12 @@ class GltfSurfaces:
                 _pad(
                     image,
                     axis,
-                    before * texels_per_unit,
-                    after * texels_per_unit,
+                    units_before * texels_per_unit,
+                    units_after * texels_per_unit,
                     border,
                 )
             )
-        return padded, unit_size / total, before / total
+        return padded, unit_size / total_units, units_before / total_units
 
 
 def _edges_differ(image: Float32Array, axis: int) -> bool:
@@ -616,10 +653,10 @@ def _pad(
     The pad has the value `border`, or repeats the texel at the edge if that is None.
     """
     size = image.shape[axis]
-    texels = np.clip(np.arange(-before, size + after), 0, size - 1)
-    padded = np.take(image, texels, axis)
+    texel_index = np.clip(np.arange(-before, size + after), 0, size - 1)
+    padded = np.take(image, texel_index, axis)
     if border is not None:
-        position = np.arange(len(texels))
+        position = np.arange(len(texel_index))
         is_outside = (position < before) | (position >= before + size)
         along_axis = np.moveaxis(padded, axis, 0)  # a view
         along_axis[is_outside] = border
@@ -633,10 +670,10 @@ def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
     At that size a border of one texel is not visible.
     """
     size = picture.shape[axis]
-    times = -(-SMALL_IMAGE_SIZE // size)
-    if times == 1:
+    factor = -(-SMALL_IMAGE_SIZE // size)
+    if factor == 1:
         return picture
-    position = ((np.arange(size * times) + 0.5) / times - 0.5).clip(0.0, size - 1.0)
+    position = ((np.arange(size * factor) + 0.5) / factor - 0.5).clip(0.0, size - 1.0)
     lower = np.floor(position).astype(np.int64)
     shape = [1] * picture.ndim
     shape[axis] = -1
@@ -663,13 +700,16 @@ DEFAULT_MATERIAL_NOTE = (
 
 
 def _list_instances(header: Header) -> list[tuple[int, int, Float64Array]]:
-    """Return node, mesh and pose of everything that is drawn, in order of the nodes."""
+    """Return node, mesh and pose (4, 4) of everything that is drawn, in order of the
+    nodes.
+    """
     poses = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
-    return [
-        (node, mesh, pose)
-        for node, pose in poses
-        if (mesh := header.nodes[node].mesh) is not None
-    ]
+    instances = []
+    for node, pose in poses:
+        mesh = header.nodes[node].mesh
+        if mesh is not None:
+            instances.append((node, mesh, pose))
+    return instances
 
 
 def _select_with_faces(
@@ -721,7 +761,10 @@ SkinPose = tuple[IntArray, Float64Array, Float64Array]
 def _read_pieces(
     file: GltfFile, mesh_nodes: Sequence[int]
 ) -> dict[tuple[int, int], PrimitiveData | None]:
-    """Read the primitives that some nodes draw, by mesh and index in the mesh."""
+    """Read the primitives that some nodes draw, by mesh and index in the mesh.
+
+    None is a primitive that is not made of faces.
+    """
     header = file.header
     meshes = dict.fromkeys(header.nodes[node].mesh for node in mesh_nodes)
     skinned_meshes = {
@@ -761,7 +804,12 @@ def _note_pieces(
     with_faces: Mapping[tuple[int, int], PrimitiveData],
     notes: Notes,
 ) -> None:
-    """Note primitives without faces or material, and with transparent vertices."""
+    """Note primitives without faces or material, and with transparent vertices.
+
+    `keys` are all primitives: indices of the mesh, and of the primitive in it. Those of
+    them with faces are in `with_faces`. The faceless ones of Gaussian splats are noted
+    elsewhere.
+    """
     primitives = [header.meshes[mesh].primitives[index] for mesh, index in keys]
     n_splats = sum(
         any(map(is_splat_name, find_unread_extensions(primitive)))
@@ -772,22 +820,26 @@ def _note_pieces(
         notes.warn(
             f"{n_without_faces} parts without faces (points, lines) are left out"
         )
-    transparent = {
+    transparent_meshes = {
         mesh for (mesh, _), piece in with_faces.items() if piece.has_transparent_colors
     }
-    bare = {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}
-    kinds = {
-        TRANSPARENT_COLORS_NOTE: [True] * len(transparent),
-        DEFAULT_MATERIAL_NOTE: [True] * len(bare),
+    meshes_without_material = {
+        mesh for (mesh, _), piece in with_faces.items() if piece.material is None
     }
-    for sentence in _count_phrases(kinds):
-        notes.warn(sentence)
+    if transparent_meshes:
+        notes.warn(_format_count(len(transparent_meshes), TRANSPARENT_COLORS_NOTE))
+    if meshes_without_material:
+        notes.warn(_format_count(len(meshes_without_material), DEFAULT_MATERIAL_NOTE))
 
 
 def _make_parts(
     surfaces: GltfSurfaces, with_faces: Mapping[tuple[int, int], PrimitiveData]
 ) -> dict[tuple[int, int], ImportedPart]:
-    """Return the parts of pieces with their surfaces and final UVs."""
+    """Return the parts of pieces with their surfaces and final UVs.
+
+    Keys are mesh and index of the primitive in it. Pieces with the same material share
+    one surface.
+    """
     groups = dict[int | None, dict[tuple[int, int], PrimitiveData]]()
     for key, piece in with_faces.items():
         groups.setdefault(piece.material, {})[key] = piece
@@ -804,7 +856,7 @@ def _make_parts(
 
 
 def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose]:
-    """Return the skins of some nodes by index."""
+    """Return the skins of some nodes, in the pose of the scene, by index."""
     header = file.header
     # Joints may be outside of the scene that is shown.
     all_poses = dict(
@@ -822,6 +874,7 @@ def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose
 
 
 def _note_skeleton(skeleton: Skeleton, notes: Notes) -> None:
+    """Note that a skeleton is shown at rest, and the first five clips that move it."""
     names = [clip.name for clip in skeleton.clips]
     clips = ""
     if names:
@@ -877,28 +930,32 @@ def _make_movable(
     skin: SkinPose | None,
     skeleton: Skeleton,
 ) -> ImportedPart:
-    """Return a part with its morph targets at rest, and with what moves it."""
+    """Return a part with its morph targets at rest, and with what moves it.
+
+    `piece` is the data of the part, which `node` draws, perhaps with a skin.
+    """
     # Without a skin, all vertices are bound to the node itself.
     joints = np.zeros((len(part.vertices), 1), np.int64)
-    bound = gltf_skeleton.VertexJoints(joints, np.ones(joints.shape))
-    nodes = np.array([node])
+    vertex_joints = gltf_skeleton.VertexJoints(joints, np.ones(joints.shape))
+    joint_nodes = np.array([node])
     inverse_binds = np.eye(4)[None]
     if skin is not None and piece.vertex_joints is not None:
-        bound = piece.vertex_joints
-        nodes, inverse_binds, _ = skin
-    rest = gltf_skeleton.read_rest_weights(file, node, len(piece.targets))
+        vertex_joints = piece.vertex_joints
+        joint_nodes, inverse_binds, _ = skin
+    rest_weights = gltf_skeleton.read_rest_weights(file, node, len(piece.targets))
     movable = Movable(
-        skeleton,
-        node,
-        part.vertices,
-        nodes,
-        inverse_binds,
-        *bound,
-        piece.targets,
-        rest,
+        skeleton=skeleton,
+        node=node,
+        vertices=part.vertices,
+        nodes=joint_nodes,
+        inverse_binds=inverse_binds,
+        joints=vertex_joints.joints,
+        weights=vertex_joints.weights,
+        targets=piece.targets,
+        rest_weights=rest_weights,
     )
     morphed = gltf_skeleton.apply_targets(
-        part, piece.targets, piece.normal_offsets, rest
+        part, piece.targets, piece.normal_offsets, rest_weights
     )
     return replace(morphed, movable=movable)
 
@@ -949,43 +1006,61 @@ def read_primitive(
     attributes = primitive.attributes
     if primitive.mode < TRIANGLES or "POSITION" not in attributes:
         return None
-    used, faces = _used_vertices(file, primitive)
-    positions = file.read_numbers(attributes["POSITION"], used)
+    used_vertices, faces = _find_used_vertices(file, primitive)
+    positions = file.read_numbers(attributes["POSITION"], used_vertices)
     material = MaterialEntry()
     if primitive.material is not None:
         material = file.header.materials[primitive.material]
-    uvs = _read_texture_coordinates(file, attributes, material.layout_texture, used)
+    uvs = _read_texture_coordinates(
+        file, attributes, material.layout_texture, used_vertices
+    )
     packed_uvs = None
-    if (packed := material.surface.metallicRoughnessTexture) is not None:
-        packed_uvs = _read_texture_coordinates(file, attributes, packed, used)
-    colors, has_alpha = _read_vertex_colors(file, attributes, used, faces)
-    see_through = material.alphaMode in TRANSPARENT_MODES and has_alpha
+    roughness_texture = material.surface.metallicRoughnessTexture
+    if roughness_texture is not None:
+        packed_uvs = _read_texture_coordinates(
+            file, attributes, roughness_texture, used_vertices
+        )
+    colors, has_alpha = _read_vertex_colors(file, attributes, used_vertices, faces)
+    has_transparent_colors = material.alphaMode in TRANSPARENT_MODES and has_alpha
     normals = None
     if "NORMAL" in attributes:
-        normals = file.read_numbers(attributes["NORMAL"], used)
+        normals = file.read_numbers(attributes["NORMAL"], used_vertices)
     part = ImportedPart(
-        positions, faces, normals, uvs, colors, ImportedSurface(), flat=True
+        vertices=positions,
+        faces=faces,
+        normals=normals,
+        uvs=uvs,
+        colors=colors,
+        surface=ImportedSurface(),
+        flat=True,
     )
     vertex_joints = None
     if is_skinned:
-        vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used)
-    targets, turns = gltf_skeleton.read_targets(file, primitive, used, extras)
+        vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used_vertices)
+    targets, normal_offsets = gltf_skeleton.read_targets(
+        file, primitive, used_vertices, extras
+    )
     return PrimitiveData(
-        part,
-        primitive.material,
-        see_through,
-        vertex_joints,
-        targets,
-        turns,
-        packed_uvs,
+        part=part,
+        material=primitive.material,
+        has_transparent_colors=has_transparent_colors,
+        vertex_joints=vertex_joints,
+        targets=targets,
+        normal_offsets=normal_offsets,
+        packed_uvs=packed_uvs,
     )
 
 
-def _used_vertices(file: GltfFile, primitive: Primitive) -> tuple[IntArray, IntArray]:
+def _find_used_vertices(
+    file: GltfFile, primitive: Primitive
+) -> tuple[IntArray, IntArray]:
     """Return the vertices (V,) that the faces of a primitive have, and the faces.
 
     Primitives may share accessors, so not every vertex is used. Faces (F, 3) are
     indices into the used vertices.
+
+    Raises:
+        FileFormatError: a face refers to a vertex that is not there.
     """
     count = file.header.accessors[primitive.attributes["POSITION"]].count
     order = np.arange(count)
@@ -997,10 +1072,10 @@ def _used_vertices(file: GltfFile, primitive: Primitive) -> tuple[IntArray, IntA
             "faces of its own vertices",
             "a face that refers to a vertex that is not there",
         )
-    used, corners = np.unique(
+    used_vertices, corners = np.unique(
         _make_triangles(order, primitive.mode), return_inverse=True
     )
-    return used, corners.reshape(-1, 3).astype(np.int64)
+    return used_vertices, corners.reshape(-1, 3).astype(np.int64)
 
 
 def _read_texture_coordinates(

@@ -29,7 +29,7 @@ from advsearch.scene.skeleton import (
     MorphTarget,
     Skeleton,
     Track,
-    rotation_entries,
+    compute_rotation_entries,
     with_ancestors,
 )
 from advsearch.trust.stored_files import check_most
@@ -57,22 +57,26 @@ def iterate_poses(header: Header) -> Iterator[tuple[int, Float64Array]]:
     else:
         children = {child for node in header.nodes for child in node.children}
         roots = [index for index in range(len(header.nodes)) if index not in children]
-    stack = [(index, np.eye(4)) for index in roots]
-    while stack:
-        index, parent_pose = stack.pop()
+    pending = [(index, np.eye(4)) for index in roots]
+    while pending:
+        index, parent_pose = pending.pop()
         pose = parent_pose @ compute_matrix(header.nodes[index])
         yield index, pose
-        stack.extend((child, pose) for child in header.nodes[index].children)
+        pending.extend((child, pose) for child in header.nodes[index].children)
 
 
 def compute_matrix(node: Node) -> Float64Array:
-    """Return the matrix (4, 4) from a node to its parent."""
+    """Return the matrix (4, 4) from a node to its parent.
+
+    It is the node's own matrix, or else translation, rotation (normalised) and scale.
+    """
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
     matrix = np.eye(4)
+    # the norm of 1.0 is 1: that of the identity, which no rotation means
     length = max(float(np.linalg.norm(node.rotation or 1.0)), 1e-12)
     quaternion = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / length
-    rotation = np.reshape(rotation_entries(*quaternion), (3, 3))
+    rotation = np.reshape(compute_rotation_entries(*quaternion), (3, 3))
     matrix[:3, :3] = rotation * np.array(node.scale or [1.0, 1.0, 1.0])
     matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
     return matrix
@@ -92,6 +96,8 @@ def read_vertex_joints(
     file: GltfFile, primitive: Primitive, used: IntArray
 ) -> VertexJoints | None:
     """Return the joints of the used vertices of a primitive; None if it has none.
+
+    Weights of a vertex are scaled to add up to 1.
 
     Raises:
         FileFormatError: joints are those of other vertices, or have no weights.
@@ -132,6 +138,7 @@ def read_vertex_joints(
 
 
 def _is_vec4(accessor: Accessor, count: int) -> bool:
+    """Return whether an accessor has four numbers for each of `count` vertices."""
     return accessor.type == "VEC4" and accessor.count == count
 
 
@@ -177,6 +184,7 @@ def pose_part(
             f"joints under {len(matrices)}, as its skin has",
             f"number {int(vertex_joints.joints.max())}",
         )
+    # (V, 3, 4): the weighted mean of the matrices of a vertex's joints
     transforms = np.zeros((len(part.vertices), 3, 4))
     for joint, weight in zip(
         vertex_joints.joints.T, vertex_joints.weights.T, strict=True
@@ -219,12 +227,12 @@ def read_targets(
         offsets = _read_offsets(file, primitive, attributes, "POSITION", used)
         if offsets is None:
             offsets = np.zeros((len(used), 3))
-        moved_rows = np.flatnonzero(offsets.any(axis=1))
+        moved_vertices = np.flatnonzero(offsets.any(axis=1))
         name = f"target-{index}"
         if index < len(names) and isinstance(names[index], str):
             name = names[index]
         targets.append(
-            MorphTarget(sanitize_name(name), moved_rows, offsets[moved_rows])
+            MorphTarget(sanitize_name(name), moved_vertices, offsets[moved_vertices])
         )
         normal_offsets.append(
             _read_offsets(file, primitive, attributes, "NORMAL", used)
@@ -239,7 +247,10 @@ def _read_offsets(
     name: str,
     used: IntArray,
 ) -> Float64Array | None:
-    """Return what a morph target adds to an attribute of used vertices, (V, 3)."""
+    """Return what a morph target adds to an attribute of used vertices, (V, 3).
+
+    None if the target leaves the attribute as it is.
+    """
     if name not in attributes:
         return None
     accessors = file.header.accessors
@@ -263,6 +274,8 @@ def apply_targets(
 ) -> ImportedPart:
     """Return a part, in its mesh's coordinates, with morph targets applied.
 
+    Targets of weight 0 are skipped; the part itself stays as it is.
+
     Args:
         part: a part as the file stores it.
         targets: its T morph targets.
@@ -285,6 +298,8 @@ def apply_targets(
 
 def read_rest_weights(file: GltfFile, node: int, count: int) -> Float64Array:
     """Return the weights (T,) at rest of a node's morph targets.
+
+    The node's own win over those of its mesh; without either they are 0.
 
     Raises:
         FileFormatError: there are not `count` weights, one for each target.
@@ -345,6 +360,8 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
 def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton | None:
     """Return the nodes and clips of a file; None if nothing moves its geometry.
 
+    Nodes have the names of bones that the VRM extension gives them, or else their own.
+
     Args:
         file: the glTF file.
         target_counts: the nodes with a mesh, and their number of morph targets.
@@ -353,18 +370,17 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
         FileFormatError: a clip is not as the format defines it, or clips are too large.
     """
     header = file.header
-    skins = {
-        skin for node in target_counts if (skin := header.nodes[node].skin) is not None
-    }
+    node_skins = {header.nodes[node].skin for node in target_counts}
+    skins = {skin for skin in node_skins if skin is not None}
     clips = _read_clips(file, target_counts, skins)
     if not (skins or clips or any(target_counts.values())):
         return None
     bone_names = {bone.node: bone.bone for bone in header.vrm_0} | {
         bone.node: name for name, bone in header.vrm.items()
     }
-    names = UniqueNames()
+    unique_names = UniqueNames()
     node_names = [
-        names.make_unique(bone_names.get(index) or node.name or f"node-{index}")
+        unique_names.make_unique(bone_names.get(index) or node.name or f"node-{index}")
         for index, node in enumerate(header.nodes)
     ]
     rotations = np.array(
@@ -372,15 +388,15 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
     )
     lengths = np.linalg.norm(rotations, axis=1, keepdims=True)
     return Skeleton(
-        file.path.name,
-        tuple(node_names),
-        np.array(header.parents),
-        np.stack([compute_matrix(node) for node in header.nodes]),
-        np.array([node.translation or [0.0] * 3 for node in header.nodes]),
-        np.asarray(rotations / np.maximum(lengths, 1e-12)),
-        np.array([node.scale or [1.0] * 3 for node in header.nodes]),
-        np.array([node.matrix is not None for node in header.nodes]),
-        clips,
+        source=file.path.name,
+        names=tuple(node_names),
+        parents=np.array(header.parents),
+        local_matrices=np.stack([compute_matrix(node) for node in header.nodes]),
+        translations=np.array([node.translation or [0.0] * 3 for node in header.nodes]),
+        rotations=np.asarray(rotations / np.maximum(lengths, 1e-12)),
+        scales=np.array([node.scale or [1.0] * 3 for node in header.nodes]),
+        has_matrix=np.array([node.matrix is not None for node in header.nodes]),
+        clips=clips,
     )
 
 
@@ -399,7 +415,12 @@ def _count_key_numbers(
 def _read_clips(
     file: GltfFile, target_counts: Mapping[int, int], skins: Collection[int]
 ) -> tuple[Clip, ...]:
-    """Return the clips of a file, of which only what moves geometry is read."""
+    """Return the clips of a file, of which only what moves geometry is read.
+
+    That is what sets the transform of a node with a mesh, of a joint or of an ancestor
+    of one, and the weights of morph targets. A clip without any such channel is left
+    out.
+    """
     header = file.header
     joints = (joint for skin in skins for joint in header.skins[skin].joints)
     moving_nodes = with_ancestors(header.parents, {*target_counts, *joints})
@@ -423,7 +444,7 @@ def _read_clips(
         MAX_KEY_NUMBERS,
         "clips of at most {} numbers",
     )
-    names = UniqueNames()
+    unique_names = UniqueNames()
     clips = list[Clip]()
     for index, (animation, channels) in enumerate(
         zip(header.animations, used_channels, strict=True)
@@ -433,7 +454,7 @@ def _read_clips(
                 _read_track(file, animation, channel, target_counts)
                 for channel in channels
             ]
-            name = names.make_unique(animation.name or f"clip-{index}")
+            name = unique_names.make_unique(animation.name or f"clip-{index}")
             clips.append(Clip(name, tuple(tracks)))
     return tuple(clips)
 
@@ -466,7 +487,7 @@ def _read_track(
     count = len(times) * values_per_key * n_targets
     if output.count != count or output.width != width:
         expected = (
-            f"{count:,} values of {width} number{'s' * (width > 1)} for "
+            f"{count:,} values of {_count_numbers(width)} for "
             f"{len(times):,} keys of a {target_path}"
         )
         raise damaged(path, expected, f"{output.count:,} of {output.width}")
@@ -481,6 +502,11 @@ def _read_track(
                 path, "rotations of a clip that are unit quaternions", "one of length 0"
             )
     return Track(node, target_path, sampler.interpolation, times, keys)
+
+
+def _count_numbers(count: int) -> str:
+    """Return a count of numbers in words, such as "1 number"."""
+    return f"{count} numbers" if count > 1 else f"{count} number"
 
 
 def _read_times(file: GltfFile, index: int) -> Float64Array:

@@ -108,6 +108,7 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
             "export it again"
         )
         raise FileFormatError(message) from error
+    # a number, or an enum with one
     environment_map = header.get("envmap")
     if getattr(environment_map, "value", environment_map) == CUBE_MAP:
         raise FileFormatError(
@@ -119,8 +120,8 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
     colors = planes if "R" in planes else _convert_luminance(planes, size)
     primaries = header.get("chromaticities")
     if primaries is not None:
-        values = np.asarray(primaries, np.float64).ravel()
-        if not np.allclose(values, PRIMARIES, atol=2e-3):
+        primary_values = np.asarray(primaries, np.float64).ravel()
+        if not np.allclose(primary_values, PRIMARIES, atol=2e-3):
             notes.append(
                 "its colours have primaries of their own and are taken for those of "
                 "sRGB"
@@ -135,10 +136,10 @@ def _read_layer(
     """Return the header, the planes and the notes of the layer that is the image."""
     with OpenEXR.File(
         io.BytesIO(data), separate_channels=True, header_only=True
-    ) as picture:
-        _check_size(file, picture)
-    with OpenEXR.File(io.BytesIO(data), separate_channels=True) as picture:
-        parts = [(dict(part.header), dict(part.channels)) for part in picture.parts]
+    ) as exr_file:
+        _check_size(file, exr_file)
+    with OpenEXR.File(io.BytesIO(data), separate_channels=True) as exr_file:
+        parts = [(dict(part.header), dict(part.channels)) for part in exr_file.parts]
         is_incomplete = any(
             len(channels) != len(header["channels"]) for header, channels in parts
         )
@@ -175,7 +176,11 @@ def _check_planes(
 
 
 def _check_size(file: Path, picture: Any) -> None:
-    """Raise FileFormatError for a picture that is deep, or over a limit."""
+    """Raise FileFormatError for a picture that is deep, or over a limit.
+
+    The limit is on the values of all parts, and on the display window of each, which
+    may be larger than its data.
+    """
     n_values = 0
     for part in picture.parts:
         header = part.header
@@ -230,41 +235,51 @@ def _select_layer(
     def rank(
         layer: tuple[str, Mapping[str, Any], Mapping[str, Any]],
     ) -> tuple[int, bool]:
+        """Return the rank of a layer: by its name, then colors before luminance."""
         name, _, channels = layer
-        last = name.split(".")[-1].lower()
-        name_rank = (
-            MAIN_LAYER_NAMES.index(last)
-            if last in MAIN_LAYER_NAMES
-            else len(MAIN_LAYER_NAMES)
-        )
+        last_word = name.split(".")[-1].lower()
+        name_rank = len(MAIN_LAYER_NAMES)
+        if last_word in MAIN_LAYER_NAMES:
+            name_rank = MAIN_LAYER_NAMES.index(last_word)
         return name_rank, "R" not in channels
 
     name, header, channels = min(layers, key=rank)
-    others = ", ".join(
+    other_names = ", ".join(
         format_name(other) for other, _, _ in layers[:20] if other != name
     )
     notes = []
-    if others and name:
-        notes.append(f"of its layers {format_name(name)} is taken; left out: {others}")
-    elif others:
-        notes.append(f"layers are left out: {others}")
-    keys = ("R", "G", "B") if "R" in channels else ("Y", "RY", "BY")
-    return header, {key: channels[key] for key in keys if key in channels}, notes
+    if other_names and name:
+        notes.append(
+            f"of its layers {format_name(name)} is taken; left out: {other_names}"
+        )
+    elif other_names:
+        notes.append(f"layers are left out: {other_names}")
+    channel_names = ("R", "G", "B") if "R" in channels else ("Y", "RY", "BY")
+    return (
+        header,
+        {key: channels[key] for key in channel_names if key in channels},
+        notes,
+    )
 
 
 def _find_color_layers(
     parts: list[tuple[dict[str, Any], dict[str, Any]]],
 ) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
-    """Return the name, header and channels of every layer with color or luminance."""
+    """Return the name, header and channels of every layer with color or luminance.
+
+    Channels are by what they hold, see `CHANNEL_NAMES`; in a layer's name their part
+    counts only if the layer has none of its own. Luminance Y with X or Z is no
+    luminance, but XYZ, and chroma needs both RY and BY.
+    """
     layers: list[tuple[str, dict[str, Any], dict[str, Any]]] = []
     for header, channels in parts:
-        by_layer: dict[str, dict[str, Any]] = {}
+        channels_by_layer: dict[str, dict[str, Any]] = {}
         for name, channel in channels.items():
-            layer, _, last = name.rpartition(".")
-            key = CHANNEL_NAMES.get(last.lower(), last)
-            by_layer.setdefault(layer, {}).setdefault(key, channel)
+            layer, _, channel_name = name.rpartition(".")
+            key = CHANNEL_NAMES.get(channel_name.lower(), channel_name)
+            channels_by_layer.setdefault(layer, {}).setdefault(key, channel)
         part_name = str(header.get("name", "")) if len(parts) > 1 else ""
-        for layer, layer_channels in by_layer.items():
+        for layer, layer_channels in channels_by_layer.items():
             names = set(layer_channels)
             is_luminance = (
                 "Y" in names
@@ -299,13 +314,16 @@ def _convert_luminance(
 
 
 def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
-    """Interpolate chroma, which has a value at every n-th row and column, to a size."""
+    """Interpolate chroma, which has a value at every n-th row and column, to a size.
+
+    Past the last value it is repeated.
+    """
     for axis in (0, 1):
-        last = plane.shape[axis] - 1
-        step = round(size[axis] / (last + 1))
-        position = np.minimum(np.arange(size[axis]) / step, last)
+        last_index = plane.shape[axis] - 1
+        spacing = round(size[axis] / (last_index + 1))
+        position = np.minimum(np.arange(size[axis]) / spacing, last_index)
         lower = position.astype(np.int64)
-        upper = np.minimum(lower + 1, last)
+        upper = np.minimum(lower + 1, last_index)
         fraction = np.expand_dims((position - lower).astype(np.float32), 1 - axis)
         plane = (
             plane.take(lower, axis) * (1.0 - fraction)
@@ -325,7 +343,10 @@ def _intersect_ranges(
 def _crop_to_display_window(
     header: Mapping[str, Any], planes: Planes, notes: list[str]
 ) -> Planes:
-    """Crop or pad planes from the data window to the display window."""
+    """Crop or pad planes from the data window to the display window.
+
+    Pads are black; data that is cropped away is noted.
+    """
     (data_top, data_left), data_size = _read_window(header, "dataWindow")
     (top, left), (height, width) = _read_window(header, "displayWindow")
     if (data_top, data_left) == (top, left) and data_size == (height, width):
@@ -342,6 +363,7 @@ def _crop_to_display_window(
         notes.append("its data beyond the display window is left out")
 
     def crop(plane: Plane) -> Plane:
+        """Copy what both windows have into a black plane of the display window."""
         result = np.zeros((height, width), plane.dtype)
         if rows.stop > rows.start and columns.stop > columns.start:
             result[
@@ -372,24 +394,29 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
     Raises:
         FileFormatError: the size is none, or too large, or scanlines are missing.
     """
-    size = _RESOLUTION.match(body)
-    if not size or not int(size[3]) or not int(size[6]) or size[2] == size[5]:
+    size_match = _RESOLUTION.match(body)
+    if (
+        not size_match
+        or not int(size_match[3])
+        or not int(size_match[6])
+        or size_match[2] == size_match[5]
+    ):
         line = body[:30].split(b"\n")[0].decode("latin-1")
         raise FileFormatError(
             f"{path}: expected a size like '-Y 512 +X 1024', got "
             f"{line!r}; save the picture again"
         )
-    n_lines = int(size[3])
-    line_length = int(size[6])
+    n_lines = int(size_match[3])
+    line_length = int(size_match[6])
     check_pixels(path, line_length, n_lines)
-    pixels = _decode_scanlines(path, body[size.end() :], n_lines, line_length)
+    pixels = _decode_scanlines(path, body[size_match.end() :], n_lines, line_length)
     # Flip it so that it begins at the top and at the left.
     line_step, pixel_step = (
         1 if sign + axis in (b"-Y", b"+X") else -1
-        for sign, axis in (size.group(1, 2), size.group(4, 5))
+        for sign, axis in (size_match.group(1, 2), size_match.group(4, 5))
     )
     pixels = pixels[::line_step, ::pixel_step]
-    if size[2] != b"Y":
+    if size_match[2] != b"Y":
         pixels = pixels.transpose(1, 0, 2)
     return pixels
 
@@ -407,15 +434,15 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
         FileFormatError: the file is no Radiance picture, has XYZ colors, is too large,
             or is cut short.
     """
-    end = re.search(rb"\r?\n\r?\n", data)
-    if not data.startswith(b"#?") or not end:
+    header_end = re.search(rb"\r?\n\r?\n", data)
+    if not data.startswith(b"#?") or not header_end:
         got = describe_content(data) if not data.startswith(b"#?") else "half a header"
         raise damaged(path, "a Radiance .hdr picture", got)
-    header = data[: end.start()]
-    body = data[end.end() :]
-    coding = re.search(rb"^FORMAT=\s*(\S+)", header, re.MULTILINE)
-    if coding and coding[1] != b"32-bit_rle_rgbe":
-        got = format_name(coding[1].decode("latin-1"), quoted=False)
+    header = data[: header_end.start()]
+    body = data[header_end.end() :]
+    format_match = re.search(rb"^FORMAT=\s*(\S+)", header, re.MULTILINE)
+    if format_match and format_match[1] != b"32-bit_rle_rgbe":
+        got = format_name(format_match[1].decode("latin-1"), quoted=False)
         raise FileFormatError(
             f"{path}: expected FORMAT=32-bit_rle_rgbe, got {got}; convert it to RGB"
         )
@@ -457,9 +484,13 @@ def decode_rgbe(pixels: Bytes) -> Float32Array:
 
 
 def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
-    """Decode scanlines to pixels (height, width, 4), run-length encoded or plain."""
+    """Decode scanlines to pixels (height, width, 4), run-length encoded or plain.
+
+    Each line is of one kind or the other; only widths from 8 to 32767 may be encoded.
+    """
     result = np.empty((height, width, 4), np.uint8)
     position = 0
+    # two bytes of 2, then the width in two bytes
     run_length_mark = bytes([2, 2, width >> 8 & 0xFF, width & 0xFF])
     for row in range(height):
         has_mark = body[position : position + 4] == run_length_mark
@@ -480,7 +511,8 @@ def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes
 def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from its four run-length encoded channels.
 
-    Returns the position after them.
+    Returns the position after them. Raises IndexError or ValueError if they end early,
+    or do not fit.
     """
     for channel in range(4):
         runs = []
@@ -505,32 +537,34 @@ def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
 def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from pixels of four bytes.
 
-    A pixel (1, 1, 1, n) repeats the last one. Returns the position after the line.
+    A pixel (1, 1, 1, n) repeats the last one n times; a further one in a row holds the
+    next 8 bits of the number. Returns the position after the line. Raises ValueError if
+    a repeat does not fit.
     """
     width = len(line)
     n_bytes = min(4 * width, len(body) - position)
-    raw = np.frombuffer(body, np.uint8, count=n_bytes, offset=position)
-    if len(raw) == 4 * width:
-        pixels = raw.reshape(width, 4)
+    line_bytes = np.frombuffer(body, np.uint8, count=n_bytes, offset=position)
+    if len(line_bytes) == 4 * width:
+        pixels = line_bytes.reshape(width, 4)
         has_repeats = (pixels[:, :3] == 1).all(axis=1).any()
         if not has_repeats:
             line[:] = pixels
             return position + 4 * width
     n_filled = 0
-    shift = 0
+    count_shift = 0
     while n_filled < width:
         pixel = body[position : position + 4]
         position = position + 4
         if pixel[:3] == b"\x01\x01\x01":
-            count = pixel[3] << shift
+            count = pixel[3] << count_shift
             if n_filled == 0 or n_filled + count > width:
                 raise ValueError("a repeat that does not fit")
             line[n_filled : n_filled + count] = line[n_filled - 1]
             n_filled = n_filled + count
             # Repeats in a row are the bytes of one count.
-            shift = shift + 8
+            count_shift = count_shift + 8
         else:
             line[n_filled] = np.frombuffer(pixel, np.uint8)
             n_filled = n_filled + 1
-            shift = 0
+            count_shift = 0
     return position

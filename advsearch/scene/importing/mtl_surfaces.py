@@ -63,29 +63,40 @@ class MtlSurface:
 class MtlReader:
     """Reads the material files of a mesh file, and converts materials to surfaces.
 
-    `find_mapped_faces` returns UVs (F, 3, 2) and areas (F,) of the faces with a
-    material, by its name and a UDIM square.
+    Attributes:
+        references: finds files beside the mesh file.
+        notes: about the file.
+        find_mapped_faces: returns UVs (F, 3, 2) and areas (F,) of the faces with a
+            material, by its name and a UDIM square.
+        n_libraries: how many material files were read.
     """
 
     references: References
     notes: Notes
     find_mapped_faces: Callable[[str, int], tuple[Float64Array, Float64Array]]
-    n_libraries: int = 0  # how many material files were read
+    n_libraries: int = 0
+    # Materials by name, with and without what may be a comment after it.
     _materials: dict[str, MtlMaterial] = field(default_factory=dict)
+    # Surfaces by the identity of their material and the UDIM square.
     _surfaces: dict[tuple[int, int], MtlSurface] = field(default_factory=dict)
+    # Maps by the identity of their material and the keyword.
     _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
 
     def read_library(self, name: str) -> None:
-        """Read a material file; of materials with the same name, the first counts."""
+        """Read a material file; of materials with the same name, the first counts.
+
+        A file that is missing is noted, and so is a second material of a name in one
+        file, unless its statements are the same.
+        """
         try:
             text = decode_text(self.references.get(name))
         except FileNotFoundError:
             file_name = normalize_name(name)
-            reason = (
+            missing_file = (
                 f"{format_name(file_name)}, which {self.references.refused[file_name]}"
             )
             self.notes.warn(
-                f" names the material file {reason}; neutral grey is used instead"
+                f" names the material file {missing_file}; neutral grey is used instead"
             )
             return
         self.n_libraries += 1
@@ -98,8 +109,11 @@ class MtlReader:
                 keyword,
             )
         for material in materials:
-            first = self._materials.setdefault(material.name, material)
-            if first.statements != material.statements and first.file == material.file:
+            known_material = self._materials.setdefault(material.name, material)
+            if (
+                known_material.statements != material.statements
+                and known_material.file == material.file
+            ):
                 self.notes.warn(
                     f"{file} has the material {format_name(material.name)} more "
                     "than once; the first counts"
@@ -109,6 +123,9 @@ class MtlReader:
             self._materials.setdefault(without_comment(material.name), material)
 
     def _find_material(self, name: str) -> MtlMaterial | None:
+        """Return the material of a name, which may have a comment after it; None if
+        none.
+        """
         return self._materials.get(name) or self._materials.get(without_comment(name))
 
     def get_surface(self, name: str, square: int = 0) -> MtlSurface | None:
@@ -128,8 +145,9 @@ class MtlReader:
     def find_squares(self, name: str, candidates: Sequence[int]) -> list[int]:
         """Return those of some UDIM squares for which a material has images.
 
-        There are none if the images of the material have no square in their names, or
-        repeat.
+        All squares, if the name of its first image has the placeholder, or if there is
+        an image for any square but the one in that name. There are none if the name has
+        no square, or if the images repeat: only the one square has one, which is noted.
 
         Args:
             name: the material.
@@ -139,7 +157,7 @@ class MtlReader:
         if material is None:
             return []
         uses = [self._parse_use(material, key) for key in UV_MAPS]
-        numbered = next(
+        numbered_name = next(
             (
                 use.name
                 for use in uses
@@ -147,26 +165,28 @@ class MtlReader:
             ),
             None,
         )
-        if numbered is None:
+        if numbered_name is None:
             return []
-        others = [
+        other_squares = [
             square
             for square in candidates
-            if square and square != find_square(numbered)
+            if square and square != find_square(numbered_name)
         ]
-        if not others:
+        if not other_squares:
             return []
         exists = (
-            isinstance(self.references.find(replace_square(numbered, square)), bytes)
-            for square in others
+            isinstance(
+                self.references.find(replace_square(numbered_name, square)), bytes
+            )
+            for square in other_squares
         )
-        if find_square(numbered) == 0 or any(exists):
+        if find_square(numbered_name) == 0 or any(exists):
             return [square for square in candidates if square]
         self.notes.warn(
-            f"{format_name(numbered)} is named like one of several pictures (UDIM), "
+            f"{format_name(numbered_name)} is named like one of several pictures (UDIM), "
             "and "
             "there is none for the "
-            f"faces in {', '.join(map(str, others[:8]))}: it repeats there; put "
+            f"faces in {', '.join(map(str, other_squares[:8]))}: it repeats there; put "
             "those pictures beside it"
         )
         return []
@@ -176,19 +196,25 @@ class MtlReader:
     ) -> MtlSurface:
         """Convert a material to a surface.
 
+        Texture coordinates are those of the first of `UV_MAPS`; maps with others are
+        left out.
+
         Args:
             material: the statements of the material.
             square: the UDIM square whose images are used, 0 for none.
             name: the name by which the mesh file uses it.
         """
-        is_first = not any(known == id(material) for known, _ in self._surfaces)
+        # Statements are noted once, not for each square.
+        is_first = not any(
+            material_id == id(material) for material_id, _ in self._surfaces
+        )
         uses = self._parse_uses(material, square)
-        first = next((uses[key] for key in UV_MAPS if key in uses), MapUse("", {}))
-        self._drop_other_layouts(material, uses, first)
+        first_use = next((uses[key] for key in UV_MAPS if key in uses), MapUse("", {}))
+        self._drop_other_layouts(material, uses, first_use)
         color, texture = self._make_base_color(material, uses.get("map_kd"))
-        opaque = ImportedSurface(color, texture, name=material.name)
+        opaque_surface = ImportedSurface(color, texture, name=material.name)
         surface = replace(
-            self._apply_opacity(material, uses.get("map_d"), opaque),
+            self._apply_opacity(material, uses.get("map_d"), opaque_surface),
             roughness=self._read_fraction(
                 material, "pr", uses.get("map_pr"), name, square
             ),
@@ -200,14 +226,15 @@ class MtlReader:
         )
         if is_first:
             self._note_unread(material)
-        is_clamped = bool(first.name) and any(
+        is_clamped = bool(first_use.name) and any(
             use.options.get("clamp", "").lower() == "on" for use in uses.values()
         )
-        return MtlSurface(surface, first.scale, first.offset, is_clamped)
+        return MtlSurface(surface, first_use.scale, first_use.offset, is_clamped)
 
     def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
-        """Return the maps of a material by keyword, with the images of a UDIM
-        square.
+        """Return the maps of a material by keyword, with the images of a UDIM square.
+
+        They count as read, but for normal maps, of which only some are.
         """
         uses = dict[str, MapUse]()
         for key in (*UV_MAPS, "map_pr", "map_pm"):
@@ -225,17 +252,22 @@ class MtlReader:
         return uses
 
     def _drop_other_layouts(
-        self, material: MtlMaterial, uses: dict[str, MapUse], first: MapUse
+        self, material: MtlMaterial, uses: dict[str, MapUse], first_use: MapUse
     ) -> None:
-        """Remove the maps whose scale and offset differ from those of the first."""
+        """Remove the maps whose scale and offset differ from those of the first, in
+        place.
+        """
         for key in [key for key in UV_MAPS if key in uses]:
-            if (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
-                what = (
+            if (uses[key].scale, uses[key].offset) != (
+                first_use.scale,
+                first_use.offset,
+            ):
+                statement = (
                     f"{material.spelling[key]} of the material "
                     f"{format_name(material.name)}"
                 )
                 self.notes.warn(
-                    f"{what} lies elsewhere than its other maps (-s, -o); "
+                    f"{statement} lies elsewhere than its other maps (-s, -o); "
                     "it is left out"
                 )
                 material.keys.mark_read(key)
@@ -249,21 +281,23 @@ class MtlReader:
         A texture is not multiplied by Kd, which is an exporter's default more often
         than a tint.
         """
-        rest = material.read_argument("kd")
+        argument = material.read_argument("kd")
         color = None
-        values = parse_numbers(rest)
+        values = parse_numbers(argument)
         if values is not None and len(values) in (1, 3, 4):  # of four, three count
             rgb = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0)
             color = rgb.astype(np.float32)
         elif "kd" in material.statements:
-            what = (
-                f"the Kd {format_name(rest)} of the material "
+            statement = (
+                f"the Kd {format_name(argument)} of the material "
                 f"{format_name(material.name)}"
             )
-            self.notes.warn(f"{what} is no colour; neutral grey is used instead")
-        instead = f"{describe_substitute(color)} is used instead"
-        words = f"{material.file} names the texture {{name}}, which {{why}}; {instead}"
-        texture = self._load_image(use, "colours and alpha", words)
+            self.notes.warn(f"{statement} is no colour; neutral grey is used instead")
+        substitute = f"{describe_substitute(color)} is used instead"
+        note_template = (
+            f"{material.file} names the texture {{name}}, which {{why}}; {substitute}"
+        )
+        texture = self._load_image(use, "colours and alpha", note_template)
         if use is not None and texture is not None:
             if texture[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
                 self.notes.warn(
@@ -276,7 +310,12 @@ class MtlReader:
         return color, texture
 
     def _note_unread(self, material: MtlMaterial) -> None:
-        """Note the statements that are not read, unless they change nothing."""
+        """Note the statements that are not read, unless they change nothing.
+
+        Nothing is changed by zeros, by ignored keywords, and by an ambient map that is
+        the color's; also noted are statements that were overridden, a fourth number of
+        Kd, and illumination models with more than highlights.
+        """
         zero_keys = {
             key
             for key in material.statements
@@ -309,15 +348,19 @@ class MtlReader:
             self.notes.record("material statement", name)
 
     def _parse_use(self, material: MtlMaterial, key: str) -> MapUse | None:
-        """Parse a statement that names an image, and note options that are not read."""
+        """Parse a statement that names an image, and note options that are not read.
+
+        None if it names none. What follows a # belongs to the name if there is such a
+        file, and is a comment otherwise. Each statement is parsed once.
+        """
         if (id(material), key) in self._uses:
             return self._uses[id(material), key]
-        rest = material.statements.get(key, "")
-        use = parse_map(without_comment(rest))
-        with_comment = parse_map(rest)
-        if with_comment is not None and with_comment != use:
-            if isinstance(self.references.find(with_comment.name), bytes):
-                use = with_comment  # the # belongs to the name
+        statement = material.statements.get(key, "")
+        use = parse_map(without_comment(statement))
+        use_with_comment = parse_map(statement)
+        if use_with_comment is not None and use_with_comment != use:
+            if isinstance(self.references.find(use_with_comment.name), bytes):
+                use = use_with_comment  # the # belongs to the name
         self._uses[id(material), key] = use
         has_colors = key in ("map_kd", "map_ke")
         read_options = ["s", "o", "mm", "clamp"]
@@ -347,7 +390,7 @@ class MtlReader:
         """Return a surface with its opacity.
 
         It is ``d``, or 1 - ``Tr``, which some programs write for d, times the image of
-        ``map_d``.
+        ``map_d``, resized to that of the color. The color alone has the factor alone.
         """
         factor = self._read_opacity(material)
         image = self._load_image(
@@ -357,18 +400,18 @@ class MtlReader:
             return surface
         color = surface.color
         texture = surface.texture
-        plain_color = np.full(3, NEUTRAL_GREY, np.float32) if color is None else color
+        color_or_grey = np.full(3, NEUTRAL_GREY, np.float32) if color is None else color
         if use is not None and image is not None:
             opacity = _select_channel(image, use)
             if texture is None:
-                texture = np.broadcast_to(plain_color, (*opacity.shape, 3))
+                texture = np.broadcast_to(color_or_grey, (*opacity.shape, 3))
             size = (texture.shape[1], texture.shape[0])
             resized = np.asarray(
                 Image.fromarray(opacity).resize(size, Image.Resampling.BILINEAR)
             )
             texture = np.concatenate([texture, resized[:, :, None]], axis=2)
-        elif texture is None:
-            color = plain_color
+        elif texture is None:  # the opacity is one number, of a plain color
+            color = color_or_grey
         factor_array = np.array([factor], np.float32)
         return replace(
             surface,
@@ -377,23 +420,29 @@ class MtlReader:
         )
 
     def _read_opacity(self, material: MtlMaterial) -> float:
-        """Return the opacity in [0, 1] that ``d`` or ``Tr`` states, 1 by default."""
+        """Return the opacity in [0, 1] that ``d`` or ``Tr`` states, 1 by default.
+
+        ``d`` wins; a ``Tr`` that agrees with it neither as a transparency nor as an
+        opacity is noted. Alone, ``Tr`` is a transparency, which is noted.
+        """
         if "-halo" in material.read_argument("d").lower().split():
             self.notes.record("option", "-halo of d")
         opacity = parse_fraction(material.read_argument("d"), -1.0)  # -1: there is none
         transparency = parse_fraction(material.read_argument("tr"), -1.0)
-        what = f"the material {format_name(material.name)} has Tr {transparency:g}"
+        material_phrase = (
+            f"the material {format_name(material.name)} has Tr {transparency:g}"
+        )
         if opacity >= 0.0 and transparency >= 0.0:
             agrees_as_opacity = abs(transparency - opacity) <= 0.01
-            agrees = abs(1.0 - transparency - opacity) <= 0.01
-            if not agrees_as_opacity and not agrees:
+            agrees_as_transparency = abs(1.0 - transparency - opacity) <= 0.01
+            if not agrees_as_opacity and not agrees_as_transparency:
                 self.notes.warn(
-                    f"{what} beside d {opacity:g}, which it contradicts; d is "
+                    f"{material_phrase} beside d {opacity:g}, which it contradicts; d is "
                     "taken for its opacity"
                 )
         elif opacity < 0.0 < transparency:
             self.notes.warn(
-                f"{what} and no d: it is taken for transparency, which makes its "
+                f"{material_phrase} and no d: it is taken for transparency, which makes its "
                 f"opacity {1.0 - transparency:g}; some programs"
                 f" mean opacity by it, so write d in its place"
             )
@@ -411,10 +460,10 @@ class MtlReader:
 
         It is the mean of its map over the faces that show it, or else its number.
         """
-        words = (
+        note_template = (
             f"{material.spelling.get(f'map_{key}')} {{name}} {{why}}; it is left out"
         )
-        image = self._load_image(use, "numbers", words)
+        image = self._load_image(use, "numbers", note_template)
         number = parse_fraction(material.read_argument(key), -1.0)
         if use is not None and image is not None:
             self.notes.warn(
@@ -430,13 +479,17 @@ class MtlReader:
     def _make_normal_map(
         self, material: MtlMaterial, uses: dict[str, MapUse]
     ) -> Float32Array | None:
-        """Return the first usable normal map (H, W, 3) of a material, or None."""
-        words = "the normal map {name} {why}; it is left out"
+        """Return the first usable normal map (H, W, 3) of a material, or None.
+
+        Bump maps are usable if they hold normals, and no heights. All statements with
+        the same image count as read.
+        """
+        note_template = "the normal map {name} {why}; it is left out"
         for key in NORMAL_MAPS:
             if key not in uses:
                 continue
             use = uses[key]
-            image = self._load_image(use, "numbers", words)
+            image = self._load_image(use, "numbers", note_template)
             material.keys.mark_read(
                 *(other for other in uses if uses[other].name == use.name)
             )
@@ -444,14 +497,18 @@ class MtlReader:
                 if key in ("norm", "map_kn") or has_normals(image):
                     return make_normal_map(image, use.bump)
                 self._images.note_missing(
-                    use.name, "holds heights, and no normals", words
+                    use.name, "holds heights, and no normals", note_template
                 )
         return None
 
     def _make_emission(
         self, material: MtlMaterial, use: MapUse | None
     ) -> Float32Array | None:
-        """Return the radiance of ``Ke`` and ``map_Ke``, (H, W, 3), or None."""
+        """Return the radiance of ``Ke`` and ``map_Ke``, (H, W, 3), or None.
+
+        They are multiplied; without a map the radiance is (1, 1, 3). A map that cannot
+        be read leaves no emission, with a note.
+        """
         values = parse_numbers(material.read_argument("ke") or "0")
         if values is None or len(values) not in (1, 3) or min(values) < 0:
             self.notes.warn(
@@ -471,10 +528,11 @@ class MtlReader:
 
     @cached_property
     def _images(self) -> FileImages:
+        """Decodes the images of all materials."""
         return FileImages(len(self._materials), self.references, self.notes)
 
     def _load_image(
-        self, use: MapUse | None, kind: ImageKind, words: str
+        self, use: MapUse | None, kind: ImageKind, note_template: str
     ) -> Float32Array | None:
         """Return the values (H, W, C) of an image with its ``-mm`` applied.
 
@@ -482,7 +540,7 @@ class MtlReader:
         """
         if use is None:
             return None
-        image = self._images.load_file(use.name, kind, words)
+        image = self._images.load_file(use.name, kind, note_template)
         if image is None or use.range == (0.0, 1.0):
             return image
         base, gain = map(np.float32, use.range)
@@ -517,27 +575,29 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
         references: finds files beside the mesh file.
     """
     names: list[str] = []
-    for rest in arguments:
-        plain = without_comment(rest)
-        if _exists(references, rest):
-            names.append(rest)
-        elif _exists(references, plain):
-            names.append(plain)
+    for argument in arguments:
+        argument_without_comment = without_comment(argument)
+        if _exists(references, argument):
+            names.append(argument)
+        elif _exists(references, argument_without_comment):
+            names.append(argument_without_comment)
         else:
-            candidates = _split_libraries(plain)
+            candidates = _split_libraries(argument_without_comment)
             have_suffix = all(map(_has_mtl_suffix, candidates))
             if have_suffix or any(_exists(references, name) for name in candidates):
                 names += candidates
             else:
-                names.append(plain)
+                names.append(argument_without_comment)
     return list(dict.fromkeys(filter(None, names)))
 
 
 def _exists(references: References, name: str) -> bool:
+    """Return whether there is a file of a name that may be read."""
     return isinstance(references.find(name), bytes)
 
 
 def _has_mtl_suffix(name: str) -> bool:
+    """Return whether a name, perhaps in quotation marks, ends in ``.mtl``."""
     return name.strip('"').lower().endswith(".mtl")
 
 
@@ -653,7 +713,10 @@ class MtlMaterial:
     def keys(self) -> TrackedKeys[str]:
         """The statements, tracking which of them are read."""
         return TrackedKeys(
-            {self.spelling[key]: rest for key, rest in self.statements.items()},
+            {
+                self.spelling[key]: statement
+                for key, statement in self.statements.items()
+            },
             fold=str.lower,
         )
 
@@ -694,15 +757,15 @@ def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
     materials: list[MtlMaterial] = []
     stray_keywords = []
     for line in _CONTINUED.sub(r"\1 ", text.replace("\r\n", "\n")).splitlines():
-        keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
+        keyword, _, argument = line.strip().replace("\t", " ").partition(" ")
         key = keyword.lower()
         if not key or key.startswith("#"):
             continue
         if key == "newmtl":
-            materials.append(MtlMaterial(" ".join(rest.split()), file))
+            materials.append(MtlMaterial(" ".join(argument.split()), file))
         elif materials:
             material = materials[-1]
-            value = rest.strip()
+            value = argument.strip()
             if material.statements.get(key, value) != value:
                 material.overridden.append(keyword)
             material.statements[key] = value
@@ -713,14 +776,15 @@ def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
 
 
 def without_comment(text: str) -> str:
-    """Return a text up to the first ``#`` that begins a word."""
+    """Return a text up to the first ``#`` that begins a word, without blanks around it."""
     return _COMMENT.sub("", text).strip()
 
 
 def parse_map(argument: str) -> MapUse | None:
     """Parse the arguments of a statement that names an image; None if it names none.
 
-    Options stand before or after the name, which may have blanks.
+    Options stand before or after the name, which may have blanks. An option that is not
+    known is one before the name; its value is left out.
     """
     options: dict[str, str] = {}
     for match in _OPTION.finditer(argument):
@@ -728,9 +792,11 @@ def parse_map(argument: str) -> MapUse | None:
             if match[key] is not None:
                 options[key] = match[f"{key}_"]
     name = " ".join(_OPTION.sub("", argument).split())
-    while unknown := _UNKNOWN.match(name):
+    unknown = _UNKNOWN.match(name)
+    while unknown:
         options[unknown[1].lower()] = ""
         name = name[unknown.end() :]
+        unknown = _UNKNOWN.match(name)
     if not name:
         return None
     bump, _ = _parse_pair(options, "bm", (1.0, 1.0))

@@ -30,7 +30,9 @@ from advsearch.scene.assets import (
     Material,
     Mesh,
     ObjectAsset,
+    find_footing,
     group_indices,
+    make_pose,
     normalise_mesh,
 )
 from advsearch.scene.importing import gltf, gltf_parts
@@ -136,7 +138,9 @@ def import_object(
         front = find_front(file, header, up)
     else:
         front = FileAxis(check_facing(facing, format_up))
-    return make_object(parts, notes, file, make_safe_name(file), up, front)
+    return make_object(
+        parts, notes, file=file, name=make_safe_name(file), up=up, front=front
+    )
 
 
 def check_facing(facing: str, up: str | None) -> str:
@@ -213,6 +217,9 @@ def make_object(
 ) -> ObjectAsset:
     """Return the object that parts of a file make up.
 
+    It is joined, turned, repaired and textured as `import_object` says. Its size in
+    metres is known only if the format has units, and the extent is plausible.
+
     Args:
         parts: at least one.
         notes: warnings about them so far.
@@ -224,32 +231,33 @@ def make_object(
     Raises:
         InputError: the geometry has NaN, infinite, or coincident vertices only.
     """
-    more_notes = Notes(file)
+    object_notes = Notes(file)
     is_gltf = file.suffix.lower() in GLTF_SUFFIXES
-    parts = _select_visible_parts(parts, more_notes)
+    parts = _select_visible_parts(parts, object_notes)
     up_axis = _find_up(parts, file, up, front)
-    turn = compute_rotation(up_axis.axis, front.axis)
+    rotation = compute_rotation(up_axis.axis, front.axis)
     surfaces = [part.surface for part in parts]
-    soup = repair(join_parts(parts, str(file), turn), str(file), more_notes)
-    soup, maps = apply_textures(soup, surfaces, more_notes)
+    soup = repair(join_parts(parts, str(file), rotation), str(file), object_notes)
+    soup, maps = apply_textures(soup, surfaces, object_notes)
     opacity = None
     if maps.color.shape[2] == 4:
         opacity = np.ascontiguousarray(maps.color[:, :, 3])
         if not opacity.any():
             opacity = None
-            more_notes.warn("it is transparent all over; it is shown opaque")
-    material = _compute_mean_material(soup, surfaces, more_notes)
+            object_notes.warn("it is transparent all over; it is shown opaque")
+    material = _compute_mean_material(soup, surfaces, object_notes)
+    # The soup's extent is 1 but for faces that the repair has removed.
     extent = compute_extent(parts) * float(
         np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max()
     )
     has_unit = is_gltf and MIN_METRES <= extent <= MAX_METRES
     return ObjectAsset(
         name=name,
-        mesh=_make_mesh(soup, surfaces, file, parts, turn),
+        mesh=_make_mesh(soup, surfaces, file, parts, rotation),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
-        warnings=_limit_warnings([*notes, *more_notes], file),
+        warnings=_limit_warnings([*notes, *object_notes], file),
         up=up_axis,
         front=front,
         opacity=opacity,
@@ -257,6 +265,7 @@ def make_object(
         emission=_compute_emitted(maps.emission, opacity),
         metres=extent if has_unit else None,
         extent=extent,
+        file_to_mesh=_compute_file_to_mesh(parts, soup, rotation),
     )
 
 
@@ -280,7 +289,10 @@ def _select_visible_parts(
 def _find_up(
     parts: list[ImportedPart], file: Path, up: str | None, front: FileAxis
 ) -> FileAxis:
-    """Return the axis that points up: the user's, the format's, or a guess."""
+    """Return the axis that points up: the user's, the format's, or a guess.
+
+    A front along y or z leaves one axis only; a guess is by the shape.
+    """
     if up:
         return FileAxis(up)
     if file.suffix.lower() in GLTF_SUFFIXES:
@@ -294,20 +306,24 @@ def _find_up(
 def _compute_mean_material(
     soup: Soup, surfaces: list[ImportedSurface], notes: Notes
 ) -> Material:
-    """Return the roughness and metallic of all surfaces, averaged by area."""
-    area = np.bincount(
+    """Return the roughness and metallic of all surfaces, averaged by area.
+
+    A note says so, unless all of them are the same. Surfaces without faces do not
+    count.
+    """
+    visible_area = np.bincount(
         soup.part,
-        weights=np.linalg.norm(soup.face_vectors(), axis=1),
+        weights=np.linalg.norm(soup.compute_face_vectors(), axis=1),
         minlength=len(surfaces),
     )
     materials = [Material().with_values(vars(surface), "") for surface in surfaces]
     values = np.array(
         [[material.roughness, material.metallic] for material in materials]
     )
-    visible_values = values[area > 0]
+    visible_values = values[visible_area > 0]
     roughness, metallic = map(float, visible_values[0])
     if not (visible_values == visible_values[0]).all():
-        means = (values * area[:, None]).sum(axis=0) / area.sum()
+        means = (values * visible_area[:, None]).sum(axis=0) / visible_area.sum()
         roughness, metallic = map(float, means)
         notes.warn(
             "the roughness and metallic of its materials are replaced by their "
@@ -321,8 +337,8 @@ def _limit_warnings(warnings: list[str], file: Path) -> tuple[str, ...]:
     n_more = len(warnings) - MAX_WARNINGS
     if n_more <= 0:
         return tuple(warnings)
-    rest = f"{file.name}: {n_more:,} more warnings are left out"
-    return (*warnings[:MAX_WARNINGS], rest)
+    last_warning = f"{file.name}: {n_more:,} more warnings are left out"
+    return (*warnings[:MAX_WARNINGS], last_warning)
 
 
 def _make_mesh(
@@ -361,6 +377,21 @@ def _make_mesh(
     return replace(normalised_mesh, rig=rig)
 
 
+def _compute_file_to_mesh(
+    parts: list[ImportedPart], soup: Soup, turn: Float64Array
+) -> Float64Array:
+    """Return the map (4, 4) from the file's coordinates to the normalised mesh's.
+
+    It is that of `join_parts` and `normalise_mesh` together; `turn` (3, 3) leads from
+    the file's axes to ours.
+    """
+    used = [part.vertices[np.unique(part.faces)] for part in parts]
+    low = np.min([points.min(axis=0) for points in used], axis=0)
+    origin, size = find_footing(soup.points[np.unique(soup.faces)])
+    linear = turn / (compute_extent(parts) * size)
+    return make_pose(linear, -linear @ low - origin / size)
+
+
 def _compute_emitted(
     emission: Float32Array | None, opacity: Float32Array | None
 ) -> Float32Array | None:
@@ -377,8 +408,8 @@ def _compute_emitted(
     )
     source_rows = np.arange(height) * rows // height
     source_columns = np.arange(width) * columns // width
-    enlarged = emission[source_rows][:, source_columns]
-    radiance = np.asarray(enlarged * resized_opacity[:, :, None], np.float32)
+    enlarged_emission = emission[source_rows][:, source_columns]
+    radiance = np.asarray(enlarged_emission * resized_opacity[:, :, None], np.float32)
     return radiance if radiance.any() else None
 
 
@@ -412,27 +443,28 @@ def guess_up(points: Float64Array, name: str) -> FileAxis:
         "z": compute_touching_fraction(points),
     }
     axis = "z"
-    other = "y"
+    other_axis = "y"
     if fractions["y"] > MIN_UP_RATIO * fractions["z"]:
         axis = "y"
-        other = "z"
+        other_axis = "z"
     reason = "its shape does not tell, as it rests as well either way"
-    if fractions[axis] > MIN_UP_RATIO * fractions[other]:
+    if fractions[axis] > MIN_UP_RATIO * fractions[other_axis]:
         reason = (
             f"it then rests on {100 * fractions[axis]:.0f} % of what it covers, seen "
-            f"from above, and on {100 * fractions[other]:.0f} % otherwise"
+            f"from above, and on {100 * fractions[other_axis]:.0f} % otherwise"
         )
     return FileAxis(
         axis,
         f"{name}: {axis} is taken for up, because {reason}; if it lies "
-        f"on its side, give `up={other}`",
+        f"on its side, give `up={other_axis}`",
     )
 
 
 def compute_touching_fraction(points: Float64Array) -> float:
     """Return the fraction of an object's footprint that touches the ground, in [0, 1].
 
-    Up is the third axis of its points (P, 3). Areas are those of convex hulls.
+    Up is the third axis of its points (P, 3). Areas are those of convex hulls, seen
+    from above; what touches is within `TOUCHING_HEIGHT` of the lowest point.
     """
     height = points[:, 2] - points[:, 2].min()
     is_touching = height <= TOUCHING_HEIGHT * np.ptp(points, axis=0).max()

@@ -50,9 +50,9 @@ def make_normal_map(picture: Float32Array, scale: float = 1.0) -> Float32Array:
     Returns:
         (H, W, 3) texels.
     """
-    factor = min(max(scale, -MAX_NORMAL_SCALE), MAX_NORMAL_SCALE)
+    clamped_scale = min(max(scale, -MAX_NORMAL_SCALE), MAX_NORMAL_SCALE)
     normals = picture * 2.0 - 1.0
-    normals[..., :2] *= factor
+    normals[..., :2] *= clamped_scale
     normals[..., 2] = np.maximum(normals[..., 2], MIN_NORMAL_Z)
     return encode_normals(normals)
 
@@ -62,11 +62,13 @@ def has_normals(picture: Float32Array) -> bool:
 
     Black texels are ignored: no face shows them.
     """
-    used = picture[picture.any(axis=2)]
-    if not len(used):
+    visible_texels = picture[picture.any(axis=2)]
+    if not len(visible_texels):
         return False
-    length_error = np.abs(np.linalg.norm(used * 2.0 - 1.0, axis=1) - 1.0)
-    blueness = float((used[:, 2] - used[:, 0]).mean(dtype=np.float64))
+    length_error = np.abs(np.linalg.norm(visible_texels * 2.0 - 1.0, axis=1) - 1.0)
+    blueness = float(
+        (visible_texels[:, 2] - visible_texels[:, 0]).mean(dtype=np.float64)
+    )
     return blueness > MIN_BLUENESS and bool(
         (length_error < MAX_LENGTH_ERROR).mean() > MIN_NORMAL_FRACTION
     )
@@ -117,7 +119,7 @@ class ImportedSurface:
         )
 
     def with_images(self, pictures: Iterable[Float32Array]) -> ImportedSurface:
-        """Return the surface with its `pictures` replaced, in their order."""
+        """Return the surface with other images, in the order of `images`."""
         remaining = iter(pictures)
         texture = None if self.texture is None else next(remaining)
         normals = None if self.normal_map is None else next(remaining)
@@ -135,9 +137,7 @@ class ImportedSurface:
         return color is not None and color.shape[-1] == 4 and not color[..., 3].any()
 
     def has_same_maps(self, other: ImportedSurface) -> bool:
-        """Return whether two surfaces have equal base colors, normal maps and
-        emission.
-        """
+        """Return whether two surfaces have equal base colors, normal maps and emission."""
         self_maps = (self.color, self.texture, self.normal_map, self.emission)
         pairs = zip(
             self_maps,
@@ -162,10 +162,10 @@ def compute_radiance(
     """
     if factor.max() > MAX_RADIANCE:
         notes.warn(f"emission brighter than {MAX_RADIANCE:g} is cut to that")
-    linear = np.ones((1, 1, 3), np.float32)
+    linear_factors = np.ones((1, 1, 3), np.float32)
     if picture is not None:
-        linear = srgb_to_linear(picture)
-    radiance = (linear * np.minimum(factor, MAX_RADIANCE)).astype(np.float32)
+        linear_factors = srgb_to_linear(picture)
+    radiance = (linear_factors * np.minimum(factor, MAX_RADIANCE)).astype(np.float32)
     return radiance if radiance.any() else None
 
 
@@ -209,10 +209,11 @@ def apply_opacity(
         return rgb
     is_cut_out = opacity[..., 0] == 0.0
     if color.ndim == 3 and not is_cut_out.all():
-        nearest = distance_transform_edt(
+        # for each texel the rows and columns of the nearest one that is not cut out
+        nearest_visible = distance_transform_edt(
             is_cut_out, return_distances=False, return_indices=True
         )
-        rgb = rgb[tuple(nearest)]
+        rgb = rgb[tuple(nearest_visible)]
     return np.concatenate([rgb, opacity], axis=-1)
 
 
@@ -333,32 +334,37 @@ def split_at_corners(
         surface: as in `ImportedPart`.
         flat: as in `ImportedPart`.
     """
-    key = np.zeros(3 * len(triangles), dtype=np.int64)
-    n_keys = 1
-    for looked_up in filter(None, (points, normals, uvs)):
-        count = len(looked_up.values) + 1
-        if n_keys * count >= 2**63:  # numbered anew, so that it does not overflow
-            key = np.unique(key, return_inverse=True)[1].reshape(-1)
-            n_keys = len(key)
-        key = key * count + looked_up.rows[triangles].reshape(-1) + 1
-        n_keys *= count
-    _, first_corner, faces = np.unique(key, return_index=True, return_inverse=True)
+    # One number for each corner, the digits of which are its rows of all values: in
+    # base (number of values + 1), since a missing row is -1.
+    corner_key = np.zeros(3 * len(triangles), dtype=np.int64)
+    n_codes = 1  # bound of the numbers
+    for indexed in filter(None, (points, normals, uvs)):
+        base = len(indexed.values) + 1
+        if n_codes * base >= 2**63:  # numbered anew, so that it does not overflow
+            corner_key = np.unique(corner_key, return_inverse=True)[1].reshape(-1)
+            n_codes = len(corner_key)
+        corner_key = corner_key * base + indexed.rows[triangles].reshape(-1) + 1
+        n_codes *= base
+    _, first_corner, faces = np.unique(
+        corner_key, return_index=True, return_inverse=True
+    )
 
-    def values_of_vertices(looked_up: IndexedValues | None) -> Float64Array | None:
-        if looked_up is None:
+    def gather_vertex_values(indexed: IndexedValues | None) -> Float64Array | None:
+        """Return values (V, C), NaN where there are none; None if there are none."""
+        if indexed is None:
             return None
-        rows = looked_up.rows[triangles].reshape(-1)[first_corner]
+        rows = indexed.rows[triangles].reshape(-1)[first_corner]
         if (rows < 0).all():
             return None
-        return np.where(rows[:, None] >= 0, looked_up.values[rows], np.nan)
+        return np.where(rows[:, None] >= 0, indexed.values[rows], np.nan)
 
     vertices = points.values[points.rows[triangles].reshape(-1)[first_corner]]
     return ImportedPart(
-        vertices,
-        faces.reshape(-1, 3),
-        values_of_vertices(normals),
-        values_of_vertices(uvs),
-        None if colors is None else colors[triangles],
-        surface,
+        vertices=vertices,
+        faces=faces.reshape(-1, 3),
+        normals=gather_vertex_values(normals),
+        uvs=gather_vertex_values(uvs),
+        colors=None if colors is None else colors[triangles],
+        surface=surface,
         flat=flat,
     )

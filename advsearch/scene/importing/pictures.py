@@ -79,31 +79,37 @@ def load_display_image(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large images and odd metadata
         image.load()
-        scale = 1.0 if limit is None else limit / max(height, width)
-        # Value of each of the 256 levels.
-        display: Float32Array = np.arange(256, dtype=np.float32) / np.float32(255.0)
-        if scale >= 1.0:
-            return np.asarray(display[to_8bit_levels(image, alpha=keep_alpha)])
-        target = max(1, round(height * scale)), max(1, round(width * scale))
-        linear = display if is_raw else srgb_to_linear(display)
+        shrink = 1.0 if limit is None else limit / max(height, width)
+        # Tables of the 256 levels.
+        display_of_level: Float32Array = np.arange(256, dtype=np.float32) / np.float32(
+            255.0
+        )
+        if shrink >= 1.0:
+            return np.asarray(display_of_level[to_8bit_levels(image, alpha=keep_alpha)])
+        target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
+        linear_of_level = (
+            display_of_level if is_raw else srgb_to_linear(display_of_level)
+        )
         is_weighted = not is_raw and (keep_alpha or image.has_transparency_data)
 
         def load_band(top: int, end: int) -> Float32Array:
+            """Return rows of colors; with opacity also that, and their product."""
             band_image = image.crop((0, top, width, end))
             levels = to_8bit_levels(band_image, alpha=is_weighted)
-            colors = linear[levels[:, :, :3]]
+            colors = linear_of_level[levels[:, :, :3]]
             if not is_weighted:
                 return colors
-            opacity = display[levels[:, :, 3:]]
+            opacity = display_of_level[levels[:, :, 3:]]
             return np.concatenate([colors, opacity, colors * opacity], axis=2)
 
-        averaged = average_in_bands(load_band, (height, width), target)
+        averaged = average_in_bands(load_band, (height, width), target_shape)
         if is_raw:
             return averaged
         colors = averaged[:, :, :3]
         opacity = averaged[:, :, 3:4]
         if is_weighted:
             weighted_colors = averaged[:, :, 4:] / np.maximum(opacity, 1e-9)
+            # Where all is transparent, the mean color stays.
             colors = np.where(opacity > 0.0, weighted_colors, colors)
         display_colors = linear_to_srgb(colors)
         if not keep_alpha:
@@ -160,32 +166,41 @@ def _average(
     rows, columns, channels = image.shape
     height = row_weights.shape[0]
     width = column_weights.shape[0]
+    # The sparse product is of two matrices: all but one axis are one. (H, C * K)
     by_rows = row_weights @ image.reshape(rows, columns * channels)
+    # (C, H * K)
     transposed = (
         by_rows.reshape(height, columns, channels)
         .transpose(1, 0, 2)
         .reshape(columns, height * channels)
     )
-    result = (
+    # (H, W, K)
+    averaged = (
         (column_weights @ transposed)
         .reshape(width, height, channels)
         .transpose(1, 0, 2)
     )
-    return np.ascontiguousarray(result, dtype=np.float32)
+    return np.ascontiguousarray(averaged, dtype=np.float32)
 
 
 def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
     """Return the weights (target, source) of source cells in target cells.
 
-    They are the overlapping lengths, normalised so that rows sum to 1.
+    They are the overlapping lengths along an axis, normalised so that rows sum to 1:
+    the edges of both grids cut it into pieces, each of which lies in one cell of
+    either.
     """
-    cells = np.arange(target + 1) * (source / target)
-    edges = np.unique(np.concatenate([cells, np.arange(source + 1, dtype=np.float64)]))
-    centers = (edges[1:] + edges[:-1]) / 2
-    lengths = np.diff(edges)
-    row = np.minimum((centers * (target / source)).astype(np.int64), target - 1)
-    column = np.minimum(centers.astype(np.int64), source - 1)
-    overlaps = sparse.coo_array((lengths, (row, column)), shape=(target, source))
+    target_edges = np.arange(target + 1) * (source / target)
+    all_edges = np.unique(
+        np.concatenate([target_edges, np.arange(source + 1, dtype=np.float64)])
+    )
+    centers = (all_edges[1:] + all_edges[:-1]) / 2
+    lengths = np.diff(all_edges)
+    target_cell = np.minimum((centers * (target / source)).astype(np.int64), target - 1)
+    source_cell = np.minimum(centers.astype(np.int64), source - 1)
+    overlaps = sparse.coo_array(
+        (lengths, (target_cell, source_cell)), shape=(target, source)
+    )
     weights = overlaps.tocsr()
     normalization = sparse.diags_array(1.0 / np.asarray(weights.sum(axis=1)).ravel())
     return sparse.csr_array(normalization @ weights)
@@ -236,13 +251,13 @@ class FileImages:
     def load_file(
         self, name: str, kind: ImageKind, message: str
     ) -> Float32Array | None:
-        """Return the values of an image that the file names; see `read`."""
+        """Return the values of an image that the file names; see `load`."""
         return self.load(name, lambda: self.references.get(name), kind, name, message)
 
     def load(
         self,
         key: Hashable,
-        content: Callable[[], bytes],
+        read_bytes: Callable[[], bytes],
         kind: ImageKind,
         name: str,
         message: str,
@@ -250,33 +265,43 @@ class FileImages:
         """Return an image's values, as `load_display_image`; None, and a note, if it
         fails.
 
+        An image is decoded once for each kind, and so is its failure; the note is added
+        at each call.
+
         Args:
             key: the same for the same image.
-            content: returns its file; raises OSError or ValueError if there is none.
+            read_bytes: returns its file; raises OSError or ValueError if there is none.
             kind: what it holds.
             name: its name in the file.
             message: the note, with {name} and {why}.
         """
         if (key, kind) not in self._cache:
-            self._cache[key, kind] = self._decode(content, kind, name)
-        values = self._cache[key, kind]
-        if not isinstance(values, str):
-            return values
-        self.note_missing(name, values, message)
-        return None
+            self._cache[key, kind] = self._decode(read_bytes, kind, name)
+        image_or_reason = self._cache[key, kind]
+        if isinstance(image_or_reason, str):
+            self.note_missing(name, image_or_reason, message)
+            return None
+        return image_or_reason
 
     def note_missing(self, name: str, reason: str, message: str) -> None:
-        """Note that an image is missing, and what replaces it."""
+        """Note that an image is missing, and what replaces it.
+
+        The message has {name} and {why}; the latter becomes the reason.
+        """
         self.notes.warn(
             message.replace("{name}", format_name(name)).replace("{why}", reason)
         )
 
     def _decode(
-        self, content: Callable[[], bytes], kind: ImageKind, name: str
+        self, read_bytes: Callable[[], bytes], kind: ImageKind, name: str
     ) -> Float32Array | str:
-        """Return the values of an image, or the reason why there are none."""
+        """Return the values of an image, or the reason why there are none.
+
+        An image that is read counts towards the largest number of pixels of all images
+        of its sort (numbers, or colors); if it was made smaller, a note says so.
+        """
         try:
-            image = Image.open(io.BytesIO(content()), formats=FORMATS)
+            image = Image.open(io.BytesIO(read_bytes()), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             return self.references.refused.get(normalize_name(name), UNREADABLE)
         (width, height) = image.size

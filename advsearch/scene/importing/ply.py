@@ -98,15 +98,17 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     has_magic = data.startswith(b"ply")
     # Some files end their lines in carriage returns alone.
     ends_in_returns = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")
-    end = _END.search(data.replace(b"\r", b"\n") if ends_in_returns else data)
-    if not has_magic or end is None:
+    header_end = _END.search(data.replace(b"\r", b"\n") if ends_in_returns else data)
+    if not has_magic or header_end is None:
         got = "half of one" if has_magic else data
         raise notes.damaged("a PLY file with a complete header", got)
-    elements, comments, order = _parse_header(decode_text(data[: end.start()]), notes)
+    elements, comments, byte_order = _parse_header(
+        decode_text(data[: header_end.start()]), notes
+    )
     notes.check_faces(elements["face"].count if "face" in elements else 0)
-    body = data[end.end() :]
+    body = data[header_end.end() :]
     position = 0
-    if order:
+    if byte_order:
         cells = np.frombuffer(body, np.uint8)
         text = b""
     else:
@@ -120,31 +122,37 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
 def _parse_header(
     header: str, notes: Notes
 ) -> tuple[dict[str, Element], list[str], str]:
-    """Return the elements, the comments and the byte order, empty for ASCII."""
+    """Return the elements, the comments and the byte order, empty for ASCII.
+
+    A property belongs to the element before it; its type has the byte order of the
+    format, which stands first. Raises FileFormatError for any other line.
+    """
     elements: dict[str, Element] = {}
     comments = list[str]()
-    order = None
-    current = None
+    byte_order = None
+    element = None
     for line in header.splitlines()[1:]:
         match line.split():
             case ["format", kind, *_] if kind in _FORMATS:
-                order = _FORMATS[kind]
+                byte_order = _FORMATS[kind]
             case ["comment" | "obj_info", *_]:
                 comments.append(line.strip().partition(line.split()[0])[2].strip())
             case ["element", name, count] if (
                 count.isdecimal() and len(count) < 20 and name not in elements
             ):
-                current = Element(name, int(count))
-                elements[name] = current
+                element = Element(name, int(count))
+                elements[name] = element
             case ["property", "list", counts, kind, name] if (
-                current and counts in _TYPES and kind in _TYPES
+                element and counts in _TYPES and kind in _TYPES
             ):
-                current.types[name] = np.dtype((order or "") + _TYPES[kind])
-                current.count_types[name] = np.dtype((order or "") + _TYPES[counts])
+                element.types[name] = np.dtype((byte_order or "") + _TYPES[kind])
+                element.count_types[name] = np.dtype(
+                    (byte_order or "") + _TYPES[counts]
+                )
             case ["property", kind, name] if (
-                current and kind in _TYPES and name not in current.types
+                element and kind in _TYPES and name not in element.types
             ):
-                current.types[name] = np.dtype((order or "") + _TYPES[kind])
+                element.types[name] = np.dtype((byte_order or "") + _TYPES[kind])
             case []:
                 pass
             case _:
@@ -152,11 +160,11 @@ def _parse_header(
                     "a PLY header of elements and their properties",
                     f"the line {format_name(line)}",
                 )
-    if order is None:
+    if byte_order is None:
         raise notes.damaged(
             f"a PLY header with a format of {', '.join(_FORMATS)}", "none of these"
         )
-    return elements, comments, order
+    return elements, comments, byte_order
 
 
 def _read_rows(
@@ -167,6 +175,9 @@ def _read_rows(
     text: bytes,
 ) -> int:
     """Read the rows of an element, and return the position of the byte after them.
+
+    If all rows are as long as the first, their values are gathered at once; only if
+    lists have different lengths are the rows walked one by one.
 
     Args:
         notes: about the file.
@@ -181,7 +192,10 @@ def _read_rows(
     """
 
     def view_from_any_byte(kind: np.dtype[np.generic]) -> Numbers:
-        """Return the numbers of a type that begin at each byte."""
+        """Return the numbers of a type that begin at each byte.
+
+        No byte is copied: number i of the view is made of the bytes from i on.
+        """
         kind = np.dtype(np.float64) if text else kind
         n_starts = max(0, len(cells) - kind.itemsize + 1)
         numbers: Numbers = np.ndarray((n_starts,), kind, cells, 0, (1,))
@@ -192,11 +206,12 @@ def _read_rows(
         name: view_from_any_byte(kind) for name, kind in element.count_types.items()
     }
     # Bytes of a scalar, or of the count of a list.
-    widths = {
+    scalar_widths = {
         name: counts.get(name, numbers).itemsize for name, numbers in values.items()
     }
 
     def check_end(end: int) -> None:
+        """Raise FileFormatError if the file has no so many bytes."""
         if end > len(cells):
             raise _make_length_error(notes, element, text)
 
@@ -206,11 +221,11 @@ def _read_rows(
         Returns:
             The bytes at which each property begins, (n_rows,), and the end of all.
         """
-        starts = {name: list[int]() for name in widths}
+        starts = {name: list[int]() for name in scalar_widths}
         byte = position
         max_length = len(cells) // (8 if text else 1)
         for _ in range(n_rows):
-            for name, width in widths.items():
+            for name, width in scalar_widths.items():
                 starts[name].append(byte)
                 check_end(byte + width)
                 if name in counts:
@@ -229,9 +244,9 @@ def _read_rows(
         }
         return arrays, byte
 
-    if not element.count or not widths:
+    if not element.count or not scalar_widths:
         return position
-    check_end(position + element.count * sum(widths.values()))
+    check_end(position + element.count * sum(scalar_widths.values()))
     # All rows are assumed to be as long as the first.
     first_starts, first_end = walk_rows(1)
     row_size = first_end - position
@@ -362,7 +377,10 @@ def _combine_colors(
 def _make_parts(
     reader: _Properties, points: Float64Array, texture_names: Sequence[str]
 ) -> list[ImportedPart]:
-    """Return the faces of a file as parts, given its points (N, 3) and textures."""
+    """Return the faces of a file as parts, given its points (N, 3) and textures.
+
+    A part for each texture, and others for faces without texture coordinates.
+    """
     notes = reader.notes
     corners, corner_counts = reader.read_polygons(len(points))
     triangles, polygon = triangulate_and_note(points[corners], corner_counts, notes)
@@ -451,7 +469,8 @@ class _Properties:
     ) -> tuple[str, ...]:
         """Return the first group of properties that an element has, () if it has none.
 
-        The properties count as read. `table` is "scalars" or "listed".
+        The properties count as read. `table` is "scalars" or "listed", a field of
+        `Element`.
         """
         properties = getattr(self.elements.get(element), table, {})
         for group in groups:
@@ -475,13 +494,14 @@ class _Properties:
             FileFormatError: there are none, one has too many or too few corners, or
                 refers to what is not there.
         """
+        # If corners have none of the known names, any other list counts.
         face_element = self.elements.get("face")
         names: tuple[str, ...] = CORNER_NAMES
         if face_element is not None:
-            others = [
+            other_lists = [
                 name for name in face_element.listed if name not in WEDGE_UV_NAMES
             ]
-            names = (*CORNER_NAMES, *others)
+            names = (*CORNER_NAMES, *other_lists)
         faces = self._find_list("face", names)
         strips = self._find_list("tristrips", CORNER_NAMES)
         corners = np.zeros(0, np.int64)
@@ -517,6 +537,7 @@ class _Properties:
         """Return the texture coordinates of triangles, or None if there are none.
 
         Files store them with the corners of faces (wedges), or else with vertices.
+        Faces that have not two numbers for each corner have none, which is noted.
 
         Args:
             corners: (C,) the vertex of each corner of the polygons.
@@ -539,14 +560,16 @@ class _Properties:
                 "corner are left out"
             )
         is_used = np.repeat(is_mapped[: len(wedges.counts)], wedges.counts)
-        used = wedges.values[is_used].astype(np.float64).reshape(-1, 2)
+        used_uvs = wedges.values[is_used].astype(np.float64).reshape(-1, 2)
         # Equal pairs become one; as complex numbers they are compared as a whole.
-        distinct, index_of_pair = np.unique(
-            used.view(np.complex128), return_inverse=True
+        distinct_uvs, index_of_pair = np.unique(
+            used_uvs.view(np.complex128), return_inverse=True
         )
-        index = np.full(len(corners), -1)
-        index[np.repeat(is_mapped, counts)] = index_of_pair.reshape(-1)
-        return IndexedValues(distinct.view(np.float64).reshape(-1, 2), index[triangles])
+        uv_of_corner = np.full(len(corners), -1)
+        uv_of_corner[np.repeat(is_mapped, counts)] = index_of_pair.reshape(-1)
+        return IndexedValues(
+            distinct_uvs.view(np.float64).reshape(-1, 2), uv_of_corner[triangles]
+        )
 
     def read_colors(
         self, vertices: IntArray, polygons: IntArray
@@ -577,20 +600,28 @@ class _Properties:
     def _read_element_colors(
         self, element: str, index: IntArray
     ) -> Float64Array | None:
-        """Return the linear colors (..., 3) of rows of an element, or None."""
+        """Return the linear colors (..., 3) of rows of an element, or None.
+
+        An alpha that is opaque everywhere counts as read. An index past the last row
+        has neutral grey.
+        """
         values = self.read_columns(element, COLOR_NAMES)
         if values is None:
             return None
-        table = self.elements[element]
-        kind = table.types[self._find_group(element, "scalars", *COLOR_NAMES)[0]]
-        for name in set(ALPHA_NAMES) & set(table.scalars):
-            alphas = table.scalars[name].astype(np.float64)
+        element_table = self.elements[element]
+        color_type = element_table.types[
+            self._find_group(element, "scalars", *COLOR_NAMES)[0]
+        ]
+        for name in set(ALPHA_NAMES) & set(element_table.scalars):
+            alphas = element_table.scalars[name].astype(np.float64)
             is_opaque = not len(alphas) or alphas.min() >= _find_scale(
-                alphas[:, None], kind
+                alphas[:, None], color_type
             )
             if is_opaque:
                 self.notes.mark_read(f"{element} property", name)
-        display = np.clip(np.nan_to_num(values / _find_scale(values, kind)), 0.0, 1.0)
+        display = np.clip(
+            np.nan_to_num(values / _find_scale(values, color_type)), 0.0, 1.0
+        )
         linear = srgb_to_linear(display.astype(np.float32))
         # Triangles of strips have no row: they are neutral grey.
         neutral = srgb_to_linear(np.full((1, 3), NEUTRAL_GREY, np.float32))
@@ -601,6 +632,10 @@ class _Properties:
         self, names: Sequence[str], corners: IntArray, counts: IntArray
     ) -> IntArray:
         """Return the index of each polygon's texture, (P,); -1 for none.
+
+        It is the `texnumber` of faces, or that of a face's first vertex. Without any,
+        all polygons have the first texture. A number of a texture that there is not is
+        noted.
 
         Args:
             names: the textures of the file.
@@ -617,10 +652,10 @@ class _Properties:
                 break
         if element is None:
             if len(names) > 1:
-                only = (
+                used_texture = (
                     f"of its {len(names)} textures only {format_name(names[0])} is used"
                 )
-                self.notes.warn(f"{only}, as its faces have no texnumber")
+                self.notes.warn(f"{used_texture}, as its faces have no texnumber")
             return np.zeros(len(counts), np.int64)
         numbers = _to_integers(self.elements[element].scalars["texnumber"])
         if element == "face":
@@ -641,7 +676,8 @@ class _Properties:
     ) -> list[ImportedSurface]:
         """Return the surface of each texture.
 
-        `has_no_colors` is whether the file has no colors that could replace a texture.
+        Its alpha is left out, with a note if it is not opaque. `has_no_colors` is
+        whether the file has no colors that could replace a texture.
         """
         pictures = FileImages(len(names), References(Path(self.notes.path)), self.notes)
         surfaces = {}
@@ -649,10 +685,10 @@ class _Properties:
         if has_no_colors:
             substitute = "neutral grey is"
         for name in dict.fromkeys(names):
-            words = (
+            note_template = (
                 f" names the texture {{name}}, which {{why}}; {substitute} used instead"
             )
-            texture = pictures.load_file(name, "colours and alpha", words)
+            texture = pictures.load_file(name, "colours and alpha", note_template)
             if texture is not None:
                 if texture[:, :, 3].min() < 1.0:
                     self.notes.warn(f"the alpha of {format_name(name)} is left out")
@@ -662,7 +698,7 @@ class _Properties:
 
 
 def _to_integers(values: npt.NDArray[np.generic]) -> IntArray:
-    """Return values as integers; floats that hold none become -1."""
+    """Return values as integers; floats that hold none, of 2^53 and more, become -1."""
     if values.dtype.kind == "f":
         numbers = values.astype(np.float64)
         values = np.where(np.abs(numbers) < 2.0**53, numbers, -1.0)
@@ -672,7 +708,9 @@ def _to_integers(values: npt.NDArray[np.generic]) -> IntArray:
 def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
     """Return the value of full brightness in colors (N, C) of a type.
 
-    It is 1 for floats, unless they are clearly in [0, 255].
+    It is 1 for floats, unless they are clearly in [0, 255]. Integers have the smallest
+    of 255, 65535 and their type's largest value that all of them fit, but 16-bit ones
+    are always of 65535.
     """
     largest = float(np.nan_to_num(values).max(initial=0.0))
     if kind.kind == "f":
@@ -681,31 +719,35 @@ def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
         return 255.0
     if kind.itemsize == 2 or largest <= 65535.0:
         return 65535.0
-    is_signed = kind.kind == "i"
-    return 2.0 ** (8 * kind.itemsize - is_signed) - 1.0
+    n_bits = 8 * kind.itemsize
+    if kind.kind == "i":
+        n_bits -= 1  # the sign
+    return 2.0**n_bits - 1.0
 
 
 def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
     """Return the triangles (T, 3) of triangle strips.
 
     Every second triangle of a strip is wound backwards, and vertex -1 starts a new
-    strip.
+    strip. Triangles with a repeated vertex are left out.
 
     Args:
         vertices: those of all strips, concatenated.
         counts: (S,) how many vertices each strip has.
     """
-    begins = np.zeros(len(vertices) + 1, dtype=np.bool_)
-    begins[np.cumsum(counts) - counts] = True
-    begins[1:][vertices < 0] = True
+    is_strip_start = np.zeros(len(vertices) + 1, dtype=np.bool_)
+    is_strip_start[np.cumsum(counts) - counts] = True
+    is_strip_start[1:][vertices < 0] = True
     index = np.arange(len(vertices))
-    strip_start = np.maximum.accumulate(np.where(begins[:-1], index, 0))
+    # for each vertex, where its strip began
+    strip_start = np.maximum.accumulate(np.where(is_strip_start[:-1], index, 0))
     position = index - strip_start
-    last = np.flatnonzero((position >= 2) & (vertices >= 0))
+    last_corner = np.flatnonzero((position >= 2) & (vertices >= 0))
     triangles: IntArray = np.stack(
-        [vertices[last - 2], vertices[last - 1], vertices[last]], axis=1
+        [vertices[last_corner - 2], vertices[last_corner - 1], vertices[last_corner]],
+        axis=1,
     )
-    is_odd = position[last] % 2 == 1
+    is_odd = position[last_corner] % 2 == 1
     triangles[is_odd] = triangles[is_odd][:, [1, 0, 2]]
     a, b, c = triangles.T
     is_degenerate = (a == b) | (b == c) | (a == c)

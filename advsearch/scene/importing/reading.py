@@ -20,8 +20,8 @@ from advsearch.scene.importing.files import check_faces as check_faces
 from advsearch.scene.importing.files import damaged as damaged
 from advsearch.scene.importing.files import describe_content as describe_content
 from advsearch.scene.importing.files import format_name as format_name
+from advsearch.scene.importing.files import get_last_line as get_last_line
 from advsearch.scene.importing.files import is_number as is_number
-from advsearch.scene.importing.files import last_line as last_line
 from advsearch.scene.importing.files import read_bytes as read_bytes
 from advsearch.scene.importing.geometry import triangulate as triangulate
 from advsearch.scene.importing.parts import ImportedPart as ImportedPart
@@ -37,6 +37,7 @@ from advsearch.trust.programs import make_environment as make_environment
 from advsearch.trust.programs import run_converter as run_converter
 
 if TYPE_CHECKING:
+    from advsearch.scene import backdrop as backdrop
     from advsearch.scene.importing import gltf_entries as gltf_entries
     from advsearch.scene.importing import hdr as hdr
     from advsearch.scene.importing import pictures as pictures
@@ -44,14 +45,19 @@ if TYPE_CHECKING:
     from advsearch.scene.importing.gltf import LARGEST_TREE as LARGEST_TREE
 
 _LATE = {"DEEPEST_TREE": "gltf", "LARGEST_TREE": "gltf"}
-_LATE_MODULES = ("gltf_entries", "hdr", "pictures")
-"""Only some need these, and they import pydantic, scipy or OpenEXR."""
+_LATE_MODULES = {
+    "backdrop": "advsearch.scene.backdrop",
+    "gltf_entries": "advsearch.scene.importing.gltf_entries",
+    "hdr": "advsearch.scene.importing.hdr",
+    "pictures": "advsearch.scene.importing.pictures",
+}
+"""Only some need these, and they import pydantic, scipy, torch or OpenEXR."""
 
 
 def __getattr__(name: str) -> Any:
     """Import a name on first use (PEP 562)."""
     if name in _LATE_MODULES:
-        return import_module(f"advsearch.scene.importing.{name}")
+        return import_module(_LATE_MODULES[name])
     if name in _LATE:
         return getattr(import_module(f"advsearch.scene.importing.{_LATE[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -128,30 +128,33 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     surroundings = _make_surrounding_meshes(
         path, header, parts, object_nodes, names, front, frame, notes
     )
-    candela, reason = _find_light_unit(header, parts, bool(lights))
-    if reason:
-        notes.append(f"{path.name}: {reason}")
-    surroundings += _make_lamps(path, header, lights, candela, node_poses, names, frame)
+    candela_per_unit, unit_note = _find_light_unit(header, parts, bool(lights))
+    if unit_note:
+        notes.append(f"{path.name}: {unit_note}")
+    surroundings += _make_lamps(
+        path, header, lights, candela_per_unit, node_poses, names, frame
+    )
     cameras = _make_cameras(path, header, node_poses, frame)
     notes.extend(gltf_parts.describe_changed_lights(header, path.name))
     asset = make_object(
         object_parts,
         notes,
-        path,
-        f"{make_safe_name(path)}-{sanitize_name(node)}",
-        "y",
-        front,
+        file=path,
+        name=f"{make_safe_name(path)}-{sanitize_name(node)}",
+        up="y",
+        front=front,
     )
     return ImportedScene(asset, tuple(surroundings), cameras)
 
 
 def _find_node_lights(header: Header, nodes: Iterable[int]) -> dict[int, LightEntry]:
     """Return the light of each node that has one."""
-    return {
-        index: header.lights[light_index]
-        for index in nodes
-        if (light_index := header.nodes[index].lamp) is not None
-    }
+    lights = {}
+    for node in nodes:
+        light_index = header.nodes[node].lamp
+        if light_index is not None:
+            lights[node] = header.lights[light_index]
+    return lights
 
 
 def _make_surrounding_meshes(
@@ -192,17 +195,20 @@ def _make_lamps(
     path: Path,
     header: Header,
     lights: Mapping[int, LightEntry],
-    candela: float,
+    candela_per_unit: float,
     node_poses: Mapping[int, Float64Array],
     names: UniqueNames,
     frame: FileFrame,
 ) -> list[ScenePart]:
-    """Return the lights of nodes as lamps; arguments and errors as for each."""
+    """Return the lights of nodes as lamps; arguments and errors as for `_make_lamp`.
+
+    Nodes are indices; `names` are those that are taken, to which theirs are added.
+    """
     lamps: list[ScenePart] = []
     for index, light in lights.items():
         name = names.make_unique(light.name or header.get_label(index))
         pose = node_poses[index]
-        lamps.append(_make_lamp(path, name, light, candela, pose, frame))
+        lamps.append(_make_lamp(path, name, light, candela_per_unit, pose, frame))
     return lamps
 
 
@@ -234,6 +240,7 @@ def _find_node(
 
 
 def _check_surroundings(path: Path, count: int) -> None:
+    """Raise InputError if there are more than `MAX_SURROUNDINGS` meshes and lamps."""
     if count > MAX_SURROUNDINGS:
         limit = f"at most {MAX_SURROUNDINGS} meshes and lights beside the object"
         raise InputError(
@@ -248,13 +255,19 @@ def _make_surrounding_mesh(
     front: FileAxis,
     object_frame: FileFrame,
 ) -> tuple[ScenePart, tuple[str, ...]]:
-    """Return one node's parts as a scene part around the object, and the warnings."""
+    """Return one node's parts as a scene part around the object, and the warnings.
+
+    The shape is normalised as an object is; its pose puts it back to where it was, with
+    the size that it had relative to the object.
+    """
     frame = _compute_frame(parts, object_frame.turn)
-    shape = make_object(parts, [], path, name, "y", front)
-    matrix = np.eye(4)
-    matrix[:3, :3] *= frame.size / object_frame.size
-    matrix[:3, 3] = object_frame.to_frame(frame.origin)
-    return make_mesh_part(shape.name, shape, matrix, shape.material), shape.warnings
+    shape = make_object(parts, notes=[], file=path, name=name, up="y", front=front)
+    mesh_to_object = np.eye(4)
+    mesh_to_object[:3, :3] *= frame.size / object_frame.size
+    mesh_to_object[:3, 3] = object_frame.to_frame(frame.origin)
+    return make_mesh_part(
+        shape.name, shape, mesh_to_object, shape.material
+    ), shape.warnings
 
 
 def list_node_names(path: Path) -> list[str]:
@@ -323,7 +336,7 @@ def _group_by_node(parts: Iterable[ImportedPart]) -> dict[int, list[ImportedPart
 
 
 @np.errstate(all="ignore")
-def contents(path: Path) -> Contents:
+def list_contents(path: Path) -> Contents:
     """Return what can be imported from a mesh or glTF file.
 
     Mitsuba's files have a function of the same name in their own module.
@@ -337,10 +350,14 @@ def contents(path: Path) -> Contents:
     name = make_safe_name(path)
     if path.suffix.lower() not in GLTF_SUFFIXES:
         front = find_front(path, None)
-        return Contents(make_object(parts, notes, path, name, None, front))
+        return Contents(
+            make_object(parts, notes, file=path, name=name, up=None, front=front)
+        )
     header = gltf.read_header(path, data)
     notes += gltf_parts.describe_changed_lights(header, path.name)
-    asset = make_object(parts, notes, path, name, "y", find_front(path, header))
+    asset = make_object(
+        parts, notes, file=path, name=name, up="y", front=find_front(path, header)
+    )
     parts_of_node = _group_by_node(parts)
     mesh_names = _make_mesh_names(header, parts, UniqueNames(RESERVED_NAMES))
     nodes = [
@@ -388,13 +405,15 @@ def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFra
 
     The largest extent is meant; parts are centred in x and y.
     """
-    corners = []
+    face_corners = []
     for part in select_visible(parts):
         triangles = part.vertices[part.faces]
         area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
         extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
-        corners.append(triangles[area > MIN_DOUBLED_AREA * extent**2].reshape(-1, 3))
-    points = np.concatenate(corners) @ turn.T
+        face_corners.append(
+            triangles[area > MIN_DOUBLED_AREA * extent**2].reshape(-1, 3)
+        )
+    points = np.concatenate(face_corners) @ turn.T
     is_valid = (
         np.isfinite(points).all() and len(points) and np.ptp(points, axis=0).max() > 0.0
     )
@@ -442,24 +461,28 @@ def _make_lamp(
     path: Path,
     name: str,
     light: LightEntry,
-    candela: float,
+    candela_per_unit: float,
     pose: Float64Array,
     frame: FileFrame,
 ) -> PointLamp | SpotLamp:
     """Return a light of a file as a lamp.
 
+    A directional light becomes a lamp so far away that its rays are parallel, and as
+    bright there as its lux at the object. Intensities of others are scaled by the
+    square of the object's size.
+
     Args:
         path: the file, for messages.
         name: name of the lamp.
         light: its entry in the header.
-        candela: how many are one unit of radiant intensity.
+        candela_per_unit: how many candela are one unit of radiant intensity.
         pose: (4, 4) of its node.
         frame: that of the object.
 
     Raises:
         InputError: it is too far away or too bright.
     """
-    intensity = np.array(light.color) * light.intensity / candela
+    intensity = np.array(light.color) * light.intensity / candela_per_unit
     if light.type == "directional":
         direction = frame.turn @ pose[:3, 2]  # it shines along its -z
         length = max(float(np.linalg.norm(direction)), 1e-12)
@@ -517,10 +540,11 @@ def _make_camera(
     matrix = np.eye(4)
     matrix[:3, :3] = axes
     matrix[:3, 3] = frame.to_frame(frame.turn @ pose[:3, 3])
-    # Without one, the aspect ratio is that of the image (section 5.13).
+    # Without one, the aspect ratio is that of the image (section 5.13), and the field
+    # of view is that of the height.
     aspect_ratio = camera.perspective.aspectRatio
-    half_height = math.tan(camera.perspective.yfov / 2.0)
-    fov = math.degrees(2.0 * math.atan(half_height * max(aspect_ratio or 1.0, 1.0)))
+    half_tangent = math.tan(camera.perspective.yfov / 2.0)
+    fov = math.degrees(2.0 * math.atan(half_tangent * max(aspect_ratio or 1.0, 1.0)))
     is_mirrored = np.linalg.det(axes) < 0.0
     if not (np.abs(matrix[:3, 3]) <= MAX_DISTANCE).all():  # NaN is not
         problem = f"within {MAX_DISTANCE:g} object sizes, got more; correct its place"

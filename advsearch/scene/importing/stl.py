@@ -33,11 +33,14 @@ _COLOR_FLAG = 0x8000
 def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an STL file as one part.
 
-    Its facet normals are ignored and computed anew, as in other programs.
+    It is binary if it has the length that its number of facets asks for, whatever it
+    begins with; text begins with "solid". Its facet normals are ignored and computed
+    anew, as in other programs.
 
     Raises:
         FileFormatError: the file is corrupt, or has no facets.
     """
+    # A header of 80 bytes, the number of facets in 4, and 50 bytes for each.
     expected_size = 84
     if len(data) >= 84:
         (n_facets,) = struct.unpack_from("<I", data, 80)
@@ -67,11 +70,19 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
             f"{path}: expected a mesh with faces, got none; export triangles"
         )
     faces = np.arange(len(points)).reshape(-1, 3)
-    return [ImportedPart(points, faces, None, None, corner_colors, surface)]
+    return [
+        ImportedPart(
+            vertices=points, faces=faces, colors=corner_colors, surface=surface
+        )
+    ]
 
 
 def _parse_text(data: bytes, notes: Notes) -> Float64Array:
-    """Return the points (3 F, 3) of an ASCII file."""
+    """Return the points (3 F, 3) of an ASCII file.
+
+    Words that the format does not have are recorded. Raises FileFormatError if the file
+    is cut short, or facets have not three vertices of three numbers.
+    """
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
         raise notes.damaged(
             "an ASCII STL file that ends in 'endsolid'", "one that is cut short"
@@ -112,20 +123,23 @@ def _read_colors(
         attributes: (F,) attribute bytes of the facets.
         notes: about the file.
     """
-    magics = head.find(b"COLOR=")
+    magics_position = head.find(b"COLOR=")
     channels = [(attributes >> shift) & 31 for shift in (10, 5, 0)]
     colors = np.stack(channels, axis=1).astype(np.float32) / np.float32(31.0)
-    if 0 <= magics <= 70:
+    if 0 <= magics_position <= 70:
         if b"MATERIAL=" in head:
             notes.record("header entry", "MATERIAL")
+        # Where no facet has any bit set, all have the color of the object.
         has_color = (attributes & _COLOR_FLAG == 0) & bool(attributes.any())
         colors = colors[:, ::-1]
-        default = np.frombuffer(head, np.uint8, 3, magics + 6) / np.float32(255.0)
-        if 0 < head[magics + 9] < 255:
+        default_color = np.frombuffer(
+            head, np.uint8, 3, magics_position + 6
+        ) / np.float32(255.0)
+        if 0 < head[magics_position + 9] < 255:
             notes.record("opacity of its header entry", "COLOR")
     else:
         has_color = attributes & _COLOR_FLAG != 0
-        default = np.full(3, NEUTRAL_GREY, np.float32)
+        default_color = np.full(3, NEUTRAL_GREY, np.float32)
         if not has_color.any():
             if attributes.any():
                 notes.record(
@@ -133,5 +147,5 @@ def _read_colors(
                     f"{attributes.max():#06x}",
                 )
             return None
-    display = np.where(has_color[:, None], colors, default).astype(np.float32)
+    display = np.where(has_color[:, None], colors, default_color).astype(np.float32)
     return np.asarray(srgb_to_linear(display), dtype=np.float64)

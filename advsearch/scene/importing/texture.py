@@ -77,31 +77,42 @@ def apply_textures(
 ) -> tuple[Soup, SurfaceMaps]:
     """Give every corner of a repaired soup UVs in [0, 1], and make the maps that fit.
 
-    The file's UVs and images are used if possible; else they are baked.
+    The file's UVs and images are used if all faces share them and they can be used
+    unchanged: then the soup is cropped to the window of its UVs at most. Otherwise it
+    is unwrapped, the images are baked, and a note says why. A soup of one color has a
+    plain map, and keeps its UVs if these are usable.
 
     Args:
         soup: a repaired soup.
         surfaces: the surface of each of its parts.
         notes: where it is reported why images were baked.
+
+    Returns:
+        The soup with its UVs, and the maps for them.
     """
-    used = _list_used_surfaces(soup, surfaces)
-    first = used[0]
-    is_uniform = all(surface.has_same_maps(first) for surface in used)
+    used_surfaces = _list_used_surfaces(soup, surfaces)
+    first_surface = used_surfaces[0]
+    is_uniform = all(surface.has_same_maps(first_surface) for surface in used_surfaces)
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
     material = index_materials(soup, surfaces)[1]
+    # First the ways that need no baking; if none is possible, the last one.
     is_lit_twice = False
     if is_uniform and has_uniform_factor:
-        if not first.images:
-            return _texture_plain(soup, first, material)
-        is_untinted = first.texture is None or soup.colors.min() == 1.0
+        if not first_surface.images:
+            return _texture_plain(soup, first_surface, material)
+        is_untinted = first_surface.texture is None or soup.colors.min() == 1.0
         if is_untinted and np.isfinite(soup.uvs).all():
             uvs, images = _crop_to_window(
-                _move_into_unit_square(soup), first.images, first.texture
+                _move_into_unit_square(soup),
+                first_surface.images,
+                first_surface.texture,
             )
             is_usable = _is_usable(soup, uvs)
-            is_lit_twice = is_usable and _is_lit_twice(uvs, first, images)
+            is_lit_twice = is_usable and _is_lit_twice(uvs, first_surface, images)
             if is_usable and not is_lit_twice:
-                return _texture_with_images(soup, uvs, first.with_images(images))
+                return _texture_with_images(
+                    soup, uvs, first_surface.with_images(images)
+                )
     unwrapped_soup = unwrap(soup, material)
     maps = bake(unwrapped_soup.uvs, soup, surfaces)
     reason = (
@@ -109,20 +120,18 @@ def apply_textures(
         "and its texture resampled"
     )
     if not is_lit_twice:
-        reason = _describe_reason(soup, used, is_uniform, has_uniform_factor)
+        reason = _describe_reason(soup, used_surfaces, is_uniform, has_uniform_factor)
     notes.warn(f"{reason} ({_describe_size(len(maps.color), soup, surfaces)})")
     return unwrapped_soup, maps
 
 
 def _describe_size(size: int, soup: Soup, surfaces: Sequence[ImportedSurface]) -> str:
-    """Describe the size of baked maps, and how much coarser they are than the
-    images.
-    """
+    """Describe the size of baked maps, and how much coarser they are than the images."""
     ratio = _count_texels(soup, surfaces) / (size * size * _FILL_FRACTION)
-    fewer = ""
+    ratio_text = ""
     if ratio >= _MAX_TEXEL_RATIO:
-        fewer = f", {ratio:.0f} times fewer than its pictures have there"
-    return f"{size} x {size} texels{fewer}"
+        ratio_text = f", {ratio:.0f} times fewer than its pictures have there"
+    return f"{size} x {size} texels{ratio_text}"
 
 
 def _texture_plain(
@@ -160,7 +169,11 @@ def index_materials(
 
 
 def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
-    """Return whether faces of different materials share many texels."""
+    """Return whether faces of different materials share many texels.
+
+    More than `_MAX_SHARED` of the texels that UVs (F, 3, 2) cover, at a size of
+    `BAKED_SIZE`; `material` is the index of each face's (F,).
+    """
     if material.min() == material.max():
         return False
     size = BAKED_SIZE
@@ -188,7 +201,9 @@ def _is_lit_twice(
 ) -> bool:
     """Return whether texels that emit light are on several faces.
 
-    Mitsuba would send light from one of them only.
+    Mitsuba would send light from one of them only. More than `_MAX_SHARED` of the lit
+    texels have to be; an emission that is the same everywhere has no texels. The last
+    picture is that of the emission.
     """
     if surface.emission is None or surface.emission.shape == (1, 1, 3):
         return False
@@ -215,7 +230,11 @@ def _describe_reason(
     is_uniform: bool,
     has_uniform_factor: bool,
 ) -> str:
-    """Return the reason why an object was baked, as a sentence for its warnings."""
+    """Return the reason why an object was baked, as a sentence for its warnings.
+
+    The first that holds of: several materials or pictures, colors of vertices, missing
+    texture coordinates, unusable ones.
+    """
     if not is_uniform:
         n_materials = len({surface.name or id(surface) for surface in used})
         if n_materials > 1:
@@ -265,7 +284,11 @@ def _tint(
 
 
 def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
-    """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny."""
+    """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny.
+
+    Of the surface's area at most the fraction `_MAX_SQUASHED` may have none in UV
+    space, and all faces cover at least `_MIN_UV_AREA` there.
+    """
     if (
         not np.isfinite(uvs).all()
         or uvs.min() < -_UV_TOLERANCE
@@ -273,7 +296,8 @@ def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
     ):
         return False
     uv_area = np.abs(compute_doubled_areas(uvs)) / 2.0
-    surface_area = np.linalg.norm(soup.face_vectors(), axis=1)
+    surface_area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
+    # 1e-12: faces that are a point or a line in UV space
     squashed_area = surface_area[uv_area < 1e-12].sum()
     return bool(
         squashed_area <= _MAX_SQUASHED * surface_area.sum()
@@ -284,7 +308,8 @@ def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
 def _move_into_unit_square(soup: Soup) -> Float64Array:
     """Move each chart by an integer offset so that it starts in the unit square.
 
-    A repeating texture looks the same. Returns UVs (F, 3, 2).
+    A repeating texture looks the same. A chart is what corners with the same point and
+    UV connect. Returns UVs (F, 3, 2).
     """
     flat_uvs = soup.uvs.reshape(-1, 2)
     corners = np.column_stack([soup.faces.reshape(-1), flat_uvs])
@@ -293,9 +318,9 @@ def _move_into_unit_square(soup: Soup) -> Float64Array:
     starts = np.concatenate([vertex[:, 0], vertex[:, 1]])
     ends = np.concatenate([vertex[:, 1], vertex[:, 2]])
     chart = find_components(int(vertex.max()) + 1, starts, ends)
-    low = np.full((int(chart.max()) + 1, 2), np.inf)
-    np.minimum.at(low, chart[vertex.reshape(-1)], flat_uvs)
-    uvs: Float64Array = soup.uvs - np.floor(low + _UV_TOLERANCE)[chart[vertex]]
+    chart_corner = np.full((int(chart.max()) + 1, 2), np.inf)
+    np.minimum.at(chart_corner, chart[vertex.reshape(-1)], flat_uvs)
+    uvs: Float64Array = soup.uvs - np.floor(chart_corner + _UV_TOLERANCE)[chart[vertex]]
     return uvs
 
 
@@ -304,48 +329,55 @@ def _crop_to_window(
 ) -> tuple[Float64Array, Sequence[Float32Array]]:
     """Crop images to the window that UVs span; the layout of the charts stays.
 
-    This is done if UVs overstep the unit square a little or use a corner of it. Windows
-    larger than `_MAX_WINDOW` textures are left alone: there the textures repeat.
+    This is done if UVs overstep the unit square a little or use a corner of it. The
+    window is one texel wider on each side. Windows larger than `_MAX_WINDOW` textures
+    are left alone: there the textures repeat.
 
     Args:
         uvs: (F, 3, 2).
         pictures: images (H, W, C).
         colors: which of them has colors, filtered in linear light.
+
+    Returns:
+        UVs relative to the window, and the images of it; or both as they were.
     """
-    texel = np.max(
+    largest_texel = np.max(
         [1.0 / np.array(picture.shape[1::-1]) for picture in pictures], axis=0
     )
-    lower = uvs.min(axis=(0, 1)) - texel
-    upper = uvs.max(axis=(0, 1)) + texel
-    size = upper - lower
+    window_lower = uvs.min(axis=(0, 1)) - largest_texel
+    window_upper = uvs.max(axis=(0, 1)) + largest_texel
+    window_size = window_upper - window_lower
     is_inside = (
-        lower.min() >= -_UV_TOLERANCE - texel.max()
-        and upper.max() <= 1.0 + _UV_TOLERANCE + texel.max()
+        window_lower.min() >= -_UV_TOLERANCE - largest_texel.max()
+        and window_upper.max() <= 1.0 + _UV_TOLERANCE + largest_texel.max()
     )
     is_filled = (
         is_inside and np.abs(compute_doubled_areas(uvs)).sum() / 2.0 >= _MIN_UV_AREA
     )
-    if size.max() > _MAX_WINDOW or is_filled:
+    if window_size.max() > _MAX_WINDOW or is_filled:
         return uvs, pictures
 
     def crop(picture: Float32Array) -> Float32Array:
         """Return an image of the window; texels keep their size."""
-        shape = np.ceil(size * np.array(picture.shape[1::-1]))
+        shape = np.ceil(window_size * np.array(picture.shape[1::-1]))
         width, height = np.clip(shape, 1, TEXTURE_LIMIT).astype(int)
-        columns = lower[0] + (np.arange(width) + 0.5) / width * size[0]
-        rows = upper[1] - (np.arange(height) + 0.5) / height * size[1]
+        columns = window_lower[0] + (np.arange(width) + 0.5) / width * window_size[0]
+        rows = window_upper[1] - (np.arange(height) + 0.5) / height * window_size[1]
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         look_up = sample_colors if picture is colors else sample_texture
         return look_up(picture, grid).reshape(height, width, -1)
 
-    return (uvs - lower) / size, [crop(picture) for picture in pictures]
+    return (uvs - window_lower) / window_size, [crop(picture) for picture in pictures]
 
 
 # ---- Baking ----
 
 
 def _choose_size(n_texels: float) -> int:
-    """Return the width of square maps with room for texels, if there may be so many."""
+    """Return the width of square maps with room for so many texels.
+
+    It is doubled from `BAKED_SIZE` up to `TEXTURE_LIMIT`, even if that has less room.
+    """
     size = BAKED_SIZE
     while size < TEXTURE_LIMIT and size * size * _FILL_FRACTION < n_texels:
         size *= 2
@@ -358,7 +390,8 @@ def bake(
     """Bake the colors, normals and emission of a soup into maps for new UVs.
 
     Texels outside every chart repeat the nearest one inside, so that filtering finds no
-    seam.
+    seam. Faces without UVs in the file have the mean color of their texture, and
+    neither bumps nor emission.
 
     Args:
         uvs: (F, 3, 2) new UVs in [0, 1] without overlaps.
@@ -402,7 +435,8 @@ def bake(
 def _make_blank_maps(surfaces: Sequence[ImportedSurface], size: int) -> SurfaceMaps:
     """Return white, flat and dark maps (N, N, ...), of which surfaces need some."""
     has_opacity = any(_get_base_color(surface).shape[-1] == 4 for surface in surfaces)
-    color = np.ones((size, size, 3 + has_opacity), np.float32)
+    n_channels = 4 if has_opacity else 3
+    color = np.ones((size, size, n_channels), np.float32)
     normals = None
     if any(surface.normal_map is not None for surface in surfaces):
         normals = np.full((size, size, 3), FLAT_TEXEL)
@@ -449,7 +483,7 @@ def _sample_base_color(
     if surface.texture is not None:
         shows_texture = [other.texture is surface.texture for other in surfaces]
         is_selected = np.array(shows_texture)[soup.part]
-        areas = np.linalg.norm(soup.face_vectors(), axis=1)[is_selected]
+        areas = np.linalg.norm(soup.compute_face_vectors(), axis=1)[is_selected]
         mean = average_over_faces(
             _to_linear(surface.texture), soup.uvs[is_selected], areas
         )
@@ -458,19 +492,23 @@ def _sample_base_color(
 
 
 def _count_texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
-    """Return how many texels of the file's images an object shows."""
+    """Return how many texels of the file's images an object shows.
+
+    A part counts by the area of its UVs and the largest of its images.
+    """
     n_texels = 0.0
     uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
     for part, area in enumerate(np.bincount(soup.part, uv_areas)):
-        sizes = (
-            picture.shape[0] * picture.shape[1] for picture in surfaces[part].images
-        )
+        sizes = (image.shape[0] * image.shape[1] for image in surfaces[part].images)
         n_texels += float(area) * max(sizes, default=0)
     return n_texels
 
 
 def _sample_nearest(texture: Float32Array, uvs: Float64Array) -> Float32Array:
-    """Return the texels (N, C) of a repeating texture that UVs (N, 2) are in."""
+    """Return the texels (N, C) of a repeating texture that UVs (N, 2) are in.
+
+    The last modulo keeps 1.0, to which a tiny negative number is rounded, inside.
+    """
     height, width = texture.shape[:2]
     rows = (1.0 - uvs[:, 1]) % 1.0 * height
     columns = uvs[:, 0] % 1.0 * width
@@ -500,36 +538,37 @@ def average_over_faces(
         return np.asarray(texture.mean(axis=(0, 1), dtype=np.float64), np.float32)
     uvs = uvs[is_known]
     areas = areas[is_known]
-    steps = int(np.clip(np.sqrt(_MAX_SAMPLES / len(areas)), 1, _MAX_STEPS))
-    weights = _compute_sample_weights(steps)
-    total = np.zeros(texture.shape[2])
+    n_steps = int(np.clip(np.sqrt(_MAX_SAMPLES / len(areas)), 1, _MAX_STEPS))
+    weights = _compute_sample_weights(n_steps)
+    weighted_sum = np.zeros(texture.shape[2])
     n_batches = -(-len(areas) * len(weights) // _MAX_SAMPLES)
     for batch in np.array_split(np.arange(len(areas)), n_batches):
-        points = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
-        texels = _sample_nearest(texture, points)
+        sample_uvs = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
+        texels = _sample_nearest(texture, sample_uvs)
         face_means = texels.reshape(len(batch), len(weights), -1).mean(
             axis=1, dtype=np.float64
         )
-        total += areas[batch] @ face_means
-    return np.asarray(total / areas.sum(), np.float32)
+        weighted_sum += areas[batch] @ face_means
+    return np.asarray(weighted_sum / areas.sum(), np.float32)
 
 
 def _compute_sample_weights(steps: int) -> Float64Array:
     """Return barycentric weights (P, 3) of the centers of small triangles.
 
-    A triangle is divided into steps**2 equal ones, some of which point up and some
-    down.
+    A triangle is divided into steps**2 equal ones. Those that point up have their
+    corner at (i, j) and their center a third of a step beyond it; those that point down
+    two thirds.
     """
     grid_i, grid_j = np.meshgrid(np.arange(steps), np.arange(steps))
     i = grid_i.reshape(-1)
     j = grid_j.reshape(-1)
     is_up = i + j < steps
     is_down = i + j < steps - 1
-    b, c = (
+    weight_b, weight_c = (
         np.concatenate([index[is_up] + 1.0 / 3.0, index[is_down] + 2.0 / 3.0]) / steps
         for index in (i, j)
     )
-    return np.stack([1.0 - b - c, b, c], axis=1)
+    return np.stack([1.0 - weight_b - weight_c, weight_b, weight_c], axis=1)
 
 
 def sample_colors(colors: Float32Array, uvs: Float64Array) -> Float32Array:
@@ -589,8 +628,9 @@ def _unmirror(
 ) -> tuple[Soup, SurfaceMaps]:
     """Return a soup whose UVs mirror no face, and the maps for it.
 
-    No texel is resampled. If some faces are mirrored, the maps get a second half, which
-    is the first one mirrored, and these faces are moved there.
+    No texel is resampled. Only a normal map needs it. If all faces are mirrored, the
+    bumps' y is reversed; if some are, the maps get a second half, which is the first
+    one mirrored, and these faces are moved there.
 
     Args:
         soup: the object.
@@ -600,16 +640,18 @@ def _unmirror(
     soup = replace(soup, uvs=uvs)
     normals = maps.normals
     is_mirrored = compute_doubled_areas(uvs) < 0.0
-    area = np.linalg.norm(soup.face_vectors(), axis=1)
+    area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
     mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
     if normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
         return soup, maps
     if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:
-        flipped = normals * np.array([1, -1, 1], np.float32) + np.array(
+        # y -> 1 - y of stored texels in [0, 1] reverses the sign
+        flipped_normals = normals * np.array([1, -1, 1], np.float32) + np.array(
             [0, 1, 0], np.float32
         )
-        return soup, replace(maps, normals=flipped)
+        return soup, replace(maps, normals=flipped_normals)
     new_uvs = uvs.copy()
+    # Both halves have half of the width: u in [0, 2] first, then halved.
     new_uvs[is_mirrored, :, 0] = 2.0 - new_uvs[is_mirrored, :, 0]
     new_uvs[:, :, 0] /= 2.0
     mirrored_normals = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array(
@@ -632,12 +674,17 @@ def convert_normals(
 ) -> Float32Array:
     """Convert texels of a normal map from the tangents of old UVs to those of new UVs.
 
+    A normal that cannot be converted, where UVs have no area, becomes upright.
+
     Args:
         texels: (T, 3) of the normal map.
         old_soup: the object with the old UVs.
         new_uvs: (F, 3, 2) the new UVs.
         face: (T,) the face that each texel is on.
         weights: (T, 3) barycentric weights of its corners.
+
+    Returns:
+        (T, 3) texels.
     """
     normal = normalize_vectors(np.einsum("tk,tkc->tc", weights, old_soup.normals[face]))
     old_tangent = _compute_tangents(old_soup, normal, face)
@@ -658,13 +705,14 @@ def _compute_tangents(soup: Soup, normal: Float64Array, face: IntArray) -> Float
 
     They are NaN where UVs have no area.
     """
-    used, index = np.unique(face, return_inverse=True)
-    a, b, c = (soup.points[soup.faces[used, k]] for k in range(3))
-    uvs = soup.uvs[used]
+    used_faces, used_index = np.unique(face, return_inverse=True)
+    a, b, c = (soup.points[soup.faces[used_faces, k]] for k in range(3))
+    uvs = soup.uvs[used_faces]
     (_, v1) = (uvs[:, 1] - uvs[:, 0]).T
     (_, v2) = (uvs[:, 2] - uvs[:, 0]).T
     handedness = np.sign(compute_doubled_areas(uvs))[:, None]
+    # d position / d u, up to a positive factor
     tangent = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * handedness
-    tangent = tangent[index.reshape(-1)]
+    tangent = tangent[used_index.reshape(-1)]
     along_normal = normal * (tangent * normal).sum(axis=1, keepdims=True)
     return normalize_vectors(tangent - along_normal)

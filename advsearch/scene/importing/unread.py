@@ -35,6 +35,7 @@ class TrackedKeys(Generic[T]):
         fold: Callable[[str], str] = str,
         prefix: str = "",
     ) -> None:
+        """Fold all keys; `prefix` stands before them in what is unread."""
         # Keys, as spelled, that a later one of the same form hides.
         self.repeated: list[str] = []
         self._fold = fold
@@ -56,9 +57,9 @@ class TrackedKeys(Generic[T]):
         None if none has. That key counts as read, and so do those of the others that
         have no value.
         """
-        present = [key for key in keys if self._values.get(key) is not None]
-        self._read.update(key for key in keys if key not in present[1:])
-        return self._values[present[0]] if present else None
+        keys_with_value = [key for key in keys if self._values.get(key) is not None]
+        self._read.update(key for key in keys if key not in keys_with_value[1:])
+        return self._values[keys_with_value[0]] if keys_with_value else None
 
     def peek(self, key: str) -> T | None:
         """Return a value without counting its key as read."""
@@ -96,8 +97,8 @@ class TrackedKeys(Generic[T]):
         """
         names = []
         for key, spelled in self._spelling.items():
-            quiet = is_quiet is not None and is_quiet(key, self._values[key])
-            if key not in self._read and not quiet:
+            needs_no_note = is_quiet is not None and is_quiet(key, self._values[key])
+            if key not in self._read and not needs_no_note:
                 names.append(self._prefix + spelled)
             if key in self._nested:
                 names += self._nested[key].find_unread()

@@ -104,11 +104,14 @@ def _measure_mapped_faces(
 
 
 def _transform_uvs(
-    uv: IndexedValues, square: int, painted: MtlSurface
+    uv: IndexedValues, square: int, mtl_surface: MtlSurface
 ) -> IndexedValues:
-    """Return UVs relative to their square, as the textures of a material are laid."""
+    """Return UVs relative to their square, as the textures of a material are laid.
+
+    That is scaled and shifted (``-s`` and ``-o``).
+    """
     corner = mtl_surfaces.get_square_corner(square)
-    uvs = (uv.values - corner) * painted.scale + painted.offset
+    uvs = (uv.values - corner) * mtl_surface.scale + mtl_surface.offset
     return IndexedValues(uvs, uv.rows)
 
 
@@ -170,25 +173,25 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
 
     parts = []
     for group in group_faces(material, has_uvs, is_flat, square):
-        first = group[0]
-        name = names[material[first]] if material[first] >= 0 else ""
-        square_number = int(square[first])
-        painted = _find_material(
+        first_triangle = group[0]
+        name = names[material[first_triangle]] if material[first_triangle] >= 0 else ""
+        square_number = int(square[first_triangle])
+        mtl_surface = _find_material(
             reader, name, square_number, colors is not None, bool(library_lines)
         )
-        surface, tint = _combine_colors(painted.surface, colors, group, notes)
-        group_uv = _transform_uvs(uv, square_number, painted)
-        if painted.is_clamped and has_uvs[first]:
+        surface, tint = _combine_colors(mtl_surface.surface, colors, group, notes)
+        group_uv = _transform_uvs(uv, square_number, mtl_surface)
+        if mtl_surface.is_clamped and has_uvs[first_triangle]:
             _note_repetition(group_uv.values[uv.rows[group]], notes)
         parts.append(
             split_at_corners(
                 group,
-                position,
-                normal,
-                group_uv,
-                tint,
-                surface,
-                flat=bool(is_flat[first]),
+                points=position,
+                normals=normal,
+                uvs=group_uv,
+                colors=tint,
+                surface=surface,
+                flat=bool(is_flat[first_triangle]),
             )
         )
     return parts
@@ -216,7 +219,11 @@ def _find_flat_faces(
     normal: IndexedValues,
     notes: Notes,
 ) -> BoolArray:
-    """Return for each triangle whether its smoothing group is off, (T,)."""
+    """Return for each triangle whether its smoothing group is off, (T,).
+
+    Before the first ``s`` it is not. Groups themselves are left out, which is noted
+    where normals have to be computed.
+    """
     values, group = _find_values_in_effect(smoothing_changes, rows)
     is_off_by_group = [value in NOT_SMOOTH for value in values]
     # Index -1, of triangles before the first statement, is the last entry.
@@ -233,15 +240,20 @@ def _find_flat_faces(
 def _find_squares(
     reader: MtlReader, names: Sequence[str], material: IntArray, uv: IndexedValues
 ) -> IntArray:
-    """Return the UDIM square of each triangle, (T,); 0 where one image is for all."""
+    """Return the UDIM square of each triangle, (T,); 0 where one image is for all.
+
+    Only squares for which the material has an image count.
+    """
     square = np.zeros(len(material), np.int64)
     has_uvs = (uv.rows >= 0).all(axis=1)
     for material_index in np.unique(material[has_uvs & (material >= 0)]):
         faces = np.flatnonzero(has_uvs & (material == material_index))
         face_squares = mtl_surfaces.compute_squares(uv.values[uv.rows[faces]])
         candidates = np.unique(face_squares).tolist()
-        with_image = reader.find_squares(names[material_index], candidates)
-        square[faces] = np.where(np.isin(face_squares, with_image), face_squares, 0)
+        squares_with_image = reader.find_squares(names[material_index], candidates)
+        square[faces] = np.where(
+            np.isin(face_squares, squares_with_image), face_squares, 0
+        )
     return square
 
 
@@ -252,24 +264,29 @@ def _find_material(
     has_colors: bool,
     names_libraries: bool,
 ) -> MtlSurface:
-    """Return the material of a name, or a plain one and a note if there is none."""
+    """Return the material of a name, or a plain one and a note if there is none.
+
+    Without a name the surface is plain, and nothing is noted. `square_number` is the
+    UDIM square; `names_libraries` is whether the file names material files, of which
+    then a note says that none could be read.
+    """
     if not name:
         return MtlSurface(ImportedSurface())
-    painted = reader.get_surface(name, square_number)
-    if painted is not None:
-        return painted
+    mtl_surface = reader.get_surface(name, square_number)
+    if mtl_surface is not None:
+        return mtl_surface
     substitute = "the colour of its vertices" if has_colors else "neutral grey"
-    instead = f"{substitute} is used instead"
+    substitute_text = f"{substitute} is used instead"
     if reader.n_libraries:
-        lacks = (
+        lacking_files = (
             "its .mtl file lacks" if reader.n_libraries == 1 else "its .mtl files lack"
         )
         reader.notes.warn(
-            f" uses the material {format_name(name)}, which {lacks}; {instead}"
+            f" uses the material {format_name(name)}, which {lacking_files}; {substitute_text}"
         )
     elif not names_libraries:  # otherwise a note says that none could be read
         reader.notes.warn(
-            f" uses materials and names no material file (mtllib); {instead}"
+            f" uses materials and names no material file (mtllib); {substitute_text}"
         )
     return MtlSurface(ImportedSurface(name=without_comment(name)))
 
@@ -278,6 +295,9 @@ def _combine_colors(
     surface: ImportedSurface, colors: Float64Array | None, group: IntArray, notes: Notes
 ) -> tuple[ImportedSurface, Float64Array | None]:
     """Decide how vertex colors and a material's own color are combined.
+
+    A texture wins over vertex colors, and a material without a color has those alone; a
+    color of the material is multiplied by them.
 
     Args:
         surface: the material.
@@ -321,16 +341,16 @@ def _parse_statements(
     smoothing_changes = list[tuple[int, str]]()
     for row, keyword, rest in lines.iterate_others():
         key = keyword.lower()
-        argument = without_comment(rest).lower()
+        clean_argument = without_comment(rest).lower()
         if key == "mtllib":
             library_lines.append(rest)
         elif key == "usemtl":
             material_changes.append((row, " ".join(rest.split())))
         elif key == "s":
-            smoothing_changes.append((row, argument))
+            smoothing_changes.append((row, clean_argument))
         elif key in NON_FACE_STATEMENTS:
             notes.record(f"{NON_FACE_STATEMENTS[key]}, statement", key)
-        elif key not in GROUPING and argument not in ("off", "0"):
+        elif key not in GROUPING and clean_argument not in ("off", "0"):
             notes.record("statement", keyword)
     return library_lines, material_changes, smoothing_changes
 
@@ -349,8 +369,8 @@ def _find_values_in_effect(
     change_rows = np.array([row for row, _ in changes], dtype=np.int64)
     last_change = np.searchsorted(change_rows, rows) - 1
     # Position -1, of rows before the first change, is the last entry.
-    change_index = np.array([*(index_of_value[value] for _, value in changes), -1])
-    return values, change_index[last_change]
+    index_of_change = np.array([*(index_of_value[value] for _, value in changes), -1])
+    return values, index_of_change[last_change]
 
 
 def _read_colors(
@@ -368,15 +388,15 @@ def _read_colors(
         notes.record("weights of vertices, the fourth number of", "v")
     if np.isfinite(opacity).any() and not np.isin(opacity, (1.0, 255.0)).all():
         notes.record("opacities of vertices, the seventh number of", "v")
-    stored: Float64Array | None = table[:, 3:6]
+    stored_colors: Float64Array | None = table[:, 3:6]
     if np.isnan(table[:, 5]).all():
-        stored = lines.read_zbrush_colors(len(table))
-    if stored is None:
+        stored_colors = lines.read_zbrush_colors(len(table))
+    if stored_colors is None:
         return None
-    has_color = np.asarray(np.isfinite(stored).all(axis=1))
-    is_of_bytes = has_color.any() and stored[has_color].max() > 2.0
-    scale = 255.0 if is_of_bytes else 1.0
-    colors = np.where(has_color[:, None], stored / scale, NEUTRAL_GREY)
+    has_color = np.asarray(np.isfinite(stored_colors).all(axis=1))
+    is_in_bytes = has_color.any() and stored_colors[has_color].max() > 2.0
+    scale = 255.0 if is_in_bytes else 1.0
+    colors = np.where(has_color[:, None], stored_colors / scale, NEUTRAL_GREY)
     return np.asarray(
         srgb_to_linear(np.clip(colors, 0.0, 1.0).astype(np.float32)), dtype=np.float64
     )
@@ -401,11 +421,19 @@ _BLANK, _IN_CORNERS = (
 class ObjLines:
     """The lines of an OBJ file, sorted into ``v``, ``vt``, ``vn``, ``f`` and others.
 
+    Attributes:
+        text: the file, as `_normalize_lines` returns it.
+        bytes: the same as an array.
+        starts, ends: (L,) where each line begins, and its line break.
+        kind: (L,) index into `KINDS` of each line; their number for another line.
+        is_unended: whether the last line has no line break.
+
     Raises:
         FileFormatError: the file is not text.
     """
 
     def __init__(self, data: bytes, notes: Notes) -> None:
+        """Find the lines of a file, and the kind of each by its first bytes."""
         if b"\x00" in data:
             raise notes.damaged(EXPECTED, data)
         text = _normalize_lines(data)
@@ -417,16 +445,18 @@ class ObjLines:
         self.ends = np.flatnonzero(self.bytes == _NEWLINE)
         self.starts = np.concatenate([[0], self.ends[:-1] + 1])
         padded = np.concatenate([self.bytes, np.full(3, _NEWLINE, np.uint8)])
-        first, second, third = (padded[self.starts + offset] for offset in range(3))
-        # Index into `KINDS` of each line; the length of `KINDS` means another.
+        first_byte, second_byte, third_byte = (
+            padded[self.starts + offset] for offset in range(3)
+        )
+        # A keyword has one or two letters, and a blank after it.
         self.kind = np.full(len(self.starts), len(KINDS), dtype=np.int8)
         for index, kind in enumerate(KINDS):
             if len(kind) == 2:
-                matches = (first == ord(kind[0])) & (second == ord(kind[1]))
-                after_keyword = third
+                matches = (first_byte == ord(kind[0])) & (second_byte == ord(kind[1]))
+                after_keyword = third_byte
             else:
-                matches = first == ord(kind[0])
-                after_keyword = second
+                matches = first_byte == ord(kind[0])
+                after_keyword = second_byte
             self.kind[matches & _BLANK[after_keyword]] = index
 
     def iterate_others(self) -> Iterator[tuple[int, str, str]]:
@@ -450,25 +480,26 @@ class ObjLines:
         """
         min_count, columns = TABLES[kind]
         fill = 0.0 if kind == "vt" else np.nan
-        rows, data = self._select_lines(kind)
+        rows, line_bytes = self._select_lines(kind)
         if not len(rows):
             return np.zeros((0, columns))
-        counts = _count_words(data)
-        values: Float64Array = parse_number_array(data.tobytes(), np.float64).astype(
-            np.float64, copy=False
-        )
+        counts = _count_words(line_bytes)
+        values: Float64Array = parse_number_array(
+            line_bytes.tobytes(), np.float64
+        ).astype(np.float64, copy=False)
         if counts.min() < min_count or len(values) != counts.sum():
             self._raise_for_numbers(kind, rows)
+        # Where all lines have as many numbers, which is usual, the table is a reshape.
         if (counts == counts[0]).all():
             table = values.reshape(len(rows), -1)[:, :columns]
-            missing = columns - table.shape[1]
-            return np.pad(table, ((0, 0), (0, missing)), constant_values=fill)
+            n_missing = columns - table.shape[1]
+            return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
         first_of_line = np.cumsum(counts) - counts
         column = np.arange(len(values)) - np.repeat(first_of_line, counts)
         row = np.repeat(np.arange(len(rows)), counts)
-        is_read = column < columns
+        is_in_table = column < columns
         table = np.full((len(rows), columns), fill)
-        table[row[is_read], column[is_read]] = values[is_read]
+        table[row[is_in_table], column[is_in_table]] = values[is_in_table]
         return table
 
     def _raise_for_numbers(self, kind: str, rows: IntArray) -> NoReturn:
@@ -500,29 +531,31 @@ class ObjLines:
             FileFormatError: a face is malformed, is too large, or refers to what is not
                 in the file; or there are too many.
         """
-        rows, data = self._select_lines("f")
+        rows, line_bytes = self._select_lines("f")
         if not len(rows):
             return np.zeros((0, 3), np.int64), rows, rows
-        parsed = _parse_corners(data)
+        parsed = _parse_corners(line_bytes)
         if parsed is None:
             self._raise_for_faces(rows)
         corners, sizes = parsed
         self._check_sizes(rows, sizes)
         for column, kind in enumerate(TABLES):
             # A view: relative indices are replaced in `corners`.
-            index = corners[:, column]
-            if not len(index):
+            kind_indices = corners[:, column]
+            if not len(kind_indices):
                 continue
-            self._resolve_relative(index, kind, rows, sizes)
-            if index.max() > counts[kind]:
+            self._resolve_relative(kind_indices, kind, rows, sizes)
+            if kind_indices.max() > counts[kind]:
                 corner_ends = np.cumsum(sizes)
-                face = np.searchsorted(corner_ends, int(index.argmax()), side="right")
+                face = np.searchsorted(
+                    corner_ends, int(kind_indices.argmax()), side="right"
+                )
                 got = (
                     f"{counts[kind]}, and a face on line {rows[face] + 1} that refers "
-                    f"to number {index.max()}"
+                    f"to number {kind_indices.max()}"
                 )
                 raise self.notes.damaged(
-                    f"at least {index.max()} {kind!r} lines",
+                    f"at least {kind_indices.max()} {kind!r} lines",
                     f"{got} (is the file cut short?)",
                 )
         return corners - 1, sizes, rows
@@ -543,7 +576,11 @@ class ObjLines:
     def _resolve_relative(
         self, index: IntArray, kind: str, rows: IntArray, sizes: IntArray
     ) -> None:
-        """Replace negative indices (C,), which count back from a face's line."""
+        """Replace negative indices (C,) in place; they count back from a face's line.
+
+        -1 is the last row of the table `kind` before that line. `rows` are those of the
+        lines of faces, and `sizes` their numbers of corners.
+        """
         is_relative = index < 0
         if not is_relative.any():
             return
@@ -566,6 +603,7 @@ class ObjLines:
         if len(digits) != 8 * count:
             return None
         channels = np.frombuffer(bytes.fromhex(digits.decode()), np.uint8)
+        # The first of four is a mask.
         return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
 
     def _select_lines(self, kind: str) -> tuple[IntArray, Bytes]:
@@ -577,14 +615,14 @@ class ObjLines:
         is_selected = self.kind == KINDS.index(kind)
         lengths = self.ends - self.starts + 1
         rows = np.flatnonzero(is_selected)
-        data = self.bytes[np.repeat(is_selected, lengths)]
+        line_bytes = self.bytes[np.repeat(is_selected, lengths)]
         starts = np.cumsum(lengths[rows]) - lengths[rows]
         for offset in range(len(kind)):
-            data[starts + offset] = ord(" ")
-        if (data == _HASH).any():
-            without_comments = re.sub(rb"#[^\n]*", b"", data.tobytes())
-            data = np.frombuffer(without_comments, dtype=np.uint8)
-        return rows, data
+            line_bytes[starts + offset] = ord(" ")
+        if (line_bytes == _HASH).any():
+            without_comments = re.sub(rb"#[^\n]*", b"", line_bytes.tobytes())
+            line_bytes = np.frombuffer(without_comments, dtype=np.uint8)
+        return rows, line_bytes
 
     def _iterate_words(self, rows: IntArray) -> Iterator[tuple[int, list[str]]]:
         """Yield the line number, from 1, and the arguments of each of some lines."""
@@ -593,7 +631,11 @@ class ObjLines:
             yield int(row) + 1, line.partition("#")[0].split()[1:]
 
     def _raise_for_faces(self, rows: IntArray) -> NoReturn:
-        """Raise FileFormatError for the first face that has a wrong index."""
+        """Raise FileFormatError for the first face that has a wrong index.
+
+        An index is a whole number that is not 0, and no further back than the rows
+        before the face's line.
+        """
         counts_before_line = np.stack(
             [np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1
         )
@@ -619,7 +661,10 @@ class ObjLines:
 
 
 def _normalize_lines(data: bytes) -> bytes:
-    """Return text whose lines end in a line feed and begin with their keyword."""
+    """Return text whose lines end in a line feed and begin with their keyword.
+
+    Continued lines are joined, and the text ends in a line feed.
+    """
     text = (
         data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         + b"\n"
@@ -636,29 +681,31 @@ def _normalize_lines(data: bytes) -> bytes:
 
 
 def _count_words(data: Bytes) -> IntArray:
-    """Return how many words each line of bytes has."""
+    """Return how many words each line of bytes has; the last byte is a line break."""
     is_blank = _BLANK[data]
-    begins_word = ~is_blank
-    begins_word[1:] &= is_blank[:-1]
+    is_word_start = ~is_blank
+    is_word_start[1:] &= is_blank[:-1]
     ends = np.flatnonzero(data == _NEWLINE)
     line_starts = np.concatenate([[0], ends[:-1] + 1])
-    return np.asarray(np.add.reduceat(begins_word, line_starts, dtype=np.int64))
+    return np.asarray(np.add.reduceat(is_word_start, line_starts, dtype=np.int64))
 
 
 def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntArray:
     """Return the column of each number in its corner, by the slashes before it.
 
-    A corner has three numbers at most, so the steps of two predecessors are enough.
+    It is how many slashes there are from the corner's first number on: the sum of its
+    own step and those of up to two predecessors, as a corner has three numbers at most.
 
     Args:
         is_first: whether a number is the first of its corner.
         is_after_two_slashes: whether two slashes, not one, are between a number that is
             not the first and its predecessor.
     """
-    step = np.where(is_first, 0, np.where(is_after_two_slashes, 2, 1))
-    column = step.copy()
-    column[1:] += np.where(is_first[1:], 0, step[:-1])
-    column[2:] += np.where(is_first[2:] | is_first[1:-1], 0, step[:-2])
+    # Slashes between a number and its predecessor in the same corner.
+    n_slashes = np.where(is_first, 0, np.where(is_after_two_slashes, 2, 1))
+    column = n_slashes.copy()
+    column[1:] += np.where(is_first[1:], 0, n_slashes[:-1])
+    column[2:] += np.where(is_first[2:] | is_first[1:-1], 0, n_slashes[:-2])
     return np.asarray(column)
 
 
@@ -672,9 +719,10 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     is_blank = _BLANK[data]
     is_slash = data == _SLASH
     is_digit = ~(is_blank | is_slash)
-    begins = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
-    is_first = is_blank[begins - 1]
-    column = _find_columns(is_first, is_slash[begins - 2])
+    number_starts = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
+    is_first = is_blank[number_starts - 1]
+    # the byte two before a number is a slash too, if there are two
+    column = _find_columns(is_first, is_slash[number_starts - 2])
     has_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])
     is_malformed = (
         (is_slash[1:] & is_blank[:-1]).any()
@@ -684,11 +732,11 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     )
     without_slashes = np.where(is_slash, np.uint8(ord(" ")), data)
     values = parse_number_array(without_slashes.tobytes(), np.int64)
-    if is_malformed or len(values) != len(begins) or (values == 0).any():
+    if is_malformed or len(values) != len(number_starts) or (values == 0).any():
         return None
-    first_begins = begins[is_first]
+    corner_starts = number_starts[is_first]
     line_ends = np.flatnonzero(data == _NEWLINE)
-    sizes = np.diff(np.searchsorted(first_begins, line_ends), prepend=0)
-    corners = np.zeros((len(first_begins), 3), dtype=np.int64)
+    sizes = np.diff(np.searchsorted(corner_starts, line_ends), prepend=0)
+    corners = np.zeros((len(corner_starts), 3), dtype=np.int64)
     corners[np.cumsum(is_first) - 1, column] = values
     return corners, sizes

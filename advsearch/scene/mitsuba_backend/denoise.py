@@ -9,6 +9,7 @@ approximation, and differences of images include it exactly.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -70,6 +71,78 @@ def denoise(
         return (output / gain).to(radiance.device)
 
 
+# pixels around what changes in which the denoised change is faded out
+FADE_RADIUS = 8
+FILL_RADIUS = 3  # pixels over which the plane is continued below the object
+FILL_WEIGHT = 0.05  # of what is filled in, where the plane covers a pixel fully
+
+
+def denoise_image(
+    rendered: Tensor,
+    albedo: Tensor,
+    normal: Tensor,
+    plane_radiance: Tensor | None,
+    *,
+    quick: bool = False,
+) -> Tensor:
+    """Return a denoised image (H, W, C) of 3, 4 or 7 channels.
+
+    Args:
+        rendered: radiance; coverage, which stays as it is; and the change of the
+            radiance of the plane that takes the shadow in a photograph.
+        albedo, normal: as for `denoise`.
+        plane_radiance: (3,) without the object; None if there is no plane.
+        quick: as for `denoise`.
+    """
+    color = rendered[..., :3].contiguous()
+    channels = [denoise(color, albedo, normal, quick=quick), rendered[..., 3:4]]
+    if plane_radiance is not None:
+        channels.append(
+            plane_radiance
+            * _denoise_shade(
+                rendered[..., 4:] / plane_radiance,
+                (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0),
+                lambda shade: denoise(shade, albedo, normal, quick=quick),
+            )
+        )
+    return torch.cat(channels, dim=-1)
+
+
+def _denoise_shade(
+    change: Tensor, visible: Tensor, remove_noise: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Return the denoised relative change (H, W, 3) of the plane.
+
+    It is zero wherever nothing near it changes. What is denoised is continued below the
+    object, so that the shadow at its contact does not get lighter.
+
+    Args:
+        change: (H, W, 3) relative change times the visible fraction.
+        visible: (H, W, 1) visible fraction of a pixel.
+        remove_noise: denoises an image (H, W, 3) of numbers of at least 0.
+    """
+    both = torch.cat([change, visible], dim=-1)
+    for _ in range(2):
+        both = _average(both, FILL_RADIUS)
+    filled = both[..., :3] / both[..., 3:].clamp_min(1e-4)
+    full_change = (change + FILL_WEIGHT * filled) / (visible + FILL_WEIGHT)
+    clean = remove_noise((1.0 + full_change).clamp_min(0.0).contiguous()) - 1.0
+    is_changed = (change != 0.0).any(dim=-1, keepdim=True).float()
+    near = torch.nn.functional.max_pool2d(
+        is_changed.permute(2, 0, 1)[None], 2 * FADE_RADIUS + 1, 1, FADE_RADIUS
+    )[0].permute(1, 2, 0)
+    return clean * visible * _average(near, FADE_RADIUS)
+
+
+def _average(image: Tensor, radius: int) -> Tensor:
+    """Return the mean of an image (H, W, C) over squares, cut at its border."""
+    planes = image.permute(2, 0, 1)[None]
+    averaged = torch.nn.functional.avg_pool2d(
+        planes, 2 * radius + 1, 1, radius, count_include_pad=False
+    )
+    return averaged[0].permute(1, 2, 0)
+
+
 @lru_cache(maxsize=8)
 def _get_buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
     """Return the buffers in which images of a size are denoised, in a thread.
@@ -94,12 +167,12 @@ def _compute_gain(radiance: Tensor) -> float:
     row_counts = np.diff(row_starts, append=height)
     column_counts = np.diff(column_starts, append=width)
     row_sums = np.add.reduceat(luminance, row_starts, axis=0)
-    sums = np.add.reduceat(row_sums, column_starts, axis=1)
-    means = sums / np.outer(row_counts, column_counts)
-    means = means[means > MIN_LUMINANCE]
-    if not means.size:
+    bin_sums = np.add.reduceat(row_sums, column_starts, axis=1)
+    bin_means = bin_sums / np.outer(row_counts, column_counts)
+    bin_means = bin_means[bin_means > MIN_LUMINANCE]
+    if not bin_means.size:  # the image is black
         return 1.0
-    return float(KEY_LUMINANCE / np.exp2(np.log2(means).mean()))
+    return float(KEY_LUMINANCE / np.exp2(np.log2(bin_means).mean()))
 
 
 def _find_bin_starts(size: int) -> IntArray:

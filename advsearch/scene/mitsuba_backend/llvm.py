@@ -64,7 +64,10 @@ Version = tuple[int, ...]
 
 @dataclass(frozen=True)
 class LibraryFile:
-    """A libLLVM file."""
+    """A libLLVM file.
+
+    As text it is its path, and in parentheses its version and why it is refused.
+    """
 
     path: Path
     version: Version  # major first, or ()
@@ -90,7 +93,7 @@ def find_libraries(
     Returns:
         Usable files first, each group newest first.
     """
-    patterns = [*_PATTERNS, *_conda_patterns(environ.get("CONDA_PREFIX", ""))]
+    patterns = [*_PATTERNS, *_list_conda_patterns(environ.get("CONDA_PREFIX", ""))]
     paths: list[Path] = []
     for pattern in patterns:
         matches = root.glob(pattern)
@@ -109,7 +112,7 @@ def find_libraries(
     )
 
 
-def _conda_patterns(prefix: str) -> list[str]:
+def _list_conda_patterns(prefix: str) -> list[str]:
     """Return patterns for an active conda environment, relative to the root."""
     if not prefix:
         return []
@@ -269,13 +272,13 @@ def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
             rejected.append(f"{candidate.path} (cannot be loaded: {error})")
         else:
             return candidate
-    found = "Found: " + "; ".join(rejected) + "." if rejected else "Found none."
+    rejected_text = "Found: " + "; ".join(rejected) + "." if rejected else "Found none."
     command = get_install_command()
     separator = "\n" if "\n" in command else " "
     raise EnvironmentSetupError(
         f"expected a libLLVM of version {MIN_VERSION} or later, with which Dr.Jit "
         "compiles "
-        f"its kernels. {found} "
+        f"its kernels. {rejected_text} "
         f"Install one with:{separator}{command}{separator}or name a file in "
         f"{ENVIRONMENT_VARIABLE}."
     )

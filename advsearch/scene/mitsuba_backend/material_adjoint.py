@@ -140,7 +140,7 @@ def material_adjoint(
         # the noise of the radiance cancels if it is the same there; for a smooth one it
         # averages out better if it is not.
         tile = ROUGH_TILE if _is_rough(cotangent) else 1
-        total += _interior_term(view, seed, spp, tile)
+        total += _compute_interior_term(view, seed, spp, tile)
     for index, mesh in enumerate([*view.moving_meshes, *view.still_meshes]):
         total += compute_outline_term(view, mesh, seed, index, boundary_spp)
         total += compute_shadow_term(view, mesh, seed, index, shadow_spp)
@@ -153,15 +153,27 @@ def material_adjoint(
 
 
 def _is_rough(cotangent: Tensor) -> bool:
-    """Return whether neighbouring pixels of a cotangent are hardly correlated."""
+    """Return whether neighbouring pixels of a cotangent are hardly correlated.
+
+    The mean square of a difference is twice the variance times one minus the
+    correlation; the sum of both directions is compared with that at `ROUGH_COTANGENT`.
+    """
     values = cotangent.detach().to(torch.float64)
-    right = torch.diff(values, dim=1).square().mean()
-    down = torch.diff(values, dim=0).square().mean()
-    return bool(right + down > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean())
+    right_square = torch.diff(values, dim=1).square().mean()
+    down_square = torch.diff(values, dim=0).square().mean()
+    return bool(
+        right_square + down_square
+        > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean()
+    )
 
 
-def _interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
-    """Return a value whose gradient by the vertices is the interior term."""
+def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
+    """Return a value whose gradient by the vertices is the interior term.
+
+    The chain is taken in two steps: first back to the points and normals of each
+    sample, where gradients that are not finite are set to zero, then on to the
+    vertices. `spp` and `tile` are as for `_sample_first_hits`.
+    """
     with dr.suspend_grad():
         film, hit, sampler = _sample_first_hits(view, seed, spp, tile)
         if dr.width(film) == 0:
@@ -170,28 +182,29 @@ def _interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
             view.camera.make_ray(film), mi.RayFlags.All
         )
     attached = view.attach_hit(hit)[:3]
-    leaves = [type(value)(dr.detach(value)) for value in attached]
-    dr.enable_grad(leaves)
-    point, facet, shading_normal = leaves
+    local_values = [type(value)(dr.detach(value)) for value in attached]
+    dr.enable_grad(local_values)
+    point, scaled_normal, shading_normal = local_values
 
     # Sum of W L J / J over all samples, attached to these points and normals.
     jacobian = (
-        dr.dot(facet, point - view.camera.eye) / view.camera.compute_depth(point) ** 3
+        dr.dot(scaled_normal, point - view.camera.eye)
+        / view.camera.compute_depth(point) ** 3
     )
     weight = view.interpolate_cotangent(
         dr.replace_grad(film, view.camera.project(point)), mi.Bool(True)
     )
-    moving_si = _attach_interaction(view, si, point, facet, shading_normal)
+    moving_si = _attach_interaction(view, si, point, scaled_normal, shading_normal)
     radiance = _sample_reflected(view, moving_si, si, sampler)
     dr.backward(dr.sum(dr.sum(weight * radiance) * _with_relative_gradient(jacobian)))
 
     # From there on to the vertices, without samples whose gradient is not finite.
     total = mi.Float(0)
-    for value, leaf in zip(attached, leaves, strict=True):
-        gradient = dr.grad(leaf)
-        usable = dr.all(dr.isfinite(gradient))
-        product = dr.dot(value, dr.select(usable, gradient, 0))
-        total += dr.sum(dr.select(usable, product, 0))
+    for value, local_value in zip(attached, local_values, strict=True):
+        gradient = dr.grad(local_value)
+        is_finite = dr.all(dr.isfinite(gradient))
+        product = dr.dot(value, dr.select(is_finite, gradient, 0))
+        total += dr.sum(dr.select(is_finite, product, 0))
     return total / spp
 
 
@@ -201,7 +214,7 @@ def _sample_first_hits(
     """Sample film positions that see a moving mesh.
 
     The film is cut into cells between pixel centers, with `spp` stratified samples in
-    each. Cells in a tile share their random numbers.
+    each. Cells in a tile, `tile` cells wide, share their random numbers.
 
     Returns:
         Film positions, their hits, and a sampler with the random numbers from there on.
@@ -221,7 +234,8 @@ def _sample_first_hits(
         make_stream(seed, 0), n_tiles * spp, tile_index * spp + sample
     )
 
-    strata_across = _largest_divisor(spp)
+    # A cell has as many strata as samples, in an almost square grid.
+    strata_across = _find_largest_divisor(spp)
     strata_shape = mi.Point2f(strata_across, spp // strata_across)
     stratum = mi.Point2f(sample % strata_across, sample // strata_across)
     film = mi.Point2f(column, row) - 0.5 + (stratum + sampler.next_2d()) / strata_shape
@@ -232,14 +246,14 @@ def _sample_first_hits(
     for mesh in view.moving_meshes:
         on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
     dr.eval(on_moving, film, hit, sampler)
-    selected = dr.compress(on_moving)
-    film = dr.gather(type(film), film, selected)
-    hit = dr.gather(type(hit), hit, selected)
-    sampler.rng = dr.gather(type(sampler.rng), sampler.rng, selected)
+    selected_lanes = dr.compress(on_moving)
+    film = dr.gather(type(film), film, selected_lanes)
+    hit = dr.gather(type(hit), hit, selected_lanes)
+    sampler.rng = dr.gather(type(sampler.rng), sampler.rng, selected_lanes)
     return film, hit, sampler
 
 
-def _largest_divisor(count: int) -> int:
+def _find_largest_divisor(count: int) -> int:
     """Return the largest divisor of a count that is at most its square root."""
     return max(n for n in range(1, int(count**0.5) + 1) if count % n == 0)
 
@@ -249,18 +263,23 @@ def _with_relative_gradient(value: Any) -> Any:
 
     There is no gradient where the value is all but zero.
     """
-    fixed = dr.detach(value)
-    usable = dr.abs(fixed) > 1e-20
+    constant = dr.detach(value)
+    is_usable = dr.abs(constant) > 1e-20
     return dr.replace_grad(
-        dr.full(type(fixed), 1.0),
-        dr.select(usable, value / dr.select(usable, fixed, 1.0), 1.0),
+        dr.full(type(constant), 1.0),
+        dr.select(is_usable, value / dr.select(is_usable, constant, 1.0), 1.0),
     )
 
 
 def _attach_interaction(
-    view: FilmView, si: Any, point: Any, facet: Any, shading_normal: Any
+    view: FilmView, si: Any, point: Any, scaled_normal: Any, shading_normal: Any
 ) -> Any:
-    """Return Mitsuba's surface interaction, attached to a point and its normals."""
+    """Return Mitsuba's surface interaction, attached to a point and its normals.
+
+    Its values stay those of `si`; their gradients are those of the point, the normal of
+    its triangle, and the shading normal. The frame's tangent follows the normal without
+    a turn about it.
+    """
 
     def attach_normal(fixed: Any, normal: Any) -> Any:
         """Attach a normal to ours, which may point to the other side."""
@@ -269,11 +288,13 @@ def _attach_interaction(
 
     moving_si = mi.SurfaceInteraction3f(si)
     moving_si.p = dr.replace_grad(si.p, point)
-    moving_si.n = attach_normal(si.n, facet)
+    moving_si.n = attach_normal(si.n, scaled_normal)
     normal = attach_normal(si.sh_frame.n, shading_normal)
-    s = si.sh_frame.s
-    s = dr.replace_grad(s, dr.normalize(dr.fma(-normal, dr.dot(normal, s), s)))
-    moving_si.sh_frame = mi.Frame3f(s, dr.cross(normal, s), normal)
+    tangent = si.sh_frame.s
+    tangent = dr.replace_grad(
+        tangent, dr.normalize(dr.fma(-normal, dr.dot(normal, tangent), tangent))
+    )
+    moving_si.sh_frame = mi.Frame3f(tangent, dr.cross(normal, tangent), normal)
     to_eye = dr.normalize(view.camera.eye - point)
     moving_si.wi = dr.replace_grad(si.wi, moving_si.sh_frame.to_local(to_eye))
     return moving_si
@@ -290,17 +311,17 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
         ds, em_weight, active_em = _sample_light(view, si, sampler, active)
         bsdf_sample, incoming, active = _sample_incoming(view, si, sampler, active)
         wo = si.to_world(bsdf_sample.wo)
-        smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+        is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     direct = _reflect_light(view, moving_si, si, ds, em_weight, active_em)
 
     # Light along the sampled direction is a constant, of which the BSDF passes more or
     # less; a mirror's stays.
     bsdf_value = si.bsdf().eval(
-        mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & smooth
+        mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & is_smooth
     )
     relative = mi.Color3f(
         *(
-            _with_relative_gradient(dr.select(smooth, channel, 1.0))
+            _with_relative_gradient(dr.select(is_smooth, channel, 1.0))
             for channel in bsdf_value
         )
     )
@@ -310,8 +331,9 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
 def _sample_light(
     view: FilmView, si: Any, sampler: Any, active: Any
 ) -> tuple[Any, Any, Any]:
-    """Sample a direction to an emitter; return it, its weight, and where there is
-    one.
+    """Sample a direction to an emitter; return it, its weight, and where there is one.
+
+    A surface that only mirrors reflects none of it.
     """
     is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
     active_em = active & is_smooth
@@ -335,15 +357,16 @@ def _sample_incoming(
         mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
     )
     active = active & dr.any(bsdf_weight != 0.0)
-    smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+    is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
     # with all of what the next surface emits
     L = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
     si_next = view.scene.ray_intersect(ray, active)
     ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
-    em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & smooth)
+    em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & is_smooth)
     mis = mi.ad.integrators.common.mis_weight(bsdf_sample.pdf, em_pdf)
-    L -= (1.0 - mis) * ds_next.emitter.eval(si_next, active & smooth)
+    # Direct light along it counts by its MIS weight alone.
+    L -= (1.0 - mis) * ds_next.emitter.eval(si_next, active & is_smooth)
     return bsdf_sample, bsdf_weight * L, active
 
 
@@ -352,19 +375,29 @@ def _reflect_light(
 ) -> Any:
     """Return reflected light that was sampled at emitters, from the moving point.
 
-    Its distance and the BSDF change, unless the emitter is infinitely far.
+    The emitter's point stays; the direction to it, the falloff with its distance and
+    the BSDF change, unless the emitter is infinitely far.
+
+    Args:
+        view: the scene.
+        moving_si, si: the interaction, attached and detached.
+        ds: direction sample to the emitter.
+        em_weight: its radiance over its density.
+        active: where there is one.
     """
     flags = ds.emitter.flags()
-    near = active & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
-    is_surface = near & mi.has_flag(flags, mi.EmitterFlags.Surface)
+    is_near = active & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
+    is_surface = is_near & mi.has_flag(flags, mi.EmitterFlags.Surface)
     to_light = ds.p - moving_si.p
-    ds.d = dr.select(near, dr.replace_grad(ds.d, dr.normalize(to_light)), ds.d)
-    attached = view.scene.eval_emitter_direction(moving_si, ds, near)
-    attached = dr.select(near, attached / dr.select(near, ds.pdf, 1.0), em_weight)
+    ds.d = dr.select(is_near, dr.replace_grad(ds.d, dr.normalize(to_light)), ds.d)
+    attached_weight = view.scene.eval_emitter_direction(moving_si, ds, is_near)
+    attached_weight = dr.select(
+        is_near, attached_weight / dr.select(is_near, ds.pdf, 1.0), em_weight
+    )
     falloff = dr.dot(ds.n, ds.d) / dr.select(
         is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0
     )
-    em_weight = dr.replace_grad(em_weight, attached) * dr.select(
+    em_weight = dr.replace_grad(em_weight, attached_weight) * dr.select(
         is_surface, _with_relative_gradient(falloff), 1.0
     )
     bsdf_value, bsdf_pdf = si.bsdf().eval_pdf(

@@ -22,8 +22,14 @@ _SHADOWS = 3
 
 
 class Camera:
-    """A pinhole camera, from Mitsuba's sensor: its transforms and its size in
-    pixels.
+    """A pinhole camera, from Mitsuba's sensor.
+
+    Attributes:
+        width, height, pixels: of the film, in pixels, and their product.
+        eye: where it stands.
+        forward: unit vector of the viewing axis.
+        to_film: projection from its local axes to the film, fractions of its size.
+        to_local: transform from the world to its local axes.
     """
 
     def __init__(self, sensor: Any) -> None:
@@ -46,10 +52,10 @@ class Camera:
 
     def make_ray(self, film: Any) -> Any:
         """Return the ray through a film position in pixels."""
-        near = self.to_film.inverse() @ mi.Point3f(
+        near_point = self.to_film.inverse() @ mi.Point3f(
             film.x / self.width, film.y / self.height, 0.0
         )
-        direction = self.to_local.inverse() @ mi.Vector3f(near)
+        direction = self.to_local.inverse() @ mi.Vector3f(near_point)
         return mi.Ray3f(self.eye, dr.normalize(direction))
 
     def is_in_frame(self, film: Any) -> Any:
@@ -89,11 +95,11 @@ class TriMesh:
             ends: (n, 2) vertices of each edge.
             fraction: (n,) position along the edge in [0, 1].
         """
-        first = mi.UInt32(ends[:, 0].to(torch.int32).contiguous())
-        second = mi.UInt32(ends[:, 1].to(torch.int32).contiguous())
-        a = dr.gather(mi.Point3f, self.positions, first)
-        b = dr.gather(mi.Point3f, self.positions, second)
-        return dr.fma(b - a, to_drjit_float(fraction), a)
+        first_index = mi.UInt32(ends[:, 0].to(torch.int32).contiguous())
+        second_index = mi.UInt32(ends[:, 1].to(torch.int32).contiguous())
+        first_end = dr.gather(mi.Point3f, self.positions, first_index)
+        second_end = dr.gather(mi.Point3f, self.positions, second_index)
+        return dr.fma(second_end - first_end, to_drjit_float(fraction), first_end)
 
     def get_gradients(self) -> dict[str, Tensor]:
         """Return the gradients by vertices and by normals, (V, 3) each."""
@@ -132,6 +138,7 @@ class FilmView:
         cotangent: Tensor,
         max_depth: int,
     ) -> None:
+        """Sort the scene's meshes into those that move and others, as `TriMesh`."""
         self.scene = scene
         self.camera = Camera(sensor)
         self.max_depth = max_depth
@@ -148,6 +155,7 @@ class FilmView:
                 mesh = _make_mesh(shape, parameters, positions, normals)
                 dr.enable_grad(mesh.positions, mesh.normals)
                 moving_meshes[vertices_name] = mesh
+            # A single rectangle, of two faces, is left out, such as the ground.
             elif shape.is_mesh() and shape.face_count() > 2:
                 buffer = parameters[f"{shape.id()}.{POSITIONS}"]
                 positions = buffer.torch().reshape(-1, 3).clone()
@@ -167,17 +175,20 @@ class FilmView:
         width = self.camera.width
         height = self.camera.height
         active = active & self.camera.is_in_frame(dr.detach(film))
-        padded = film + 0.5
-        base = dr.floor(dr.detach(padded))
-        cell = mi.Point2u(dr.clip(base.x, 0, width), dr.clip(base.y, 0, height))
-        fraction = padded - mi.Point2f(cell)
+        padded_film = film + 0.5
+        cell_position = dr.floor(dr.detach(padded_film))
+        cell = mi.Point2u(
+            dr.clip(cell_position.x, 0, width), dr.clip(cell_position.y, 0, height)
+        )
+        fraction = padded_film - mi.Point2f(cell)
+        # index of the cell's upper left corner in the padded image
         corner = cell.y * (width + 2) + cell.x
-        texels = [
+        cell_corners = [
             dr.gather(mi.Color3f, self.padded_cotangent, corner + offset, active)
             for offset in (0, 1, width + 2, width + 3)
         ]
-        top = dr.lerp(texels[0], texels[1], fraction.x)
-        bottom = dr.lerp(texels[2], texels[3], fraction.x)
+        top = dr.lerp(cell_corners[0], cell_corners[1], fraction.x)
+        bottom = dr.lerp(cell_corners[2], cell_corners[3], fraction.x)
         return dr.lerp(top, bottom, fraction.y) & active
 
     def attach_hit(self, hit: Any) -> tuple[Any, Any, Any, Any]:
@@ -189,9 +200,9 @@ class FilmView:
             nothing.
         """
         point = mi.Point3f(0)
-        facet = mi.Normal3f(0, 0, 1)
+        scaled_normal = mi.Normal3f(0, 0, 1)
         shading_normal = mi.Normal3f(0, 0, 1)
-        moves = mi.Bool(False)
+        is_moving = mi.Bool(False)
         u, v = hit.prim_uv
         for mesh in self.moving_meshes:
             on_mesh = hit.is_valid() & (hit.shape == mesh.shape)
@@ -200,28 +211,31 @@ class FilmView:
                 dr.gather(mi.Point3f, mesh.positions, corner, on_mesh)
                 for corner in corners
             )
-            normal = mi.Normal3f(dr.cross(b - a, c - a))
+            face_normal = mi.Normal3f(dr.cross(b - a, c - a))
             mesh_point = dr.fma(b - a, u, dr.fma(c - a, v, a))
             point = dr.select(on_mesh, mesh_point, point)
-            facet = dr.select(on_mesh, normal, facet)
+            scaled_normal = dr.select(on_mesh, face_normal, scaled_normal)
             if mesh.is_smooth:
                 a, b, c = (
                     dr.gather(mi.Normal3f, mesh.normals, corner, on_mesh)
                     for corner in corners
                 )
-                normal = dr.fma(b - a, u, dr.fma(c - a, v, a))
-            shading_normal = dr.select(on_mesh, normal, shading_normal)
-            moves = moves | on_mesh
-        return point, facet, shading_normal, moves
+                face_normal = dr.fma(b - a, u, dr.fma(c - a, v, a))
+            shading_normal = dr.select(on_mesh, face_normal, shading_normal)
+            is_moving = is_moving | on_mesh
+        return point, scaled_normal, shading_normal, is_moving
 
     def sample_radiance(self, ray: Any, sampler: Any, depth: int, active: Any) -> Any:
         """Sample the radiance that arrives along a ray, as a constant.
 
         Paths have up to `depth` segments.
         """
-        tracer = _path_tracer(max(depth, 1))
+        tracer = _make_path_tracer(max(depth, 1))
+        # without derivatives and state, which only the adjoint modes take
+        derivative = None
+        state = None
         return tracer.sample(
-            dr.ADMode.Primal, self.scene, sampler, ray, None, None, active
+            dr.ADMode.Primal, self.scene, sampler, ray, derivative, state, active
         )[0]
 
 
@@ -244,7 +258,8 @@ def _make_mesh(
 
 
 @cache
-def _path_tracer(depth: int) -> Any:
+def _make_path_tracer(depth: int) -> Any:
+    # rr_depth: no path ends by chance before `max_depth`
     return mi.load_dict({"type": "prb", "max_depth": depth, "rr_depth": 1000})
 
 
@@ -252,7 +267,10 @@ def _path_tracer(depth: int) -> Any:
 
 
 class _Sampler:
-    """The part of a sampler that a path tracer needs, with a generator of ours."""
+    """The part of a sampler that a path tracer needs, with a generator of ours.
+
+    Dr.Jit needs `DRJIT_STRUCT` to carry its state through loops.
+    """
 
     DRJIT_STRUCT = {"rng": mi.PCG32}  # noqa: RUF012 (Dr.Jit wants a plain dictionary)
 
@@ -280,7 +298,12 @@ def make_sampler(stream: int, count: int, index: Any = None) -> Any:
 
 
 def make_stream(seed: int, purpose: int, index: int = 0) -> int:
-    """Return a starting state below 2^63, far apart for neighbouring seeds."""
+    """Return a starting state below 2^63, far apart for neighbouring seeds.
+
+    The factor is 2^64 over the golden ratio, which spreads consecutive numbers
+    (Fibonacci hashing). `purpose` is one of the streams above, and `index` that of a
+    mesh.
+    """
     return (((seed * 64 + index) * 4 + purpose + 1) * 0x9E3779B97F4A7C15) % 2**63
 
 
@@ -295,14 +318,17 @@ def sample_uniform(stream: int, count: int, dimensions: int) -> Tensor:
 
 
 def to_drjit_array(tensor: Tensor) -> Any:
+    """Convert a tensor to a flat Dr.Jit array of float32, without its gradient."""
     return mi.TensorXf(tensor.detach().to("cpu", torch.float32).contiguous()).array
 
 
 def to_drjit_float(tensor: Tensor) -> Any:
+    """Convert a tensor (N,) to a Dr.Jit array of float32, one number in each lane."""
     return mi.Float(tensor.to(torch.float32).contiguous())
 
 
 def to_drjit_vectors(kind: Any, tensor: Tensor) -> Any:
+    """Convert a tensor (N, 3) to Dr.Jit's points or vectors of a type `kind`."""
     return kind(*(to_drjit_float(tensor[:, axis]) for axis in range(3)))
 
 
@@ -329,32 +355,44 @@ def compute_outline_term(
 ) -> Any:
     """Return a value whose gradient is the outline term of one mesh.
 
-    `mesh_index` is the index of the mesh, `spp` the samples in multiples of the number
-    of pixels.
+    Where an outline moves across the film, it replaces what is behind it. A point on it
+    counts by the cotangent times the radiance behind, and by its speed along the
+    normal, relative to that of the surface behind if that moves too. Points that
+    something else hides count nothing.
+
+    Args:
+        view: the scene.
+        mesh: one that moves, or one that stands still and may hide it.
+        seed: of the samples.
+        mesh_index: index of the mesh.
+        spp: samples, in multiples of the number of pixels.
     """
     stream = make_stream(seed, _OUTLINES, mesh_index)
     random = sample_uniform(stream, spp * view.camera.pixels, 1)[:, 0]
     sampled = _sample_outline(view.camera, mesh, random)
     if sampled is None:
         return mi.Float(0)
-    n = mi.Vector2f(
+    film_normal = mi.Vector2f(
         to_drjit_float(sampled.normal[:, 0]), to_drjit_float(sampled.normal[:, 1])
     )
-    edge = mesh.interpolate_edge(sampled.ends, sampled.fraction)
-    film = view.camera.project(edge)
+    edge_point = mesh.interpolate_edge(sampled.ends, sampled.fraction)
+    edge_film = view.camera.project(edge_point)
     with dr.suspend_grad():
-        ray = view.camera.make_ray(dr.detach(film) + EDGE_OFFSET * n)
+        ray = view.camera.make_ray(dr.detach(edge_film) + EDGE_OFFSET * film_normal)
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
-        edge_distance = dr.norm(dr.detach(edge) - view.camera.eye)
+        edge_distance = dr.norm(dr.detach(edge_point) - view.camera.eye)
         is_visible = ~hit.is_valid() | (hit.t > edge_distance * (1.0 - DEPTH_TOLERANCE))
         sampler = make_sampler(stream + _PATHS, len(sampled.fraction))
-        behind = view.sample_radiance(ray, sampler, view.max_depth, is_visible)
-        strength = dr.sum(view.interpolate_cotangent(film, is_visible) * behind)
+        radiance_behind = view.sample_radiance(ray, sampler, view.max_depth, is_visible)
+        strength = dr.sum(
+            view.interpolate_cotangent(edge_film, is_visible) * radiance_behind
+        )
         strength = dr.select(is_visible & dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
+    # Outside of `suspend_grad`: from here on it is differentiated by the vertices.
     point_behind, _, _, moves = view.attach_hit(hit)
     film_behind = dr.select(moves, view.camera.project(point_behind), 0.0)
-    speed = dr.dot(n, film - film_behind)
+    speed = dr.dot(film_normal, edge_film - film_behind)
     return dr.sum(strength * speed) * -sampled.pixels_per_sample
 
 
@@ -370,6 +408,8 @@ class _OutlineSamples(NamedTuple):
 def _to_space_fraction(film_fraction: Tensor, depth: Tensor) -> Tensor:
     """Return how far along edges in space points are: halfway on the film is not
     halfway.
+
+    Fractions (N,) grow from the first end of an edge to the second.
 
     Args:
         film_fraction: (N,) how far along the edges they are on the film.
@@ -425,76 +465,98 @@ def _sample_outline(
     length = _measure_on_film(camera, a, b, depth)
     if not float(length.sum()) > 0.0:
         return None
-    pick, film_fraction = _sample_along(length, random)
+    edge_index, film_fraction = _sample_along(length, random)
 
-    middle = mesh.vertices[ends].mean(dim=1)
-    step = project_to_film(
-        camera, middle + 1e-3 * mesh.extent * outwards
-    ) - project_to_film(camera, middle)
-    normal = _find_film_normals(b[pick] - a[pick], step[pick])
-    fraction = _to_space_fraction(film_fraction, depth[pick])
+    # A short step away from the mesh tells its side of the edge on the film.
+    midpoints = mesh.vertices[ends].mean(dim=1)
+    outwards_on_film = project_to_film(
+        camera, midpoints + 1e-3 * mesh.extent * outwards
+    ) - project_to_film(camera, midpoints)
+    normal = _find_film_normals(
+        b[edge_index] - a[edge_index], outwards_on_film[edge_index]
+    )
+    fraction = _to_space_fraction(film_fraction, depth[edge_index])
     pixels_per_sample = float(length.sum()) / len(random)
-    return _OutlineSamples(ends[pick], fraction, normal, pixels_per_sample)
+    return _OutlineSamples(ends[edge_index], fraction, normal, pixels_per_sample)
 
 
 def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the edges that the eye may see as an outline.
+    """Find the edges that the eye (3,) may see as an outline.
 
-    All faces of such an edge lie on one side of the plane through the edge and the eye.
+    All faces of such an edge lie on one side of the plane through the edge and the eye,
+    be it one face or several; edges that something hides are among them.
 
     Returns:
         (E, 2) vertices of the edges, and (E, 3) that plane's unit normal, away from the
         mesh.
     """
     ends, owner, across = _find_edges(mesh.vertices, mesh.corners)
+    # (E, 3) normals of the planes
     plane = torch.linalg.cross(
         mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
     )
     plane = torch.nn.functional.normalize(plane, dim=1)
-    side = (plane[owner] * (mesh.vertices[across] - eye)).sum(dim=1)
-    lowest = torch.full((len(ends),), torch.inf, dtype=side.dtype).scatter_reduce(
-        0, owner, side, "amin"
-    )
-    highest = torch.full((len(ends),), -torch.inf, dtype=side.dtype).scatter_reduce(
-        0, owner, side, "amax"
-    )
-    on_outline = (lowest > 0.0) | (highest < 0.0)
-    sign = torch.where(lowest[on_outline] > 0.0, -1.0, 1.0)[:, None]
+    # (3 F,) on which side of its edge's plane the third corner of each face lies
+    offset_from_plane = (plane[owner] * (mesh.vertices[across] - eye)).sum(dim=1)
+    min_offset = torch.full(
+        (len(ends),), torch.inf, dtype=offset_from_plane.dtype
+    ).scatter_reduce(0, owner, offset_from_plane, "amin")
+    max_offset = torch.full(
+        (len(ends),), -torch.inf, dtype=offset_from_plane.dtype
+    ).scatter_reduce(0, owner, offset_from_plane, "amax")
+    on_outline = (min_offset > 0.0) | (max_offset < 0.0)
+    sign = torch.where(min_offset[on_outline] > 0.0, -1.0, 1.0)[:, None]
     return ends[on_outline], plane[on_outline] * sign
 
 
 def _sample_along(length: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
     """Spread n stratified samples over segments with given lengths.
 
+    Args:
+        length: (E,) of the segments, of which at least one is positive; a segment of
+            length 0 gets no sample.
+        random: (n,) in [0, 1).
+
     Returns:
         (n,) index of the segment, and (n,) position along it in [0, 1].
     """
-    sums = length.cumsum(dim=0)
-    distance = (torch.arange(len(random)) + random) / len(random) * sums[-1]
-    last = int(length.nonzero().max())
-    pick = torch.searchsorted(sums, distance, right=True).clamp_max(last)
-    fraction = (1.0 - (sums[pick] - distance) / length[pick]).clamp(0.0, 1.0)
-    return pick, fraction
+    length_sums = length.cumsum(dim=0)
+    distance = (torch.arange(len(random)) + random) / len(random) * length_sums[-1]
+    last_segment = int(length.nonzero().max())
+    # Clamped: rounding may place a sample past the last segment with a length.
+    segment = torch.searchsorted(length_sums, distance, right=True).clamp_max(
+        last_segment
+    )
+    fraction = (1.0 - (length_sums[segment] - distance) / length[segment]).clamp(
+        0.0, 1.0
+    )
+    return segment, fraction
 
 
 def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Find the edges of a mesh; vertices at the same position count as one.
 
+    Args:
+        vertices: (V, 3) positions.
+        corners: (F, 3) vertices of the faces.
+
     Returns:
         (E, 2) vertices of each edge; and for each of the 3 F sides of faces, (3 F,) the
-        index of its edge and (3 F,) the vertex across.
+        index of its edge and (3 F,) the vertex across, which is the face's third
+        corner.
     """
     position_id = torch.unique(vertices, dim=0, return_inverse=True)[1]
-    sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    face_sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     across = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
-    lower, higher = position_id[sides].aminmax(dim=1)
-    keys, owner = torch.unique(lower * len(vertices) + higher, return_inverse=True)
+    lower, higher = position_id[face_sides].aminmax(dim=1)
+    edge_keys, owner = torch.unique(lower * len(vertices) + higher, return_inverse=True)
     side_index = torch.arange(len(owner))
-    # repeatable, unlike indexing
-    first = torch.full((len(keys),), len(owner)).scatter_reduce(
+    # The vertices of an edge are those of the first side that lies on it. Assigning by
+    # index would take any side's, not the same one in each call.
+    first_side = torch.full((len(edge_keys),), len(owner)).scatter_reduce(
         0, owner, side_index, "amin"
     )
-    return sides[first], owner, across
+    return face_sides[first_side], owner, across
 
 
 def compute_shadow_term(
@@ -502,8 +564,14 @@ def compute_shadow_term(
 ) -> Any:
     """Return a value whose gradient is the shadow term of one mesh.
 
-    `mesh_index` is the index of the mesh, `spp` the samples in multiples of the number
-    of pixels.
+    A line that touches the mesh at an edge separates light that passes from light that
+    is blocked, and ends at a lit point, where the shadow's border lies. That point
+    counts by what the light past the edge adds to the image, and by the border's speed,
+    relative to the lit surface if that moves too.
+
+    Args:
+        view, seed, mesh_index, spp: as for `compute_outline_term`.
+        mesh: one that moves, or one that stands still and may shade it.
     """
     stream = make_stream(seed, _SHADOWS, mesh_index)
     random = sample_uniform(stream, spp * view.camera.pixels, 4)
@@ -516,43 +584,51 @@ def compute_shadow_term(
     edge_points = torch.lerp(
         mesh.vertices[ends[:, 0]], mesh.vertices[ends[:, 1]], fraction[:, None]
     )
-    p = to_drjit_vectors(mi.Point3f, edge_points)
-    d = to_drjit_vectors(mi.Vector3f, direction)
-    n = to_drjit_vectors(mi.Vector3f, sampled.normal)
-    offset = SHADOW_OFFSET * mesh.extent * n
+    edge_position = to_drjit_vectors(mi.Point3f, edge_points)
+    light_direction = to_drjit_vectors(mi.Vector3f, direction)
+    edge_normal = to_drjit_vectors(mi.Vector3f, sampled.normal)
+    offset = SHADOW_OFFSET * mesh.extent * edge_normal
     with dr.suspend_grad():
-        ray = mi.Ray3f(p + offset, -d)
+        # The line goes on from just past the edge, with the light, to the lit point.
+        ray = mi.Ray3f(edge_position + offset, -light_direction)
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
-        lit = _eval_lit_points(view, si, d)
-        dr.eval(lit, hit, si, p, offset)
+        lit = _eval_lit_points(view, si, light_direction)
+        dr.eval(lit, hit, si, edge_position, offset)
+        # Most lines end where the camera sees nothing: what follows is for the others.
         lit_index = dr.compress(dr.any(lit != 0.0))
         if dr.width(lit_index) == 0:
             return mi.Float(0)
-        lit, hit, si, p, offset, n = (
+        lit, hit, si, edge_position, offset, edge_normal = (
             dr.gather(type(value), value, lit_index)
-            for value in (lit, hit, si, p, offset, n)
+            for value in (lit, hit, si, edge_position, offset, edge_normal)
         )
         strength = dr.sum(
-            lit * _sample_radiance_difference(view, si, p, offset, stream)
+            lit * _sample_radiance_difference(view, si, edge_position, offset, stream)
         )
         strength = dr.select(dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
-    selected = lit_index.torch().to("cpu", torch.int64)
+    sample_index = lit_index.torch().to("cpu", torch.int64)
     lit_point, _, _, moves = view.attach_hit(hit)
     sine = torch.linalg.cross(
         direction, _compute_edge_directions(mesh.vertices, ends)
     ).norm(dim=1)
-    edge_point = mesh.interpolate_edge(ends[selected], fraction[selected])
-    speed = dr.dot(n, edge_point - dr.select(moves, lit_point, 0.0))
+    edge_point = mesh.interpolate_edge(ends[sample_index], fraction[sample_index])
+    speed = dr.dot(edge_normal, edge_point - dr.select(moves, lit_point, 0.0))
     return (
-        dr.sum(strength * to_drjit_float(sine[selected]) * speed)
+        dr.sum(strength * to_drjit_float(sine[sample_index]) * speed)
         * -sampled.measure_per_sample
     )
 
 
 def _eval_lit_points(view: FilmView, si: Any, d: Any) -> Any:
-    """Return W f J' of lit points that the camera sees, for light from d; else 0."""
+    """Return how lit points count in the image, for light from direction d.
+
+    That is the cotangent at the point's pixel, times the BSDF and its cosine, times the
+    area on the film of what a line's spread in space and angle covers at the point; 0
+    where the camera does not see it. (W, f and J' of the formula in
+    `material_adjoint`.)
+    """
     camera = view.camera
     film = camera.project(si.p)
     depth = camera.compute_depth(si.p)
@@ -575,15 +651,30 @@ def _eval_lit_points(view: FilmView, si: Any, d: Any) -> Any:
 def _sample_radiance_difference(
     view: FilmView, si: Any, p: Any, offset: Any, stream: int
 ) -> Any:
-    """Return the radiance that a lit point gets just past an edge minus just inside."""
+    """Return the radiance that a lit point gets just past an edge minus just inside.
+
+    0 where something hides the edge from the lit point.
+
+    Args:
+        view: the scene.
+        si: the lit point.
+        p: the point on the edge.
+        offset: the step from the edge to just past it.
+        stream: of random numbers; both sides have the same.
+    """
 
     def make_ray(target: Any) -> Any:
         ray = si.spawn_ray_to(target)
         return mi.Ray3f(ray.o, ray.d)
 
-    first = view.scene.ray_intersect_preliminary(make_ray(p + offset), coherent=False)
-    reach = dr.norm(p - si.p) * (1.0 - DEPTH_TOLERANCE) - 2.0 * dr.norm(offset)
-    is_free = ~first.is_valid() | (first.t > reach)
+    occluder = view.scene.ray_intersect_preliminary(
+        make_ray(p + offset), coherent=False
+    )
+    # Shorter by a tolerance, so that the mesh at the edge itself is no occluder.
+    distance_to_edge = dr.norm(p - si.p) * (1.0 - DEPTH_TOLERANCE) - 2.0 * dr.norm(
+        offset
+    )
+    is_free = ~occluder.is_valid() | (occluder.t > distance_to_edge)
 
     def sample_radiance(target: Any) -> Any:
         sampler = make_sampler(stream + _PATHS, dr.width(p))
@@ -591,9 +682,9 @@ def _sample_radiance_difference(
             make_ray(target), sampler, view.max_depth - 1, is_free
         )
 
-    past = sample_radiance(p + offset)
-    inside = sample_radiance(p - offset)
-    return dr.select(is_free, past - inside, 0.0)
+    radiance_past = sample_radiance(p + offset)
+    radiance_inside = sample_radiance(p - offset)
+    return dr.select(is_free, radiance_past - radiance_inside, 0.0)
 
 
 class _TangentSamples(NamedTuple):
@@ -607,7 +698,7 @@ class _TangentSamples(NamedTuple):
 
 
 def _orient_outwards(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Return vectors (N, 3), turned over where they point in a direction (N, 3)."""
+    """Return vectors (N, 3), turned over where they point along a direction (N, 3)."""
     points_inwards = (vectors * directions).sum(dim=1, keepdim=True) > 0.0
     return vectors * torch.where(points_inwards, -1.0, 1.0)
 
@@ -631,23 +722,30 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     measure = edge_length * edges.angle
     if len(random) == 0 or not float(measure.sum()) > 0.0:
         return None
-    pick, _ = _sample_along(measure, random[:, 0])
-    axis = edges.axis[pick]
-    first = edges.first[pick]
-    second = edges.second[pick]
+    edge_index, _ = _sample_along(measure, random[:, 0])
+    axis = edges.axis[edge_index]
+    along_first = edges.along_first[edge_index]
+    along_second = edges.along_second[edge_index]
 
     # A direction perpendicular to the edge, within the exterior angle.
-    turn = random[:, 2:3] * edges.angle[pick][:, None]
-    aside = torch.cos(turn) * second + torch.sin(turn) * edges.turned[pick]
+    angle = random[:, 2:3] * edges.angle[edge_index][:, None]
+    perpendicular = (
+        torch.cos(angle) * along_second + torch.sin(angle) * edges.opening[edge_index]
+    )
     # The sign chooses the side, the rest is the cosine with the edge.
-    height = 4.0 * random[:, 3:4] - 2.0
-    aside = torch.where(height < 0.0, -aside, aside)
-    height = height.abs() - 1.0
-    direction = height * axis + (1.0 - height.square()).clamp_min(0.0).sqrt() * aside
+    edge_cosine = 4.0 * random[:, 3:4] - 2.0
+    perpendicular = torch.where(edge_cosine < 0.0, -perpendicular, perpendicular)
+    edge_cosine = edge_cosine.abs() - 1.0
+    direction = (
+        edge_cosine * axis
+        + (1.0 - edge_cosine.square()).clamp_min(0.0).sqrt() * perpendicular
+    )
 
-    normal = _orient_outwards(torch.linalg.cross(axis, aside), first + second)
+    normal = _orient_outwards(
+        torch.linalg.cross(axis, perpendicular), along_first + along_second
+    )
     return _TangentSamples(
-        ends=edges.ends[pick],
+        ends=edges.ends[edge_index],
         fraction=random[:, 1],
         direction=direction,
         normal=normal,
@@ -660,57 +758,75 @@ class _ExteriorAngles(NamedTuple):
 
     ends: Tensor  # (E, 2) vertices
     axis: Tensor  # (E, 3) unit vector along the edge
-    first: Tensor  # (E, 3) unit vectors along both faces, perpendicular to the edge
-    second: Tensor
-    # (E, 3) unit vector, perpendicular to edge and `second`, to which the angle opens
-    turned: Tensor
+    # (E, 3) unit vectors along both faces, perpendicular to the edge; the same vector
+    # twice where there is one face
+    along_first: Tensor
+    along_second: Tensor
+    # (E, 3) unit vector, perpendicular to the edge and to `along_second`, to which the
+    # angle opens
+    opening: Tensor
     angle: Tensor  # (E,) exterior angle, radians
 
 
 def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
+    """Measure the exterior angles of the edges of a mesh that have one face or two.
+
+    Edges with more faces, or of length 0, are left out.
+    """
     vertices = mesh.vertices
     ends, owner, across = _find_edges(vertices, mesh.corners)
+    # Sides of faces edge by edge; those of an edge end at entry `last`.
     order = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
-    last = n_faces.cumsum(dim=0) - 1
+    last_entry = n_faces.cumsum(dim=0) - 1
     length = (vertices[ends[:, 1]] - vertices[ends[:, 0]]).norm(dim=1)
-    proper = (n_faces <= 2) & (length > 0.0)
-    ends = ends[proper]
-    is_single = n_faces[proper] == 1
+    is_measured = (n_faces <= 2) & (length > 0.0)
+    ends = ends[is_measured]
+    is_single = n_faces[is_measured] == 1
     axis = _compute_edge_directions(vertices, ends)
 
     def along_face(entry: Tensor) -> Tensor:
         """Return unit vectors along one of an edge's faces, perpendicular to it."""
-        vector = vertices[across[order[entry[proper]]]] - vertices[ends[:, 0]]
+        vector = vertices[across[order[entry[is_measured]]]] - vertices[ends[:, 0]]
         return torch.nn.functional.normalize(
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
 
-    first = along_face(last - n_faces + 1)
-    second = along_face(last)
-    turned, angle = _measure_between_faces(first, second, axis, is_single)
-    return _ExteriorAngles(ends, axis, first, second, turned, angle)
+    along_first = along_face(last_entry - n_faces + 1)
+    along_second = along_face(last_entry)
+    opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)
+    return _ExteriorAngles(
+        ends=ends,
+        axis=axis,
+        along_first=along_first,
+        along_second=along_second,
+        opening=opening,
+        angle=angle,
+    )
 
 
 def _measure_between_faces(
-    first: Tensor, second: Tensor, axis: Tensor, is_single: Tensor
+    along_first: Tensor, along_second: Tensor, axis: Tensor, is_single: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the second axis (N, 3) of the exterior angles of edges, and these (N,).
+    """Return where the exterior angles of edges open to (N, 3), and their sizes (N,).
+
+    The directions of an exterior angle are cos(t) along_second + sin(t) opening, with t from 0
+    to the angle: it is pi minus the angle between the faces, and pi at a single face.
 
     Args:
-        first, second: (N, 3) unit vectors along both faces, perpendicular to the edge.
+        along_first, along_second: (N, 3) unit vectors along both faces, perpendicular to the edge.
         axis: (N, 3) unit vectors along the edges.
         is_single: (N,) whether an edge has only one face.
     """
-    cosine = (first * second).sum(dim=1, keepdim=True)
-    rest = first - cosine * second
-    turned = torch.where(
+    cosine = (along_first * along_second).sum(dim=1, keepdim=True)
+    perpendicular = along_first - cosine * along_second
+    opening = torch.where(
         is_single[:, None],
-        torch.linalg.cross(axis, second),
-        -torch.nn.functional.normalize(rest, dim=1),
+        torch.linalg.cross(axis, along_second),
+        -torch.nn.functional.normalize(perpendicular, dim=1),
     )
-    angle = torch.pi - torch.atan2(rest.norm(dim=1), cosine[:, 0])
-    return turned, angle
+    angle = torch.pi - torch.atan2(perpendicular.norm(dim=1), cosine[:, 0])
+    return opening, angle
 
 
 def _compute_edge_directions(vertices: Tensor, ends: Tensor) -> Tensor:

@@ -97,7 +97,10 @@ def clamp_to_rendered(name: str, value: float) -> float:
 
 
 def make_emitter(part: MeshPart) -> Plugin | None:
-    """Return the light that a mesh emits from the front of its faces, or None."""
+    """Return the light that a mesh emits from the front of its faces, or None.
+
+    Even light is a color, whose input has three numbers; other light is a texture.
+    """
     if part.emission is None:
         return None
     if has_textured_emission(part):
@@ -154,7 +157,7 @@ def make_texture(linear: Float32Array) -> Plugin:
 def map_inner_plugins(
     plugin: Mapping[str, object], change: Callable[[Mapping[str, object]], object]
 ) -> Plugin:
-    """Return a plugin whose inner plugins are changed."""
+    """Return a plugin whose inner plugins are changed, those directly in it."""
     return {
         key: change(entry) if isinstance(entry, Mapping) else entry
         for key, entry in plugin.items()
@@ -194,6 +197,10 @@ def to_repeating_uv(
 ) -> Tensor:
     """Convert texture coordinates for a texture that repeats and is interpolated.
 
+    The texture's own transform, its wrap mode and its filter are applied here instead:
+    mirrored and clamped coordinates stay half a texel inside, and unfiltered ones go to
+    the center of their texel.
+
     Args:
         uv: (n, 2) float32, as Mitsuba has them.
         options: how the texture is really looked up, see `make_base_texture`.
@@ -205,14 +212,17 @@ def to_repeating_uv(
     if "to_uv" in options:
         matrix = torch.as_tensor(np.asarray(options["to_uv"]), dtype=uv.dtype)
         uv = uv @ matrix[:2, :2].T + matrix[:2, -1]
-    texels = torch.tensor((size[1], size[0]), dtype=uv.dtype)
-    wrap = options.get("wrap_mode", "repeat")
-    if wrap == "mirror":
-        uv = 1.0 - (uv % 2.0 - 1.0).abs()
-    if wrap != "repeat":
-        uv = torch.minimum(torch.maximum(uv, 0.5 / texels), 1.0 - 0.5 / texels)
+    texture_size = torch.tensor((size[1], size[0]), dtype=uv.dtype)
+    wrap_mode = options.get("wrap_mode", "repeat")
+    if wrap_mode == "mirror":
+        uv = 1.0 - (uv % 2.0 - 1.0).abs()  # back and forth in [0, 1]
+    # within half a texel of the border the texture does not blend with the other side
+    if wrap_mode != "repeat":
+        uv = torch.minimum(
+            torch.maximum(uv, 0.5 / texture_size), 1.0 - 0.5 / texture_size
+        )
     if options.get("filter_type") == "nearest":
-        return (torch.floor(uv * texels) + 0.5) / texels
+        return (torch.floor(uv * texture_size) + 0.5) / texture_size
     return uv
 
 
@@ -250,8 +260,8 @@ def make_mitsuba_mesh(
     parameters[FACES] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
     parameters.update()
     for key, values in mesh.attributes.items():
-        flat = np.ascontiguousarray(values, np.float32).ravel()
-        plugin.add_attribute(key, values.shape[1], flat)
+        flat_values = np.ascontiguousarray(values, np.float32).ravel()
+        plugin.add_attribute(key, values.shape[1], flat_values)
     return plugin
 
 
@@ -263,13 +273,14 @@ def to_loadable(plugin: Mapping[str, object]) -> Plugin:
     """
     entries = {key: _to_loadable_entry(value) for key, value in plugin.items()}
     if entries.get("type") == "principled":
-        for name, (dark, smallest) in BLACK_METAL_VALUES.items():
-            if entries.get(name) == dark:
-                entries[name] = smallest
+        for name, (refused_value, smallest_value) in BLACK_METAL_VALUES.items():
+            if entries.get(name) == refused_value:
+                entries[name] = smallest_value
     return entries
 
 
 def _to_loadable_entry(value: object) -> object:
+    """Convert one value of a dictionary, see `to_loadable`."""
     if isinstance(value, Mapping):
         return to_loadable(value)
     if not isinstance(value, np.ndarray):
@@ -290,6 +301,7 @@ def to_plain(plugin: Mapping[str, object]) -> Plugin:
 
 
 def _to_plain_entry(value: object) -> object:
+    """Convert one value of a dictionary, see `to_plain`."""
     if isinstance(value, Mapping):
         return to_plain(value)
     matrix = getattr(value, "matrix", None)

@@ -75,10 +75,11 @@ def find_plugin_numbers(
 def _find_numbers(
     description: SceneDescription,
 ) -> tuple[dict[str, PluginNumber], dict[str, str]]:
-    """Find all numbers and colors of a scene.
+    """Find all numbers and colors of a scene; that of the last description is
+    remembered.
 
     Returns:
-        They by their key, with an input if they have one; and the type of the rest.
+        Them by their key, with an input if they have one; and the type of the rest.
     """
     scene = MitsubaScene(description, SMALL_RESOLUTION)
     inputs = {
@@ -99,14 +100,14 @@ def _find_numbers(
         else:
             other_types[key] = f"a {type(value).__name__}"
             continue
-        estimators = _valid_estimators(scene.parameters.flags(key))
+        estimators = _find_valid_estimators(scene.parameters.flags(key))
         numbers[key] = PluginNumber(
             key, values, inputs.get(key, ""), estimators, is_plain
         )
     return numbers, other_types
 
 
-def _valid_estimators(flags: int) -> tuple[str, ...]:
+def _find_valid_estimators(flags: int) -> tuple[str, ...]:
     """Return the estimators that are valid for a parameter with Mitsuba's flags."""
     if flags & mi.ParamFlags.NonDifferentiable.value:
         return DIFFERENCES_ONLY

@@ -87,12 +87,15 @@ def _compute_cap_height(
 
 
 def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
-    """Return the index of the highest drop in each cell, as in `sample_raindrops`."""
+    """Return the index of the highest drop in each cell, as in `sample_raindrops`.
+
+    Drops (count, 4) and the half width of the sheet are as there too.
+    """
     cell_centers = (
         np.arange(GRID_SIZE) + 0.5
     ) / GRID_SIZE * 2.0 * half_width - half_width
     highest_drop = np.full((GRID_SIZE, GRID_SIZE), len(drops))
-    highest = np.zeros((GRID_SIZE, GRID_SIZE))
+    max_height = np.zeros((GRID_SIZE, GRID_SIZE))
     for index, (x, y, radius, curvature_radius) in enumerate(drops):
         rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
         columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
@@ -101,13 +104,15 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
         distance_squared = dy[:, None] ** 2 + dx[None] ** 2
         height = _compute_cap_height(distance_squared, radius, curvature_radius)
         cells = np.ix_(rows, columns)
-        is_higher = (distance_squared < radius**2) & (height > highest[cells])
+        is_higher = (distance_squared < radius**2) & (height > max_height[cells])
         highest_drop[cells] = np.where(is_higher, index, highest_drop[cells])
-        highest[cells] = np.where(is_higher, height, highest[cells])
+        max_height[cells] = np.where(is_higher, height, max_height[cells])
     return highest_drop
 
 
 common: Any = mi.ad.integrators.common
+PRBIntegrator: Any = mi.ad.integrators.prb.PRBIntegrator
+PLANE_SHAPE = "ground"  # Mitsuba's id of the plane that takes the shadow
 ISOTROPIC_PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
 MIN_EXTINCTION = 1e-20
 MAX_SCATTERINGS = 8
@@ -141,6 +146,10 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
     Derivatives are right for the haze's color, for emission, for everything that
     surfaces look up, and for the density where it is greater than 0. Moving geometry
     has none.
+
+    Attributes:
+        haze: the medium.
+        radius: of the ball that it fills.
 
     Properties in addition to those of `prb`: `medium`, a homogeneous medium with grey
     extinction, and `radius`, that of the ball around the origin which the medium fills.
@@ -189,7 +198,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             # ---- the next event: a surface, the outside, or the haze before it
             is_first = bounces + scatterings == 0
             si = self._intersect(scene, ray, is_first, active)
-            haze_start, haze_length = self._haze_segment(ray.o, ray.d, si.t)
+            haze_start, haze_length = self._find_haze_segment(ray.o, ray.d, si.t)
             with dr.resume_grad(when=not primal):
                 scattered, flight, weight, albedo, extinction = self._sample_flight(
                     sampler, haze_length, active
@@ -290,18 +299,26 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             )
         return si
 
-    def _haze_segment(
+    def _find_haze_segment(
         self, origin: Any, direction: Any, max_distance: Any
     ) -> tuple[Any, Any]:
-        """Return where the haze starts on a segment, and its length (0 for a miss)."""
-        middle = -dr.dot(origin, direction)
-        half = dr.sqrt(
+        """Return where the haze starts on a segment, and its length (0 for a miss).
+
+        The segment begins at an origin in a unit direction; the haze fills the ball
+        around the coordinates' origin.
+        """
+        closest_distance = -dr.dot(origin, direction)
+        # 0 where the ray passes the ball: then the length is 0 too
+        half_chord = dr.sqrt(
             dr.maximum(
-                dr.square(middle) - dr.squared_norm(origin) + self.radius**2, 0.0
+                dr.square(closest_distance) - dr.squared_norm(origin) + self.radius**2,
+                0.0,
             )
         )
-        start = dr.maximum(middle - half, 0.0)
-        return start, dr.maximum(dr.minimum(middle + half, max_distance) - start, 0.0)
+        start = dr.maximum(closest_distance - half_chord, 0.0)
+        return start, dr.maximum(
+            dr.minimum(closest_distance + half_chord, max_distance) - start, 0.0
+        )
 
     def _sample_flight(
         self, sampler: Any, haze_length: Any, active: Any
@@ -317,6 +334,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             dr.zeros(mi.MediumInteraction3f)
         )
         extinction = extinction[0]
+        # A haze of extinction 0 scatters infinitely far away.
         flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(
             dr.detach(extinction), MIN_EXTINCTION
         )
@@ -344,7 +362,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         active = active & (ds.pdf != 0.0)
         is_outside = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         distance = dr.select(is_outside, dr.inf, ds.dist)
-        _, haze_length = self._haze_segment(event.p, ds.d, distance)
+        _, haze_length = self._find_haze_segment(event.p, ds.d, distance)
         if not primal:
             with dr.resume_grad():
                 attached = scene.eval_emitter_direction(event, ds, active)
@@ -368,6 +386,139 @@ def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
 mi.register_integrator("advsearch_haze", lambda props: HazePath(props))
 
 
+class _PlaneHits:
+    """Camera rays that meet the plane first, and where their paths go on.
+
+    Args:
+        scene, sampler: as in `mi.ad.integrators.common.RBIntegrator`.
+        ray: camera rays.
+        active: which are traced at all.
+
+    Attributes:
+        is_hit: whether a ray meets the plane first.
+        direct_change: of its radiance by what hides the environment, and by lamps.
+        weight: of the light that comes along the path's next segment.
+        path_ray: that segment; of other rays, the camera ray.
+        is_traced: whether there is such a segment.
+    """
+
+    def __init__(self, scene: Any, sampler: Any, ray: Any, active: Any) -> None:
+        plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
+        self._si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.is_hit)
+        light = self._sample_emitter(scene, sampler)
+        self.direct_change = dr.select(self.is_hit, self._factor * light, 0.0)
+        bounce, self.weight = self._si.bsdf().sample(
+            mi.BSDFContext(),
+            self._si,
+            sampler.next_1d(),
+            sampler.next_2d(),
+            self.is_hit,
+        )
+        bounced_ray = self._si.spawn_ray(self._si.to_world(bounce.wo))
+        self.path_ray = dr.select(self.is_hit, bounced_ray, ray)
+        self.is_traced = active & (~self.is_hit | (bounce.pdf > 0.0))
+
+    def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
+        """Sample an emitter, and return its radiance over the density.
+
+        The factor by which that changes the plane is stored: what the plane reflects of
+        it, with -1 for the environment where something is in between, and 0 where
+        nothing is; for lamps it is the other way around, 0 and 1.
+        """
+        si = self._si
+        ds, light = scene.sample_emitter_direction(
+            si, sampler.next_2d(), False, self.is_hit
+        )
+        is_sampled = self.is_hit & (ds.pdf != 0.0)
+        is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
+        is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        sign = dr.select(is_blocked, 0.0, 1.0)
+        sign = dr.select(is_environment, sign - 1.0, sign)
+        reflected = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(ds.d), is_sampled)
+        self._emitter_sample = ds
+        self._factor = dr.select(is_sampled, sign * reflected, 0.0)
+        return light
+
+    def backpropagate(self, scene: Any, cotangent: Any) -> None:
+        """Add the derivative of `cotangent * direct_change` by lights."""
+        ds = self._emitter_sample
+        is_sampled = self.is_hit & (ds.pdf != 0.0)
+        with dr.resume_grad():
+            light = scene.eval_emitter_direction(self._si, ds, is_sampled)
+            light *= dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
+            if dr.grad_enabled(light):
+                # The path goes along the same edges later: they are kept.
+                change = cotangent * self._factor * light
+                dr.backward_from(change, dr.ADFlag.ClearInterior)
+
+
+class PhotographPath(PRBIntegrator):  # type: ignore[misc]
+    """Trace paths for a scene that is rendered into a photograph, with an adjoint.
+
+    It is the integrator `advsearch_photograph`. The plane that takes the shadow, the
+    shape `ground`, is not seen. Where a camera ray meets it first, the change of its
+    radiance by all that is in the scene beside it and the environment is in three more
+    channels:
+
+        - light of the environment that is kept from it + light of lamps
+        + light that other surfaces send to it
+
+    Both are exactly zero where nothing is in the way, so that the photograph stays as
+    it is there, without noise. The object sees the plane as any other surface.
+
+    The derivative is that of `prb` on what is left of the path.
+    """
+
+    def sample(
+        self,
+        mode: Any,
+        scene: Any,
+        sampler: Any,
+        ray: Any,
+        δL: Any,
+        state_in: Any,
+        active: Any,
+        δaovs: Any = None,
+        **rest: Any,
+    ) -> Any:
+        """Sample paths, or replay them; see `mi.ad.integrators.common.RBIntegrator`."""
+        plane = _PlaneHits(scene, sampler, mi.Ray3f(dr.detach(ray)), mi.Bool(active))
+        if mode != dr.ADMode.Primal:
+            change = mi.Spectrum(*δaovs)
+            plane.backpropagate(scene, change)
+            δL = dr.select(plane.is_hit, plane.weight * change, δL)
+        L, valid, _, state_out = super().sample(
+            mode=mode,
+            scene=scene,
+            sampler=sampler,
+            ray=plane.path_ray,
+            δL=δL,
+            state_in=state_in,
+            active=plane.is_traced,
+            **rest,
+        )
+        change = dr.select(plane.is_hit, plane.weight * L + plane.direct_change, 0.0)
+        color = dr.select(plane.is_hit, 0.0, L)
+        return color, valid & ~plane.is_hit, [*change], state_out
+
+    def sample_rays(self, scene: Any, sensor: Any, sampler: Any, **rest: Any) -> Any:
+        """Return rays, weights and positions, with weights that are plain numbers.
+
+        Mitsuba 3.9.1 multiplies each further channel by a weight of three channels in
+        `render_backward`, which fails. Our cameras' weights are grey.
+        """
+        ray, weight, position = super().sample_rays(scene, sensor, sampler, **rest)
+        return ray, mi.Float(weight[0]), position
+
+    def aov_names(self) -> list[str]:
+        return [f"plane.{channel}" for channel in "RGB"]
+
+
+mi.register_integrator("advsearch_photograph", lambda props: PhotographPath(props))
+
+
 class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
     """Render what guides the denoiser: diffuse reflectance and shading normal.
 
@@ -380,10 +531,13 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
     def sample(
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
     ) -> Any:
-        """Return reflectance, coverage and guides; see `mi.SamplingIntegrator`."""
+        """Return reflectance, coverage and guides; see `mi.SamplingIntegrator`.
+
+        A ray goes on through a surface with the probability with which light passes it.
+        """
         active = mi.Bool(active)
         ray = mi.Ray3f(ray)
-        covered = mi.Bool(False)
+        is_covered = mi.Bool(False)
         albedo = mi.Spectrum(0.0)
         normal = mi.Normal3f(0.0)
         while active:
@@ -391,16 +545,17 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
             active &= si.is_valid()
             bsdf = si.bsdf()
             transmittance = dr.max(bsdf.eval_null_transmission(si, active))
-            passes = active & (sampler.next_1d(active) < transmittance)
-            stops = active & ~passes
-            albedo[stops] = bsdf.eval_diffuse_reflectance(si, stops)
-            normal[stops] = si.sh_frame.n
-            covered |= stops
+            passes_through = active & (sampler.next_1d(active) < transmittance)
+            is_stopped = active & ~passes_through
+            albedo[is_stopped] = bsdf.eval_diffuse_reflectance(si, is_stopped)
+            normal[is_stopped] = si.sh_frame.n
+            is_covered |= is_stopped
             ray = si.spawn_ray(ray.d)
-            active = passes
-        return albedo, covered, [*albedo, *normal]
+            active = passes_through
+        return albedo, is_covered, [*albedo, *normal]
 
     def aov_names(self) -> list[str]:
+        """Names of the channels after reflectance: of albedo and normal."""
         names = ("albedo", "normal")
         return [f"{name}.{channel}" for name in names for channel in "XYZ"]
 
@@ -413,7 +568,7 @@ MAX_CELLS = 512
 NO_DROP = (0.0, 0.0, -1.0, 1.0)  # center, radius and curvature: a drop without inside
 
 
-def _transmittance(
+def _compute_transmittance(
     cos_incident: Any, cos_refracted: Any, ior_incident: float, ior_refracted: float
 ) -> Any:
     """Return Fresnel's transmittance of unpolarised light between two media.
@@ -445,27 +600,38 @@ def _refract_through_drop(
         The direction behind the drop, not normalised; the fraction of the light that
         passes; and whether the ray is lost by total reflection.
     """
-    inner = mi.Vector3f(direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0)
-    inner.z = dr.safe_sqrt(1.0 - inner.x * inner.x - inner.y * inner.y)
+    inside_direction = mi.Vector3f(
+        direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0
+    )
+    inside_direction.z = dr.safe_sqrt(
+        1.0
+        - inside_direction.x * inside_direction.x
+        - inside_direction.y * inside_direction.y
+    )
 
     # From the center of curvature: where the ray enters, and where it leaves.
     entry = mi.Vector3f(dx, dy, dr.safe_sqrt(drop.w * drop.w - drop.z * drop.z))
-    along = dr.dot(entry, inner)
+    entry_cosine = dr.dot(entry, inside_direction)
     exit_distance = (
-        dr.safe_sqrt(along * along - dr.squared_norm(entry) + drop.w * drop.w) - along
+        dr.safe_sqrt(
+            entry_cosine * entry_cosine - dr.squared_norm(entry) + drop.w * drop.w
+        )
+        - entry_cosine
     )
-    exit_point = entry + inner * exit_distance
+    exit_point = entry + inside_direction * exit_distance
     normal = exit_point / drop.w
 
-    cos_inside = dr.dot(inner, normal)
+    cos_inside = dr.dot(inside_direction, normal)
     cos_outside_squared = 1.0 - WATER_IOR * WATER_IOR * (1.0 - cos_inside * cos_inside)
     cos_outside = dr.safe_sqrt(cos_outside_squared)
-    outer = WATER_IOR * inner + (cos_outside - WATER_IOR * cos_inside) * normal
-    transmitted = _transmittance(direction.z, inner.z, 1.0, WATER_IOR) * _transmittance(
-        cos_inside, cos_outside, WATER_IOR, 1.0
+    outside_direction = (
+        WATER_IOR * inside_direction + (cos_outside - WATER_IOR * cos_inside) * normal
     )
-    is_lost = (cos_outside_squared <= 0.0) | (outer.z <= 0.0)
-    return outer, transmitted, is_lost
+    transmitted = _compute_transmittance(
+        direction.z, inside_direction.z, 1.0, WATER_IOR
+    ) * _compute_transmittance(cos_inside, cos_outside, WATER_IOR, 1.0)
+    is_lost = (cos_outside_squared <= 0.0) | (outside_direction.z <= 0.0)
+    return outside_direction, transmitted, is_lost
 
 
 class ModelledCamera(mi.Sensor):  # type: ignore[misc]
@@ -479,9 +645,16 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     Raindrops before the camera bend the rays, see the comment at the top.
 
     Parameters: `to_world`; `lens`, its numbers in the order of `NUMBER_NAMES`.
+
+    Attributes:
+        pose: Mitsuba's transform from the camera's axes (left, up, ahead) to the world.
+        lens: the numbers.
+        rays: four numbers for each grid point, row by row: direction and margin, see
+            `CameraModel.make_ray_table`.
     """
 
     def __init__(self, props: Any) -> None:
+        """Read the model, the clipping and perhaps drops from the sensor's properties."""
         super().__init__(props)
         values = tuple(float(props[name]) for name in NUMBER_NAMES)
         self._model = CameraModel(
@@ -489,20 +662,23 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         )
         self._near = float(props["near_clip"])
         self._far = float(props["far_clip"])
-        self._cells = tuple(
+        self._grid_cells = tuple(
             max(MIN_CELLS, min(MAX_CELLS, int(size)))
             for size in self.film().crop_size()
         )
         self.pose = mi.Transform4f(super().world_transform())
         self.lens = mi.TensorXf(list(values), (len(NUMBER_NAMES),))
         self._make_rays()
-        self._half = 0.0  # width of the square with drops; 0 without drops
+        self._sheet_half_width = 0.0  # width of the square with drops; 0 without drops
         if "drops" in props:
             self._make_drops(props)
 
     def _make_drops(self, props: Any) -> None:
-        """Sample the raindrops that the sensor's properties describe."""
-        self._half, drops, grid = sample_raindrops(
+        """Sample the raindrops that the sensor's properties describe.
+
+        From then on rays take a sample of the aperture (`sample3`).
+        """
+        self._sheet_half_width, drops, grid = sample_raindrops(
             int(props["drops"]),
             float(props["drop_size"]),
             int(props["drop_seed"]),
@@ -516,16 +692,19 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         self.m_needs_sample_3 = True
 
     def traverse(self, cb: Any) -> None:
+        """Tell Mitsuba the parameters that may be set."""
         super().traverse(cb)
         cb.put("to_world", self.pose, mi.ParamFlags.NonDifferentiable)
         cb.put("lens", self.lens, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: Any) -> None:
+        """Compute the rays anew after the lens has changed, or possibly has."""
         if not keys or "lens" in keys:
             self._make_rays()
         super().parameters_changed(keys)
 
     def world_transform(self) -> Any:
+        """Return the pose; Mitsuba's own is not updated."""
         return self.pose
 
     def sample_ray_differential(
@@ -537,7 +716,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         """
         direction, is_inside = self._look_up_direction(sample2)
         transmitted = mi.Float(1.0)
-        if self._half > 0.0:
+        if self._sheet_half_width > 0.0:
             direction, transmitted = self._bend_by_drops(direction, sample3)
         weight = dr.select(is_inside, transmitted, 0.0)
         # Every field is set: a ragged ray has no derivatives.
@@ -562,12 +741,12 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
         Ground truth such as depth is that of the scene behind the drops.
         """
-        half_width = self._half
-        self._half = 0.0
+        half_width = self._sheet_half_width
+        self._sheet_half_width = 0.0
         try:
             return self.sample_ray(time, 0.5, position, mi.Point2f(0.5))
         finally:
-            self._half = half_width
+            self._sheet_half_width = half_width
 
     def _bend_by_drops(self, direction: Any, sample: Any) -> tuple[Any, Any]:
         """Refract the rays that meet a drop.
@@ -576,15 +755,20 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             The unit directions, and the fraction of the light that passes (1 without a
             drop, 0 where a drop reflects it inside).
         """
-        lens = APERTURE_RADIUS * mi.warp.square_to_uniform_disk_concentric(sample)
-        reach = SHEET_DISTANCE / dr.maximum(direction.z, 1e-3)
-        x = direction.x * reach + lens.x
-        y = direction.y * reach + lens.y
+        aperture_point = APERTURE_RADIUS * mi.warp.square_to_uniform_disk_concentric(
+            sample
+        )
+        sheet_distance = SHEET_DISTANCE / dr.maximum(direction.z, 1e-3)
+        x = direction.x * sheet_distance + aperture_point.x
+        y = direction.y * sheet_distance + aperture_point.y
+        # 0.1: rays almost along the sheet meet no drop
         drop, dx, dy, is_hit = self._find_drop(x, y, direction.z > 0.1)
         refracted, transmitted, is_lost = _refract_through_drop(direction, dx, dy, drop)
         weight = dr.select(is_hit, dr.select(is_lost, 0.0, transmitted), 1.0)
-        bent = dr.select(is_hit & ~is_lost, dr.normalize(refracted), direction)
-        return bent, weight
+        refracted_direction = dr.select(
+            is_hit & ~is_lost, dr.normalize(refracted), direction
+        )
+        return refracted_direction, weight
 
     def _find_drop(self, x: Any, y: Any, active: Any) -> tuple[Any, Any, Any, Any]:
         """Find the drop at a point of the sheet, in millimetres.
@@ -593,7 +777,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             The drop's four numbers, as in `sample_raindrops`; the point's x and y from
             the drop's center; and whether there is a drop at all.
         """
-        half_width = self._half
+        half_width = self._sheet_half_width
         cells_per_mm = GRID_SIZE / (2.0 * half_width)
         column = (x + half_width) * cells_per_mm
         row = (y + half_width) * cells_per_mm
@@ -616,7 +800,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
     def _make_rays(self) -> None:
         """Compute the grid of ray directions from the lens's numbers."""
-        n_columns, n_rows = self._cells
+        n_columns, n_rows = self._grid_cells
         x = torch.linspace(0.0, 1.0, n_columns + 1, dtype=torch.float64)
         y = torch.linspace(0.0, 1.0, n_rows + 1, dtype=torch.float64)
         positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
@@ -631,7 +815,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
 
         The second value is whether the lens has a direction there at all.
         """
-        n_columns, n_rows = self._cells
+        n_columns, n_rows = self._grid_cells
         x = position.x * n_columns
         y = position.y * n_rows
         column = dr.clip(mi.Int32(dr.floor(x)), 0, n_columns - 1)

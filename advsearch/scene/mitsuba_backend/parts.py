@@ -16,6 +16,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene import parts
+from advsearch.scene.backdrop import has_plane
 from advsearch.scene.camera_model import NUMBER_NAMES
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -40,7 +41,10 @@ to_flat_array: Write = attrgetter("array")
 
 
 def to_constant(value: Any) -> float:
-    """Return a single number that is a constant of the kernel."""
+    """Return a single number that is a constant of the kernel.
+
+    It has no derivative, and a recorded kernel would keep its value.
+    """
     return float(value.array[0])
 
 
@@ -76,7 +80,10 @@ def to_torch(value: Any) -> Tensor:
 
 
 def _get_entries(value: Any, count: int) -> list[Any]:
-    """Return the first entries of a Dr.Jit tensor, one array for each."""
+    """Return the first entries of a Dr.Jit tensor, one array for each.
+
+    They are gathered one by one so that derivatives reach them.
+    """
     return [
         dr.gather(mi.Float, value.array, mi.UInt32(entry)) for entry in range(count)
     ]
@@ -110,13 +117,16 @@ class SceneInput:
 
 
 def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
-    """Return the one parameter of Mitsuba that an input means; None without one."""
-    prefix, star, suffix = scene_input.key.partition("*")
+    """Return the one parameter of Mitsuba that an input means; None without one.
+
+    Raises RuntimeError if there are several.
+    """
+    prefix, asterisk, suffix = scene_input.key.partition("*")
 
     def matches(key: str) -> bool:
-        if star and not (key.startswith(prefix) and key.endswith(suffix)):
+        if asterisk and not (key.startswith(prefix) and key.endswith(suffix)):
             return False
-        if not star and key != scene_input.key:
+        if not asterisk and key != scene_input.key:
             return False
         owner = scene_input.owner
         return owner is None or parameters.properties[key][2] is owner
@@ -184,7 +194,8 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
         inputs += _make_principled_inputs(name)
     else:
 
-        def fill(options: Mapping[str, object]) -> object:
+        def load_base_texture(options: Mapping[str, object]) -> object:
+            """Load the base color, and add the input that owns this texture."""
             texture = mi.load_dict(
                 meshes.make_base_texture(part.base_color, options), optimize=False
             )
@@ -198,7 +209,7 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
             )
             return texture
 
-        surface = meshes.fill_base_color(part.surface, fill)
+        surface = meshes.fill_base_color(part.surface, load_base_texture)
     if meshes.has_textured_emission(part):
         inputs.append(
             SceneInput(
@@ -247,6 +258,7 @@ def _make_pose_input(name: str, parameter: str) -> SceneInput:
 
 @translate_part.register
 def _translate_plugin(part: parts.PluginPart) -> Translation:
+    """Return one of Mitsuba's plugins as it is, which has no inputs."""
     integrator = {"type": "prbvolpath"} if part.volumetric else {}
     plugins = {part.name: meshes.to_loadable(part.plugin)}
     return Translation(plugins, integrator=integrator)
@@ -254,6 +266,7 @@ def _translate_plugin(part: parts.PluginPart) -> Translation:
 
 @translate_part.register
 def _translate_numbers(part: parts.PluginNumbers) -> Translation:
+    """Return inputs for numbers of other plugins; those of other parts exist already."""
     return Translation(
         {},
         tuple(
@@ -265,7 +278,11 @@ def _translate_numbers(part: parts.PluginNumbers) -> Translation:
 
 
 def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
-    """Return the input of a number or a color of a Mitsuba scene."""
+    """Return the input of a number or a color of a Mitsuba scene.
+
+    A plain number is a constant; a number of a principled surface is clamped as ours
+    are.
+    """
     write: Write
     if plugin_number.plain:
         write = to_constant
@@ -278,21 +295,22 @@ def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
         for parameter, key in SURFACE_KEYS.items()
         if plugin_number.key.endswith(f".{key}")
     ]
-    within = None
+    rendered_range = None
     if surface_parameters:
-        within = meshes.RENDERED_RANGES.get(surface_parameters[0])
+        rendered_range = meshes.RENDERED_RANGES.get(surface_parameters[0])
     return SceneInput(
         plugin_number.input,
         plugin_number.key,
         write,
         is_interior="adjoint" in plugin_number.valid,
         shape=(len(plugin_number.values),),
-        rendered_range=within,
+        rendered_range=rendered_range,
     )
 
 
 @translate_part.register
 def _translate_point_lamp(part: parts.PointLamp) -> Translation:
+    """Return a lamp that is a point."""
     name = part.name
     lamp = {
         "type": "point",
@@ -307,6 +325,7 @@ def _translate_point_lamp(part: parts.PointLamp) -> Translation:
 
 @translate_part.register
 def _translate_spot_lamp(part: parts.SpotLamp) -> Translation:
+    """Return a lamp with a cone."""
     cutoff, beam = part.cone
     lamp = {
         "type": "spot",
@@ -322,6 +341,7 @@ def _translate_spot_lamp(part: parts.SpotLamp) -> Translation:
 
 @translate_part.register
 def _translate_ball_lamp(part: parts.BallLamp) -> Translation:
+    """Return a ball that shines; its pose scales a unit sphere, without a surface."""
     pose = mi.ScalarTransform4f().translate(list(part.center)).scale(part.radius)
     ball = {
         "type": "sphere",
@@ -365,9 +385,11 @@ def _translate_beam(part: parts.BeamLamp) -> Translation:
     """Return a headlamp's beam as a projector.
 
     Mitsuba's projector puts pi times its texture on a plane before it, where an
-    intensity I puts I cos^3.
+    intensity I puts I cos^3: at an angle with that cosine, 1/cos as far away and
+    slanted by it.
     """
     height, width = part.table.shape
+    # Middles of the table's cells, on a plane at distance 1.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
@@ -414,6 +436,7 @@ def _translate_haze(part: parts.HazePart) -> Translation:
 
 
 def _make_rgb(value: Sequence[float]) -> Plugin:
+    """Return the plugin of a color."""
     return {"type": "rgb", "value": list(value)}
 
 
@@ -428,7 +451,13 @@ def make_scene_dict(
 ) -> Plugin:
     """Return Mitsuba's dictionary of a scene's camera, environment and ground.
 
-    Objects come as parts.
+    Objects come as parts. With a backdrop the film has an alpha channel, by which the
+    backdrop is put behind the image.
+
+    Args:
+        description: the scene.
+        resolution: height and width.
+        filter, sampler: Mitsuba's types of reconstruction filter and sampler.
     """
     height, width = resolution
     to_world = camera_to_world(description, width / height)
@@ -466,7 +495,11 @@ def make_scene_dict(
 
 
 def _make_ground(description: SceneDescription) -> Any:
-    """Return the ground: a photographed one, a plain one, or None."""
+    """Return the ground: a photographed one, a plain one, or None.
+
+    A plain one is a two-sided square of `ground.size`; a road or a place has meshes of
+    its own instead.
+    """
     photograph = description.photograph
     if photograph is not None:
         surface = meshes.make_diffuse(photograph.base_color.numpy())
@@ -476,11 +509,18 @@ def _make_ground(description: SceneDescription) -> Any:
     size = description.number("ground.size")
     if not size > 0.0 or is_paved(description):
         return None
+    level = 0.0
+    if description.backdrop_photograph is not None:
+        if not has_plane(description):
+            return None
+        level = description.number("ground.level")
     srgb = np.array(description.ground_color, np.float32)
     reflectance = _make_rgb(srgb_to_linear(srgb).tolist())
     return {
         "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().scale(size / 2.0),
+        "to_world": mi.ScalarTransform4f()
+        .translate([0.0, 0.0, level])
+        .scale(size / 2.0),
         "bsdf": {
             "type": "twosided",
             "bsdf": {"type": "diffuse", "reflectance": reflectance},
@@ -516,7 +556,15 @@ def convert_refusals(description: SceneDescription) -> Iterator[None]:
 
 
 def _make_lens(description: SceneDescription) -> Plugin:
-    """Return the plugin of the camera's lens, without pose and film."""
+    """Return the plugin of the camera's lens, without pose and film.
+
+    A pinhole, a thin lens, or our own sensor for a lens model, with raindrops if there
+    are any.
+
+    Raises:
+        InputError: a plain background with raindrops, or with a lens that leaves parts
+            of the image black.
+    """
     model = description.camera_model
     drops = description.number("camera.drops")
     if model is None:
@@ -525,15 +573,16 @@ def _make_lens(description: SceneDescription) -> Plugin:
             "fov": description.number("camera.fov"),
             "fov_axis": "larger",
         }
-        thin = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
-        return pinhole | thin if description.thin_lens else pinhole
+        thin_lens = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
+        return pinhole | thin_lens if description.thin_lens else pinhole
     if description.backdrop and drops > 0.0:
         raise InputError(
             "background: raindrops have no plain background behind them; "
             "leave one of the two out"
         )
     # a searched lens may fold
-    if description.backdrop and (model.black_fraction > 0.0 or not model.name):
+    has_plain_backdrop = description.backdrop and not description.backdrop_photograph
+    if has_plain_backdrop and (model.black_fraction > 0.0 or not model.name):
         raise InputError(
             "background: it would show where the camera's lens sees nothing as well; "
             "leave the plain background out, "
@@ -575,8 +624,9 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
     height, width = resolution
 
     def to_horizontal_fov(value: Any) -> Any:
-        half_fov = dr.deg2rad(value.array) / 2.0
-        half_tangent = dr.tan(half_fov) * min(1.0, width / height)
+        half_angle = dr.deg2rad(value.array) / 2.0
+        # of the width, which is not the larger side of an upright image
+        half_tangent = dr.tan(half_angle) * min(1.0, width / height)
         return mi.Float(2.0 * dr.rad2deg(dr.atan(half_tangent)))
 
     camera_inputs = [

@@ -20,6 +20,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.scene.assembly import Assembly
+from advsearch.scene.backdrop import compute_plane_radiance
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import (
     ALL_OMISSIONS,
@@ -77,6 +78,8 @@ class MitsubaScene:
         definition: the description, and the filter.
         input_names: every input that can be set.
         parameters: Mitsuba's own.
+        plane_radiance: (3,) of the plane that takes the shadow in a photograph, without
+            the object; None if there is none.
         roulette_depth: segments of a light path after which Russian roulette starts.
         declared_inputs: for each input its key in `parameters`, and its definition.
         interior_inputs: the inputs that the interior adjoint differentiates correctly.
@@ -117,7 +120,7 @@ class MitsubaScene:
             self.definition = (description, filter)
             self.resolution = resolution
             self.sampler = sampler
-            self.assembly = Assembly(description)
+            self.assembly = Assembly(description, resolution)
             self.max_depth = self.depth = max_depth
             self.window: Window | None = None
             self._leave_out = frozenset(leave_out)
@@ -133,12 +136,15 @@ class MitsubaScene:
                 not description.thin_lens and description.camera_model is None
             )
             self._backdrop = description.backdrop
+            self.plane_radiance = compute_plane_radiance(description)
             if description.backdrop and description.has_emission:
+                behind = "the plain background"
+                if description.backdrop_photograph is not None:
+                    behind = "the photograph"
                 raise InputError(
                     "background: Mitsuba hides surfaces that emit light together with "
-                    "the environment; leave the plain "
-                    "background out, or take an object and surroundings without "
-                    "emission"
+                    f"the environment; leave {behind} out, or take an object and "
+                    "surroundings without emission"
                 )
             self._guides: Plugin = {
                 "type": "aov",
@@ -335,8 +341,10 @@ class MitsubaScene:
 
         Returns:
             For each of `seeds` (H, W, 3) float32, of the window if there is one; of a
-            scene with a backdrop (H, W, 4) with the coverage of its surfaces; of
-            "guides" (H, W, 6), the first hit's albedo in [0, 1] and its shading normal.
+            scene with a backdrop (H, W, 4) with the coverage of its surfaces, or with a
+            plane that takes the shadow in a photograph (H, W, 7), where the last three
+            are the change of the plane's radiance; of "guides" (H, W, 6), the first
+            hit's albedo in [0, 1] and its shading normal.
         """
         INTERRUPTS.look()
         with mitsuba_lock, self._crop_film():
@@ -451,7 +459,8 @@ class MitsubaScene:
 
         Args:
             inputs: as in `radiance`.
-            cotangent: (H, W, 3) float32, of the window if there is one.
+            cotangent: (H, W, 3) float32, or of as many channels as the image has; of
+                the window if there is one.
             seed: should differ from the primal's, or the gradient of a noisy image is
                 returned.
             spp: independent samples per pixel.
@@ -476,10 +485,14 @@ class MitsubaScene:
             if "boundary" not in self._leave_out and has_boundary:
                 method = "boundary"
                 extra = extra | self._buffers
-            image_gradient = cotangent.detach().to(torch.float32).contiguous()
-            if self._backdrop:
-                no_coverage = torch.zeros_like(image_gradient[..., :1])
-                image_gradient = torch.cat([image_gradient, no_coverage], dim=-1)
+            image_gradient = cotangent.detach().to(torch.float32)
+            color_gradient = image_gradient[..., :3]
+            if self._backdrop:  # coverage has no derivative
+                n_others = 1 if self.plane_radiance is None else 4
+                others = torch.zeros(*image_gradient.shape[:2], n_others)
+                others[..., 1:] = image_gradient[..., 4:]
+                color_gradient = torch.cat([color_gradient, others], dim=-1)
+            image_gradient = color_gradient.contiguous()
             self._set(inputs)
             names = (*sorted(extra - set(requested)), *requested)
             with self._tracked(names, inputs) as tracked, self._crop_film():
@@ -607,6 +620,7 @@ class MitsubaScene:
                 self.depth,
                 spp,
                 projector,
+                self._find_plane(),
             )
             size = self.parameters[key].shape[:2]
             surface = None
@@ -621,6 +635,13 @@ class MitsubaScene:
             return replace(paths, vertices=vertices)
 
     # ---- implementation
+
+    def _find_plane(self) -> Any:
+        """Return Mitsuba's shape of the plane that takes the shadow, or None."""
+        if self.plane_radiance is None:
+            return None
+        shapes = {shape.id(): shape for shape in self._scene.shapes()}
+        return shapes[parts.GROUND_NAME]
 
     def _set(self, inputs: Mapping[str, Tensor]) -> None:
         """Set exactly these inputs, and everything else to its base value.
@@ -718,9 +739,12 @@ class MitsubaScene:
                 "rr_depth": self.roulette_depth,
                 **self._path,
             }
+            hidden = {**path, "hide_emitters": True}
+            if self.plane_radiance is not None:
+                hidden["type"] = "advsearch_photograph"
             recipes: dict[str, Plugin] = {
                 "path": path,
-                "hidden": {**path, "hide_emitters": True},
+                "hidden": hidden,
                 "guides": self._guides,
                 "boundary": {
                     "type": "prb_projective",

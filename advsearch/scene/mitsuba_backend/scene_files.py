@@ -109,9 +109,10 @@ def read_scene_dict(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[st
 
 
 def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
-    """Check that entries are numbers where they are read here.
+    """Raise InputError unless entries are numbers where they are read here.
 
-    Mitsuba checks all other entries. `where` is the beginning of an error.
+    Mitsuba checks all other entries. Colors count as numbers of their own; other
+    plugins are checked inside. `where` is the beginning of an error.
     """
     for key, value in plugin.items():
         is_color = isinstance(value, Mapping) and value.get("type", "rgb") in (
@@ -149,23 +150,23 @@ class PluginContents:
 def read_contents(path: Path) -> PluginContents:
     """Return what is understood of a scene file; errors as for `read_scene_dict`."""
     named = dict(_list_plugins(read_scene_dict(path)[0]))
-    kinds = {name: str(plugin["type"]) for name, plugin in named.items()}
+    type_by_name = {name: str(plugin["type"]) for name, plugin in named.items()}
     objects = tuple(
         name
-        for name, kind in kinds.items()
+        for name, kind in type_by_name.items()
         if kind in shapes.OBJECT_SHAPES and named[name].get("bsdf") != NULL_BSDF
     )
-    cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
-    known = {*objects, *cameras}
-    replaced = INTEGRATOR_TYPES | SENSOR_TYPES
-    other_kinds = {
+    cameras = tuple(name for name, kind in type_by_name.items() if kind in CAMERAS)
+    known_names = {*objects, *cameras}
+    replaced_types = INTEGRATOR_TYPES | SENSOR_TYPES
+    unchanged = {
         name: kind
-        for name, kind in kinds.items()
-        if name not in known and kind not in replaced
+        for name, kind in type_by_name.items()
+        if name not in known_names and kind not in replaced_types
     }
     lights = tuple(name for name, plugin in named.items() if _emits_light(plugin))
     return PluginContents(
-        objects, other_kinds, lights, tuple(map(_rename_reserved, cameras))
+        objects, unchanged, lights, tuple(map(_rename_reserved, cameras))
     )
 
 
@@ -175,13 +176,14 @@ def _rename_reserved(name: str) -> str:
 
 
 def _emits_light(plugin: Mapping[str, object]) -> bool:
+    """Return whether a plugin, or one in it, is a light."""
     return any(inner.get("type") in LIGHT_TYPES for inner in iterate_plugins(plugin))
 
 
 def import_mitsuba_scene(
     scene: Path | Mapping[str, object], object_id: str
 ) -> ImportedScene:
-    """Read a Mitsuba scene, an XML file or a dictionary as Mitsuba's loader takes it.
+    """Import a Mitsuba scene, an XML file or a dictionary as Mitsuba's loader takes it.
 
     The shape becomes a mesh with its own kind of surface, whose base color, where it
     has one, becomes a texture. Everything else stays as it is, under its own name.
@@ -202,26 +204,34 @@ def import_mitsuba_scene(
     """
     tree, notes = read_scene_dict(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
-    named = dict(_list_plugins(tree))
-    object_id = _find_shape(named, object_id, where)
-    if len(named) > MAX_PLUGINS:
+    plugins = dict(_list_plugins(tree))
+    object_id = _find_shape(plugins, object_id, where)
+    if len(plugins) > MAX_PLUGINS:
         raise InputError(
             f"{where}: expected at most {MAX_PLUGINS} plugins at the top, "
-            f"got {len(named)}; join meshes"
+            f"got {len(plugins)}; join meshes"
         )
-    shape = named[object_id]
-    surface = shapes.read_surface(_find_surface(shape, named))
+    shape = plugins[object_id]
+    surface = shapes.read_surface(_find_surface(shape, plugins))
     mesh, has_uvs = shapes.load_shape_mesh(shape, object_id)
-    frame = _ObjectFrame(mesh, object_id, z_up=_is_z_up(named))
-    haze, haze_names = shapes.find_haze(named, frame.matrix) or (None, frozenset[str]())
-    light = _find_radiance(shape)
-    left_out = _describe_left_out(
-        tree, shape, hazy=haze is not None, lit=light is not None
+    frame = _ObjectFrame(mesh, object_id, z_up=_is_z_up(plugins))
+    haze, haze_names = shapes.find_haze(plugins, frame.matrix) or (
+        None,
+        frozenset[str](),
     )
-    missing = _describe_missing_attributes(surface.plugin, mesh)
-    notes += [f"{where}: {clause}" for clause in (*left_out, *surface.notes, *missing)]
-    turn = frame.turn.astype(np.float32)
-    mesh = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
+    emission = _find_radiance(shape)
+    left_out_clauses = _describe_left_out(
+        tree, shape, hazy=haze is not None, lit=emission is not None
+    )
+    missing_clauses = _describe_missing_attributes(surface.plugin, mesh)
+    notes += [
+        f"{where}: {clause}"
+        for clause in (*left_out_clauses, *surface.notes, *missing_clauses)
+    ]
+    rotation = frame.rotation.astype(np.float32)
+    mesh = replace(
+        mesh, vertices=mesh.vertices @ rotation.T, normals=mesh.normals @ rotation.T
+    )
     mesh, base_color = _paint(mesh, has_uvs, surface, str(shape["type"]), where)
     source = scene if isinstance(scene, Path) else Path("scene.xml")
     asset = ObjectAsset(
@@ -232,33 +242,36 @@ def import_mitsuba_scene(
         warnings=tuple(notes),
         up=FileAxis("z"),
         surface=surface.plugin,
-        emission=light,
+        emission=emission,
         extent=frame.size,
     )
     surroundings: list[ScenePart] = [] if haze is None else [haze]
-    surroundings += _import_surroundings(named, {object_id, *haze_names}, frame)
+    surroundings += _import_surroundings(plugins, {object_id, *haze_names}, frame)
     cameras = {
         _rename_reserved(name): _import_camera(plugin, frame)
-        for name, plugin in named.items()
+        for name, plugin in plugins.items()
         if plugin["type"] in CAMERAS
     }
     return ImportedScene(asset, tuple(surroundings), cameras)
 
 
 def _find_shape(
-    named: Mapping[str, Mapping[str, object]], wanted: str, where: str
+    named: Mapping[str, Mapping[str, object]], object_id: str, where: str
 ) -> str:
-    """Return the id of a shape, or that of the only one with the same letters."""
+    """Return the id of a shape, or that of the only one with the same letters.
+
+    Case and signs do not count. Raises UnknownNameError: there are none, or several.
+    """
 
     def letters_of(name: str) -> str:
         return "".join(filter(str.isalnum, name.casefold()))
 
     ids = [name for name, plugin in named.items() if plugin["type"] in SHAPE_TYPES]
-    if wanted in ids:
-        return wanted
-    similar = [name for name in ids if letters_of(name) == letters_of(wanted)]
+    if object_id in ids:
+        return object_id
+    similar = [name for name in ids if letters_of(name) == letters_of(object_id)]
     if len(similar) != 1:
-        raise UnknownNameError(f"shape of {where}", wanted, ids)
+        raise UnknownNameError(f"shape of {where}", object_id, ids)
     return similar[0]
 
 
@@ -280,17 +293,22 @@ def _import_surroundings(
     used: Collection[str],
     frame: _ObjectFrame,
 ) -> Iterator[ScenePart]:
-    """Import all plugins that stay as they are; those that were `used` do not."""
-    replaced = INTEGRATOR_TYPES | SENSOR_TYPES
+    """Yield all plugins that stay as they are, in the object's coordinates.
+
+    Plugins that were `used`, integrators and sensors are left out.
+    """
+    replaced_types = INTEGRATOR_TYPES | SENSOR_TYPES
     for name, plugin in named.items():
-        if name in used or plugin["type"] in replaced:
+        if name in used or plugin["type"] in replaced_types:
             continue
-        moved = _rename_references(frame.move_plugin(plugin))
+        moved_plugin = _rename_references(frame.move_plugin(plugin))
         has_medium = any(
-            inner.get("type") in MEDIUM_TYPES for inner in iterate_plugins(moved)
+            inner.get("type") in MEDIUM_TYPES for inner in iterate_plugins(moved_plugin)
         )
         part_type = MediumPart if has_medium else PluginPart
-        yield part_type(_rename_reserved(name), moved, _emits_light(moved))
+        yield part_type(
+            _rename_reserved(name), moved_plugin, _emits_light(moved_plugin)
+        )
 
 
 def _paint(
@@ -299,8 +317,8 @@ def _paint(
     """Return a mesh with texture coordinates for its base color, and that base color.
 
     Where anything is looked up by the mesh's own coordinates, or by its attributes,
-    they stay. A shape of one color gets new ones where its own do not tell its points
-    apart, as on a cube.
+    they stay, after the base color's own transform. A shape of one color gets new ones
+    where its own do not tell its points apart, as on a cube.
 
     Args:
         mesh: of the shape.
@@ -311,22 +329,21 @@ def _paint(
     """
     if surface.is_textured or surface.is_bound:
         # the transform is that of coordinates with v downwards
-        flipped = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
-        flipped = flipped @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
-        uvs = (flipped * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
+        file_uvs = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
+        file_uvs = file_uvs @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
+        uvs = (file_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
         return replace(mesh, uvs=uvs), surface.base_color
     keeps_uvs = has_uvs and kind not in ("cube", "sphere", "cylinder", "disk")
-    color = ImportedSurface(color=surface.base_color[0, 0])
+    surface_color = ImportedSurface(color=surface.base_color[0, 0])
     part = ImportedPart(
-        mesh.vertices.astype(np.float64),
-        mesh.faces.astype(np.int64),
-        mesh.normals.astype(np.float64),
-        mesh.uvs.astype(np.float64) if keeps_uvs else None,
-        None,
-        color,
+        vertices=mesh.vertices.astype(np.float64),
+        faces=mesh.faces.astype(np.int64),
+        normals=mesh.normals.astype(np.float64),
+        uvs=mesh.uvs.astype(np.float64) if keeps_uvs else None,
+        surface=surface_color,
     )
     soup, maps = apply_textures(
-        join_parts([part], where, np.eye(3)), [color], Notes(where)
+        join_parts([part], where, np.eye(3)), [surface_color], Notes(where)
     )
     return assemble(soup)[0], maps.color
 
@@ -355,7 +372,8 @@ def _find_surface(
 ) -> Mapping[str, object]:
     """Return the surface of a shape, with its references resolved.
 
-    It is Mitsuba's default if the shape has none.
+    It is the shape's first entry that is neither a light nor a medium, or Mitsuba's
+    default. Raises UnknownNameError: a reference leads nowhere, or round in a circle.
     """
     count = 0
 
@@ -487,34 +505,42 @@ class _ObjectFrame:
     """The object's coordinates: z up, standing on z = 0, with a largest extent of 1.
 
     Attributes:
-        turn: (3, 3) rotation from the scene's coordinates to z up.
+        rotation: (3, 3) rotation from the scene's coordinates to z up.
         size: largest extent in the scene's units.
         matrix: (4, 4) from the scene's coordinates to the object's.
     """
 
     def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
-        turn = np.eye(4) if z_up else Y_TO_Z
-        turned = mesh.vertices.astype(np.float64) @ turn[:3, :3].T
-        lower = turned.min(axis=0)
-        upper = turned.max(axis=0)
-        self.turn = turn[:3, :3]
+        """Measure a mesh, in the scene's coordinates, for the object of a name.
+
+        Without `z_up` the scene's y axis points up. Raises InputError: it has no
+        extent.
+        """
+        to_z_up = np.eye(4) if z_up else Y_TO_Z
+        vertices = mesh.vertices.astype(np.float64) @ to_z_up[:3, :3].T
+        lower = vertices.min(axis=0)
+        upper = vertices.max(axis=0)
+        self.rotation = to_z_up[:3, :3]
         self.size = float((upper - lower).max())
         if not (math.isfinite(self.size) and self.size > 0.0):
             raise InputError(
                 f"object {name}: expected a shape of some size, got one of {self.size}"
             )
-        move = np.eye(4)
-        move[:3, 3] = (
+        translation = np.eye(4)
+        translation[:3, 3] = (
             -(lower[0] + upper[0]) / 2,
             -(lower[1] + upper[1]) / 2,
             -lower[2],
         )
-        self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
+        self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ translation @ to_z_up
 
     def move_plugin(
         self, plugin: Mapping[str, object], *, at_top: bool = True
     ) -> Plugin:
         """Return a plugin of the scene in the object's coordinates.
+
+        Shapes and lamps move, distant lights only turn, and media are denser or thinner
+        by the size of the object. All else stays as it is.
 
         Args:
             plugin: its dictionary.
@@ -544,6 +570,7 @@ class _ObjectFrame:
         )
 
     def _with_pose(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin whose `to_world` leads to the object's coordinates."""
         return {**plugin, "to_world": self.matrix @ shapes.get_pose(plugin)}
 
     def _move_distant_light(self, plugin: Mapping[str, object]) -> Plugin:
@@ -551,11 +578,11 @@ class _ObjectFrame:
         entries = dict(plugin)
         if "direction" in entries:
             direction = np.asarray(entries["direction"], dtype=np.float64)
-            entries["direction"] = (self.turn @ direction).tolist()
+            entries["direction"] = (self.rotation @ direction).tolist()
         elif plugin["type"] != "constant":
-            turn = np.eye(4)
-            turn[:3, :3] = self.turn
-            entries["to_world"] = turn @ shapes.get_pose(plugin)
+            rotation = np.eye(4)
+            rotation[:3, :3] = self.rotation
+            entries["to_world"] = rotation @ shapes.get_pose(plugin)
         return entries
 
     def _move_lamp(self, plugin: Mapping[str, object]) -> Plugin:
@@ -588,7 +615,11 @@ def _scale_power(value: object, factor: float, kind: str) -> object:
 
 
 def _scale_spectrum(value: Mapping[str, object], factor: float) -> Plugin | None:
-    """Multiply a spectrum's or a bitmap's values; None if it is of another kind."""
+    """Multiply a spectrum's or a bitmap's values; None if it is of another kind.
+
+    The value may be one number, three, or pairs of wavelength and amount; lights of a
+    fixed spectrum have a scale of their own.
+    """
     kind = value["type"]
     inner = value.get("value")
     bitmap = value.get("bitmap")
@@ -610,8 +641,14 @@ def _scale_spectrum(value: Mapping[str, object], factor: float) -> Plugin | None
 
 
 def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCamera:
-    """Return a sensor's pose and field of view along the larger side."""
+    """Return a sensor's pose and field of view along the larger side.
+
+    The field of view is along the axis that the sensor states, or the diagonal of a
+    focal length; its tangent is proportional to the film's length along it. Mitsuba's
+    default film is 768 x 576.
+    """
     matrix = frame.matrix @ shapes.get_pose(sensor)
+    # without the scale of the object's frame
     matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
     entries = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
     film = next((plugin for plugin in entries if "film" in str(plugin["type"])), {})
@@ -623,24 +660,24 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCa
             f"{width:g} x {height:g}"
         )
     axis = str(sensor.get("fov_axis", "x"))
-    degrees = float(np.asarray(sensor.get("fov", 0.0)))
-    if not degrees:
+    fov = float(np.asarray(sensor.get("fov", 0.0)))
+    if not fov:
         axis = "diagonal"
-        degrees = _fov_of_focal_length(str(sensor.get("focal_length", "50mm")))
-    larger = max(width, height)
-    lengths = {
+        fov = _compute_diagonal_fov(str(sensor.get("focal_length", "50mm")))
+    larger_side = max(width, height)
+    length_of_axis = {
         "x": width,
         "y": height,
         "diagonal": math.hypot(width, height),
-        "larger": larger,
+        "larger": larger_side,
         "smaller": min(width, height),
     }
-    length = lengths.get(axis, width)
-    half_tangent = math.tan(math.radians(degrees) / 2.0) * larger / length
+    axis_length = length_of_axis.get(axis, width)
+    half_tangent = math.tan(math.radians(fov) / 2.0) * larger_side / axis_length
     return PosedCamera(matrix, 2.0 * math.degrees(math.atan(half_tangent)))
 
 
-def _fov_of_focal_length(text: str) -> float:
+def _compute_diagonal_fov(text: str) -> float:
     """Return the diagonal field of view in degrees of a focal length such as "50mm"."""
     length = 0.0
     with contextlib.suppress(ValueError):

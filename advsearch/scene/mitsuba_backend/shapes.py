@@ -93,6 +93,9 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     Of a mesh with `face_normals`, or without texture coordinates, every face has
     vertices of its own.
 
+    Normals are unit vectors, reversed by `flip_normals`, and faces are wound so that
+    their fronts are where the normals point.
+
     Args:
         shape: the shape's dictionary.
         name: of the object, for errors.
@@ -130,12 +133,13 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
             np.tile(DEFAULT_FACE_UVS, (len(faces), 1)) if uvs is None else uvs[corners]
         )
 
-    used, index = np.unique(faces, return_inverse=True)
-    faces = index.reshape(-1, 3)
-    vertices = vertices[used]
-    uvs = uvs[used] * (1.0, -1.0) + (0.0, 1.0)
-    sign = -1.0 if shape.get("flip_normals") else 1.0
-    normals = np.nan_to_num(normals)[used] * sign
+    used_vertices, vertex_index = np.unique(faces, return_inverse=True)
+    faces = vertex_index.reshape(-1, 3)
+    vertices = vertices[used_vertices]
+    # v points up in our meshes, and down in Mitsuba's
+    uvs = uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
+    normal_sign = -1.0 if shape.get("flip_normals") else 1.0
+    normals = np.nan_to_num(normals)[used_vertices] * normal_sign
     if (
         np.einsum("fk,fck->", compute_area_vectors(vertices[faces]), normals[faces])
         < 0.0
@@ -147,7 +151,7 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
         np.ascontiguousarray(faces, np.uint32),
         normals.astype(np.float32),
         uvs.astype(np.float32),
-        _select_vertices(attributes, used),
+        _select_vertices(attributes, used_vertices),
     )
     return mesh, has_uvs
 
@@ -163,7 +167,14 @@ def _select_vertices(
 
 
 def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
-    """Load a mesh with Mitsuba; `name` is that of the object, for errors."""
+    """Load a mesh with Mitsuba; `name` is that of the object, for errors.
+
+    Only entries of the geometry are loaded, without surface and light. Normals and
+    texture coordinates are None if the mesh has none.
+
+    Raises:
+        InputError: Mitsuba refuses the mesh, or it has no faces.
+    """
     entries = {key: value for key, value in shape.items() if key in MESH_ENTRIES}
     try:
         with suppress_warnings():
@@ -197,6 +208,7 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
 
 
 def _normalize(vectors: Float64Array) -> Float64Array:
+    """Return vectors (n, 3) scaled to unit length; one of length 0 stays."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.maximum(lengths, 1e-30))
 
@@ -204,28 +216,37 @@ def _normalize(vectors: Float64Array) -> Float64Array:
 def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     """Make the triangles of one of `TESSELLATED_SHAPES`, with Mitsuba's texture
     coordinates.
+
+    The shape is made as Mitsuba's unit shape first, then posed by its own numbers and
+    its `to_world`. Faces without area are left out; round shapes have `ROUND_SEGMENTS`
+    around.
+
+    Raises:
+        InputError: its pose has no volume.
     """
-    local = np.eye(4)
-    turn = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
+    shape_pose = np.eye(4)
+    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
     normals = None
     if kind == "sphere":
-        uvs, faces = _make_grid(turn, turn[::2])
+        uvs, faces = _make_grid(fractions, fractions[::2])
         polar = np.pi * uvs[:, 1]
         vertices = np.stack(
-            [*(np.sin(polar) * _circle_points(uvs[:, 0])), np.cos(polar)], axis=1
+            [*(np.sin(polar) * _compute_circle_points(uvs[:, 0])), np.cos(polar)],
+            axis=1,
         )
         normals = vertices
-        local[:3, :3] *= _get_radius(shape)
-        local[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
+        shape_pose[:3, :3] *= _get_radius(shape)
+        shape_pose[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
-        uvs, faces = _make_grid(turn, np.array([0.0, 1.0]))
-        vertices = np.stack([*_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
+        uvs, faces = _make_grid(fractions, np.array([0.0, 1.0]))
+        vertices = np.stack([*_compute_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
-        local = _compute_cylinder_pose(shape)
+        shape_pose = _compute_cylinder_pose(shape)
     elif kind == "disk":
-        uvs, faces = _make_grid(turn[::8], turn)
+        uvs, faces = _make_grid(fractions[::8], fractions)
         vertices = np.stack(
-            [*(uvs[:, 0] * _circle_points(uvs[:, 1])), np.zeros(len(uvs))], axis=1
+            [*(uvs[:, 0] * _compute_circle_points(uvs[:, 1])), np.zeros(len(uvs))],
+            axis=1,
         )
     else:
         uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
@@ -234,22 +255,27 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1))
     # without faces that have no area, such as those at a pole
     faces = faces[np.linalg.norm(compute_area_vectors(vertices[faces]), axis=1) > 1e-9]
-    matrix = get_pose(shape) @ local
+    matrix = get_pose(shape) @ shape_pose
     if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise InputError(
             f"object {name}: expected a {kind} of some size, got one "
             "without extent; change its numbers"
         )
+    # normals are transformed by the inverse transpose
     normals = _normalize(normals @ np.linalg.inv(matrix[:3, :3]))
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
 
 
 def _get_radius(shape: Mapping[str, object]) -> float:
+    """Return the radius that a shape states; Mitsuba's default is 1."""
     return float(np.asarray(shape.get("radius", 1.0), np.float64))
 
 
 def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
-    """Return the (4, 4) pose of the unit cylinder along z that is a given cylinder."""
+    """Return the (4, 4) pose of the unit cylinder along z that is a given cylinder.
+
+    It has `radius`, and goes from `p0` to `p1`.
+    """
     start = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), np.float64)
     end = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), np.float64)
     radius = _get_radius(shape)
@@ -259,28 +285,34 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     sign = np.copysign(1.0, z)
     # axes as in Mitsuba's `coordinate_system` (Duff et al. 2017), which has float32
     # alone
-    a = -1.0 / (sign + z)
-    first = np.array([1.0 + sign * x * x * a, sign * x * y * a, -sign * x])
-    second = np.array([x * y * a, sign + y * y * a, -y])
+    factor = -1.0 / (sign + z)
+    x_axis = np.array([1.0 + sign * x * x * factor, sign * x * y * factor, -sign * x])
+    y_axis = np.array([x * y * factor, sign + y * y * factor, -y])
     pose = np.eye(4)
-    pose[:3] = np.stack([first * radius, second * radius, axis * length, start], axis=1)
+    pose[:3] = np.stack(
+        [x_axis * radius, y_axis * radius, axis * length, start], axis=1
+    )
     return pose
 
 
 def _make_grid(u: Float64Array, v: Float64Array) -> tuple[Float64Array, IntArray]:
-    """Return the points (n, 2) of a grid and its triangles (m, 3)."""
+    """Return the points (n, 2) of a grid and its triangles (m, 3).
+
+    Points are row by row: `u` runs along rows, and `v` is that of each row. A cell is
+    two triangles.
+    """
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     row_starts = np.arange(len(v) - 1)[:, None] * len(u)
-    first = (row_starts + np.arange(len(u) - 1)).reshape(-1)
-    above = first + len(u)
-    lower = np.stack([first, first + 1, above + 1], axis=1)
-    upper = np.stack([first, above + 1, above], axis=1)
+    corner = (row_starts + np.arange(len(u) - 1)).reshape(-1)
+    corner_above = corner + len(u)
+    lower = np.stack([corner, corner + 1, corner_above + 1], axis=1)
+    upper = np.stack([corner, corner_above + 1, corner_above], axis=1)
     return points, np.concatenate([lower, upper])
 
 
-def _circle_points(turn: Float64Array) -> Float64Array:
+def _compute_circle_points(turns: Float64Array) -> Float64Array:
     """Return x and y on the unit circle, for fractions of a turn."""
-    return np.asarray([np.cos(2.0 * np.pi * turn), np.sin(2.0 * np.pi * turn)])
+    return np.asarray([np.cos(2.0 * np.pi * turns), np.sin(2.0 * np.pi * turns)])
 
 
 def get_pose(plugin: Mapping[str, object]) -> Float64Array:
@@ -312,7 +344,9 @@ def find_haze(
             all directions.
 
     Returns:
-        The haze and the names of the plugins that it is made of; None if there is none.
+        The haze and the names of the plugins that it is made of; None if there is none,
+        or if it cannot be rendered as one: not grey, out of range, or a ball that is
+        not about the object.
     """
     names = _find_haze_plugins(named)
     if names is None:
@@ -324,6 +358,7 @@ def find_haze(
         np.broadcast_to(_parse_numbers(ball.get("center", np.zeros(3))), (3,)), 1.0
     )
     scene_radius = float(_parse_numbers(ball.get("radius", 1.0))[0])
+    # the cube root of the determinant is the scale of lengths
     radius = scene_radius * float(np.cbrt(abs(np.linalg.det(pose[:3, :3]))))
     if not (
         radius > 0.0 and float(np.linalg.norm(center[:3])) <= MAX_CENTER_OFFSET * radius
@@ -342,7 +377,8 @@ def _read_haze_medium(
 ) -> tuple[float, tuple[float, float, float]] | None:
     """Return extinction, in the object's lengths, and albedo of a medium.
 
-    None if it is not grey, or out of range; `matrix` is as in `find_haze`.
+    None if it is not grey, or out of range (comparisons with NaN are false); `matrix`
+    is as in `find_haze`.
     """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
@@ -364,31 +400,31 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     """
     camera_media = {_get_reference(plugin.get("medium")) for plugin in named.values()}
     camera_media.discard(None)
-    balls = [
+    ball_names = [
         name
         for name, plugin in named.items()
         if plugin["type"] == "sphere"
         and _get_reference(plugin.get("interior")) in camera_media
     ]
-    media = [
+    medium_names = [
         name
         for name, plugin in named.items()
         if plugin["type"] in ("homogeneous", "heterogeneous")
     ]
-    if len(camera_media) != 1 or len(balls) != 1 or len(media) != 1:
+    if len(camera_media) != 1 or len(ball_names) != 1 or len(medium_names) != 1:
         return None
-    ball = named[balls[0]]
-    medium = named[media[0]]
-    isotropic = {"type": "isotropic"}
+    ball = named[ball_names[0]]
+    medium = named[medium_names[0]]
+    isotropic_phase = {"type": "isotropic"}
     is_haze = (
         set(ball) <= _OF_BALL
         and set(medium) <= _OF_MEDIUM
         and medium["type"] == "homogeneous"
         and ball.get("bsdf") == {"type": "null"}
-        and medium.get("phase", isotropic) == isotropic
-        and camera_media == {media[0]}
+        and medium.get("phase", isotropic_phase) == isotropic_phase
+        and camera_media == {medium_names[0]}
     )
-    return (balls[0], media[0]) if is_haze else None
+    return (ball_names[0], medium_names[0]) if is_haze else None
 
 
 def _get_reference(plugin: object) -> str | None:
@@ -404,7 +440,7 @@ def _parse_numbers(value: object) -> Float64Array:
         is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
         value = value.get("value") if is_constant else None
     if isinstance(value, (str, bool)):
-        value = None
+        value = None  # which becomes NaN
     try:
         numbers = np.atleast_1d(np.asarray(value, np.float64))
     except (TypeError, ValueError):  # such as pairs of wavelength and value
@@ -474,7 +510,8 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
     """Take the first base color out of a surface: a color, a bitmap or a checkerboard.
 
     Whatever else is looked up by texture coordinates stays as it is: where the base
-    color has a transform of its own, the others get the inverse before theirs.
+    color has a transform of its own, the others get the inverse before theirs. A base
+    color is cut to [0, 1], and a surface without one is grey: notes say so.
     """
     surface, color = _take_base_color(bsdf)
     if color is None:
@@ -483,6 +520,7 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
         )
         color = _Color(grey, {})
     linear = color.linear
+    # A texture of one color counts as constant only if it has the size of one.
     is_constant = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE) and not bool(
         np.ptp(linear, axis=(0, 1)).any()
     )
@@ -503,8 +541,9 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
 
 
 def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]:
-    """Return a surface with `BASE_COLOR` in the place of its first base color, and
-    it.
+    """Return a surface with `BASE_COLOR` in the place of its first base color, and it.
+
+    The first is that of the outermost plugin which has one; None if there is none.
     """
     base: _Color | None = None
 
@@ -521,7 +560,10 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
 
 
 def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
-    """Return clauses about what of a surface is not as in the scene."""
+    """Return clauses about what of a surface is not as in the scene.
+
+    `linear` are the linear values of its base color, of any shape.
+    """
     notes = []
     types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:
@@ -557,6 +599,7 @@ def _apply_uv_transform(
         plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
         for plugin in iterate_plugins(surface)
     )
+    # u grows along the same direction as before
     keeps_tangents = to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0
     is_invertible = abs(np.linalg.det(to_uv)) > 1e-12
     if not is_invertible or (uses_tangents and not keeps_tangents):
@@ -572,7 +615,8 @@ def _with_transform(
 ) -> Plugin:
     """Return a plugin whose textures of some kinds have one more transform (3, 3).
 
-    Texture coordinates go through it before the texture's own.
+    Texture coordinates go through it before the texture's own. Inner plugins are
+    changed too, at any depth.
     """
     changed = map_inner_plugins(
         plugin, lambda inner: _with_transform(inner, before, *kinds)
@@ -589,29 +633,34 @@ def _with_transform(
 def to_uv_matrix(value: object) -> Float64Array:
     """Return a transform of texture coordinates (3, 3).
 
-    Of one with (4, 4) it is what Mitsuba takes.
+    Of one with (4, 4) it is what Mitsuba takes: the rows and columns of x, y and 1.
     """
     matrix = np.asarray(value, dtype=np.float64)
     return matrix if matrix.shape == (3, 3) else matrix[np.ix_((0, 1, 3), (0, 1, 3))]
 
 
 def _parse_base_color(value: object) -> _Color | None:
-    """Return a color, a checkerboard or a bitmap as a base color; None of all else."""
-    same_everywhere = parse_constant_color(value)
-    if same_everywhere is not None:
+    """Return a color, a checkerboard or a bitmap as a base color; None of all else.
+
+    A checkerboard is a texture of 2 x 2 texels, of which none is interpolated.
+    """
+    constant = parse_constant_color(value)
+    if constant is not None:
         size = (CONSTANT_SIZE, CONSTANT_SIZE, 3)
-        return _Color(np.broadcast_to(same_everywhere, size), {})
+        return _Color(np.broadcast_to(constant, size), {})
     if not isinstance(value, Mapping):
         return None
     if value["type"] == "checkerboard":
-        dark = parse_constant_color(value.get("color0", 0.4))
-        light = parse_constant_color(value.get("color1", 0.2))
+        first_color = parse_constant_color(value.get("color0", 0.4))
+        second_color = parse_constant_color(value.get("color1", 0.2))
         unknown = set(value) - {"type", "id", "color0", "color1", "to_uv"}
-        if dark is None or light is None or unknown:
+        if first_color is None or second_color is None or unknown:
             return None
-        board = np.array([[dark, light], [light, dark]], np.float32)
+        checkerboard = np.array(
+            [[first_color, second_color], [second_color, first_color]], np.float32
+        )
         return _Color(
-            _repeat_texels(board), {"filter_type": "nearest"}, value.get("to_uv")
+            _repeat_texels(checkerboard), {"filter_type": "nearest"}, value.get("to_uv")
         )
     pixels = _read_pixels(value) if value["type"] == "bitmap" else None
     if pixels is None:
@@ -626,13 +675,17 @@ def _repeat_texels(texture: Float32Array) -> Float32Array:
     """Repeat texels so that none is blurred where a control keeps the texture's
     size.
     """
-    down, across = (-(-MIN_NEAREST_SIZE // size) for size in texture.shape[:2])
-    return texture.repeat(down, axis=0).repeat(across, axis=1)
+    row_repeats, column_repeats = (
+        -(-MIN_NEAREST_SIZE // size) for size in texture.shape[:2]
+    )
+    return texture.repeat(row_repeats, axis=0).repeat(column_repeats, axis=1)
 
 
 def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
-    """Return the linear values (H, W, 3) of a bitmap; None if it cannot be read
-    here.
+    """Return the linear values (H, W, 3) of a bitmap; None if it cannot be read here.
+
+    An array holds linear values already; of one with two channels, grey and alpha, the
+    first is read. A file or one of Mitsuba's bitmaps is converted, unless it is raw.
     """
     image = value.get("bitmap")
     if isinstance(image, np.ndarray):

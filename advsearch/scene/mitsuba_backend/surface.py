@@ -27,7 +27,7 @@ from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, mitsuba_
 # object.
 MIN_BLENDED_SPREAD = 0.15
 MAX_BLENDED_SPREAD = 0.4
-CAMERA_SIZE = 16  # numbers of a camera in the kernel, see `_camera_numbers`
+CAMERA_SIZE = 16  # numbers of a camera in the kernel, see `_make_camera_numbers`
 RAY_PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
 """Positions of the rays of a pixel in it.
 
@@ -98,7 +98,10 @@ class ViewSamples:
 
 
 def _select_ray_offset(ray_index: Any) -> tuple[Any, Any]:
-    """Return where in its pixel each ray goes, in pixels to the right and down."""
+    """Return where in its pixel each ray goes, in pixels to the right and down.
+
+    `ray_index` counts the rays of a pixel, see `RAY_PATTERN`.
+    """
     x_offset = mi.Float(RAY_PATTERN[0][0])
     y_offset = mi.Float(RAY_PATTERN[0][1])
     for index, offset in enumerate(RAY_PATTERN[1:], 1):
@@ -114,12 +117,12 @@ class ViewTracer:
         scene: the scene; the inputs of the arrangement have to be set at a call.
         grids, lobes: those of all surfaces, the searched texture's first.
         widths: root mean square angles, radians, of the blurred maps, each twice the
-            one before. The maps are blurred as seen from `middle`.
-        photographed: height from which a photographed ground was taken; None of any
-            other ground.
+            one before. The maps are blurred as seen from `center`.
+        photograph_height: height from which a photographed ground was taken; None of
+            any other ground.
         model: lens model of all cameras; None of pinholes, which have a field of view
             each.
-        middle: (3,) center of the object.
+        center: (3,) center of the object.
     """
 
     def __init__(
@@ -132,21 +135,26 @@ class ViewTracer:
         model: CameraModel | None,
         center: Float32Array,
     ) -> None:
+        """Prepare the tables of all surfaces and of the lens for the kernel."""
         self._scene = scene
         self._grids = tuple(grids)
         self._widths = tuple(widths)
-        self._photographed = photograph_height
-        self._middle = center.tolist()
+        self._photograph_height = photograph_height
+        self._center = center.tolist()
         tables = [
             np.concatenate([getattr(surface, name) for name in texel_rays.LOBE_TABLES])
             for surface in lobes
         ]
-        self._tables = np.concatenate(tables).astype(np.float32)
+        self._lobe_tables = np.concatenate(tables).astype(np.float32)
         self._lens = None if model is None else self._make_lens_table(model)
-        self._recorded = Recordings()
+        self._recordings = Recordings()
 
     def _make_lens_table(self, model: CameraModel) -> Float32Array:
-        """Return the lens's rays through each pixel, flat, four numbers each."""
+        """Return the lens's rays through each pixel, flat, four numbers each.
+
+        They are the direction in the camera's axes, and whether the lens has a ray
+        there (above 0). Rays are in the order of lanes: row, column, ray of the pixel.
+        """
         height, width = self._scene.resolution
         row, column, ray_index = np.meshgrid(
             np.arange(height),
@@ -179,7 +187,7 @@ class ViewTracer:
             height, width = self._scene.resolution
             count = len(cameras)
             camera_rows = np.stack(
-                [_camera_numbers(inputs, height, width) for inputs in cameras]
+                [_make_camera_numbers(inputs, height, width) for inputs in cameras]
             ).astype(np.float32)
 
             def trace(
@@ -197,12 +205,13 @@ class ViewTracer:
                     mitsuba_scene, lane, tables, cameras, lens, recorded_lit
                 )
 
-            recording = self._recorded.get_or_record(
+            recording = self._recordings.get_or_record(
                 (count, lit.sky_shape, lit.blurred_shape), trace, []
             )
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
             arrays = [
-                mi.Float(values) for values in (self._tables, camera_rows.ravel(), lens)
+                mi.Float(values)
+                for values in (self._lobe_tables, camera_rows.ravel(), lens)
             ]
             lane = dr.arange(mi.UInt32, count * height * width * RAYS_PER_PIXEL)
             # A recording takes its size from its arguments; without the lanes it would
@@ -224,55 +233,72 @@ class ViewTracer:
     ) -> list[Any]:
         """Trace all rays: the recorded kernel.
 
+        Rays go through cut-outs layer by layer. Each layer stops a fraction of what
+        light is left of a ray, and the last one all of it.
+
+        Args:
+            mitsuba_scene: the scene.
+            lane: number of the ray: camera, row, column, ray of the pixel.
+            tables: tables of `Lobes` of all surfaces, flat.
+            cameras: `CAMERA_SIZE` numbers for each camera, flat.
+            lens: as from `_make_lens_table`.
+            lit: the light.
+
         Returns:
             For each pixel the three channels of radiance without the searched texture,
             and coverage; then for each layer of cut-outs and each ray u, v and weight
             of the searched texture, negative on its back.
         """
         ray, active = self._make_rays(lane, cameras, lens)
-        d = ray.d
+        direction = ray.d
         to_local = texel_rays.world_to_map(self._scene)
         ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
-        # Through cut-outs, layer by layer; what light passes one is left for those
-        # behind it.
         n_layers = texel_rays.count_cut_out_layers(self._scene)
-        texture = []
+        texture_channels = []
         radiance = mi.Color3f(0.0)
-        covered = mi.Float(0.0)
-        left = mi.Float(1.0)
+        coverage = mi.Float(0.0)
+        transmittance = mi.Float(1.0)
         for layer in range(n_layers + 1):
             si = mitsuba_scene.ray_intersect(ray, ray_flags, layer == 0, active)
-            valid = active & si.is_valid()
+            is_hit = active & si.is_valid()
             if layer < n_layers:
-                stopped = left * (1.0 - texel_rays.eval_transmittance(si, valid))
+                stopped_fraction = transmittance * (
+                    1.0 - texel_rays.eval_transmittance(si, is_hit)
+                )
             else:
-                stopped = left
+                stopped_fraction = transmittance
             surface_radiance, diffuse, side = self._shade(
-                mitsuba_scene, si, valid, d, tables, lit
+                mitsuba_scene, si, is_hit, direction, tables, lit
             )
-            radiance += dr.select(valid, stopped * surface_radiance, 0.0)
+            radiance += dr.select(is_hit, stopped_fraction * surface_radiance, 0.0)
             escapes = active & ~si.is_valid()
-            radiance += dr.select(escapes, left * _look_up_sky(lit, d, to_local), 0.0)
-            covered += dr.select(valid, stopped / RAYS_PER_PIXEL, 0.0)
-            texture += [
+            radiance += dr.select(
+                escapes, transmittance * _look_up_sky(lit, direction, to_local), 0.0
+            )
+            coverage += dr.select(is_hit, stopped_fraction / RAYS_PER_PIXEL, 0.0)
+            texture_channels += [
                 si.uv.x,
                 si.uv.y,
-                side * stopped * diffuse / (math.pi * RAYS_PER_PIXEL),
+                side * stopped_fraction * diffuse / (math.pi * RAYS_PER_PIXEL),
             ]
-            left = left - stopped
-            active = valid & (left > MIN_TRANSMITTANCE)
-            ray = si.spawn_ray(d)
+            transmittance = transmittance - stopped_fraction
+            active = is_hit & (transmittance > MIN_TRANSMITTANCE)
+            ray = si.spawn_ray(direction)
         radiance /= RAYS_PER_PIXEL
-        # a sum in a kernel of its own for each channel would trace all rays again
-        dr.eval(radiance, covered, texture)
+        # All at once: a kernel for each channel's sum would trace all rays again.
+        dr.eval(radiance, coverage, texture_channels)
         pixel_sums = [
-            dr.block_sum(channel, RAYS_PER_PIXEL) for channel in (*radiance, covered)
+            dr.block_sum(channel, RAYS_PER_PIXEL) for channel in (*radiance, coverage)
         ]
-        return [*pixel_sums, *texture]
+        return [*pixel_sums, *texture_channels]
 
     def _make_rays(self, lane: Any, cameras: Any, lens: Any) -> tuple[Any, Any]:
-        """Return the ray of each lane, and whether the lens has one there."""
+        """Return the ray of each lane, and whether the lens has one there.
+
+        `cameras` and `lens` are as for `_trace`. See `_make_camera_numbers` for a camera's
+        numbers.
+        """
         height, width = self._scene.resolution
         pixel = lane // RAYS_PER_PIXEL
         ray_index = lane % RAYS_PER_PIXEL
@@ -314,6 +340,12 @@ class ViewTracer:
     ) -> tuple[Any, Any, Any]:
         """Shade what a ray in direction d hit.
 
+        Args:
+            mitsuba_scene, tables, lit: as for `_trace`.
+            si: the hit.
+            valid: whether there is one.
+            d: unit direction of the ray.
+
         Returns:
             Its radiance, without what the searched texture reflects diffusely; its
             diffuse fraction; and 1 on the front of the searched texture, -1 on its
@@ -324,7 +356,7 @@ class ViewTracer:
             mask & valid
             for mask in texel_rays.find_hit_grids(mitsuba_scene, self._grids, si, d)
         ]
-        # towards the viewer
+        # shading normal, turned towards the viewer
         n = dr.select(dr.dot(si.sh_frame.n, d) > 0.0, -si.sh_frame.n, si.sh_frame.n)
         cosine = -dr.dot(n, d)
         diffuse, *lobe = self._look_up_lobes(masks, cosine, tables)
@@ -334,7 +366,7 @@ class ViewTracer:
         diffuse_radiance = self._look_up_diffuse(si, masks, lit, to_local)
         side = mi.Float(0.0)
         for grid, mask in zip(self._grids, masks, strict=True):
-            if grid.warp is None:
+            if grid.warp is None:  # the searched texture's, not the ground's
                 side = dr.select(mask, -1.0 if grid.side < 0 else 1.0, side)
         radiance = dr.select(
             side != 0.0, 0.0, diffuse_radiance * dr.select(valid, diffuse, 1.0)
@@ -350,13 +382,14 @@ class ViewTracer:
     ) -> list[Any]:
         """Look up the tables of `Lobes` for a cosine of the angle of view.
 
-        The value lies between the two entries next to the angle.
+        A value lies between the two entries next to the cosine. `masks` tell which
+        surface was hit; where none was, the values are those of the first.
         """
         n_tables = len(texel_rays.LOBE_TABLES)
-        table = mi.UInt32(0)
+        table_start = mi.UInt32(0)
         for index, mask in enumerate(masks):
             first_entry = mi.UInt32(index * n_tables * texel_rays.N_ANGLES)
-            table = dr.select(mask, first_entry, table)
+            table_start = dr.select(mask, first_entry, table_start)
         position = dr.clip(
             cosine * texel_rays.N_ANGLES - 0.5, 0.0, texel_rays.N_ANGLES - 1.0
         )
@@ -364,10 +397,10 @@ class ViewTracer:
         fraction = position - mi.Float(lower)
         values = []
         for index in range(n_tables):
-            entry = table + index * texel_rays.N_ANGLES + lower
-            first = dr.gather(mi.Float, tables, entry)
-            second = dr.gather(mi.Float, tables, entry + 1)
-            values.append(first + fraction * (second - first))
+            entry = table_start + index * texel_rays.N_ANGLES + lower
+            lower_value = dr.gather(mi.Float, tables, entry)
+            upper_value = dr.gather(mi.Float, tables, entry + 1)
+            values.append(lower_value + fraction * (upper_value - lower_value))
         return values
 
     def _reflect(
@@ -383,56 +416,78 @@ class ViewTracer:
     ) -> Any:
         """Return the radiance in the gloss of what a ray in direction d hit.
 
-        A ray in the mean direction of the lobe finds what is there, and the blurred map
-        how bright it is. The lobe is gloss, up, along, core and tail of `Lobes`.
+        A ray in the mean direction of the lobe finds what is reflected. That is a
+        texel of the object; the environment, blurred by the width of the lobe; or the
+        ground, which gives way to the blurred environment the wider the lobe is.
+
+        Args:
+            mitsuba_scene, lit: as for `_trace`.
+            si: the hit.
+            d: unit direction of the ray.
+            n: unit shading normal, towards the viewer.
+            cosine: of the angle of view.
+            lobe: gloss, up, along, core and tail of `Lobes`.
+            active: whether there is any gloss.
         """
         _, up, along, core, tail = lobe
         to_local = texel_rays.world_to_map(self._scene)
         n_layers = texel_rays.count_cut_out_layers(self._scene)
+        # 1e-8: a ray straight down has no direction along the surface
         tangent = dr.normalize(d + n * cosine + 1e-8)
-        wo = dr.normalize(n * up + tangent * along)
-        si_wo = texel_rays.find_opaque_hits(
+        reflected_direction = dr.normalize(n * up + tangent * along)
+        reflected_hit = texel_rays.find_opaque_hits(
             mitsuba_scene,
-            mi.Ray3f(si.p + n * texel_rays.RAY_OFFSET, wo),
+            mi.Ray3f(si.p + n * texel_rays.RAY_OFFSET, reflected_direction),
             n_layers,
             active=active,
         )
-        masks_wo = texel_rays.find_hit_grids(mitsuba_scene, self._grids, si_wo, wo)
-        map_direction = self._correct_parallax(si, wo)
+        reflected_masks = texel_rays.find_hit_grids(
+            mitsuba_scene, self._grids, reflected_hit, reflected_direction
+        )
+        map_direction = self._correct_parallax(si, reflected_direction)
         blurred = 0.5 * sum(
             _look_up_blurred(lit, map_direction, to_local, spread, self._widths)
             for spread in (core, tail)
         )
-        texel = self._look_up_texel(si_wo, masks_wo, lit)
+        texel = self._look_up_texel(reflected_hit, reflected_masks, lit)
 
         # On the ground one ray meets a single place: the wider the lobe, the more
         # counts what surrounds the object, which is darker where the ground is darker
         # there than far off.
         far_ground = mi.UInt32(self._grids[-1].first_cell + self._grids[-1].n_cells)
-        shade = texel / _gather_color(lit.texels, far_ground)
-        on_ground = mi.Bool(False)
-        for grid, mask in zip(self._grids, masks_wo, strict=True):
-            on_ground |= mask & (grid.warp is not None)
+        darkening = texel / _gather_color(lit.texels, far_ground)
+        is_ground = mi.Bool(False)
+        for grid, mask in zip(self._grids, reflected_masks, strict=True):
+            is_ground |= mask & (grid.warp is not None)
         spread = dr.sqrt(0.5 * (core * core + tail * tail))
         wideness = dr.clip(
             (spread - MIN_BLENDED_SPREAD) / (MAX_BLENDED_SPREAD - MIN_BLENDED_SPREAD),
             0.0,
             1.0,
         )
-        single_ray = self._look_up_diffuse(si_wo, masks_wo, lit, to_local)
-        ground = single_ray + wideness * (blurred * shade - single_ray)
-        return dr.select(si_wo.is_valid(), dr.select(on_ground, ground, texel), blurred)
+        ground_radiance = self._look_up_diffuse(
+            reflected_hit, reflected_masks, lit, to_local
+        )
+        blended_ground = ground_radiance + wideness * (
+            blurred * darkening - ground_radiance
+        )
+        return dr.select(
+            reflected_hit.is_valid(),
+            dr.select(is_ground, blended_ground, texel),
+            blurred,
+        )
 
     def _correct_parallax(self, si: Any, direction: Any) -> Any:
         """Return the direction in which the blurred maps have what is seen from a hit.
 
         The maps are those seen from the object's center: what matters is the direction
-        in which the center sees the same point of the ground.
+        in which the center sees the same point of the ground, z = 0. A direction that
+        is level or goes up, or a scene without ground, needs no correction.
         """
         if all(grid.warp is None for grid in self._grids):
             return direction
         distance = si.p.z / dr.maximum(-direction.z, 1e-3)
-        from_center = si.p + direction * distance - mi.Point3f(*self._middle)
+        from_center = si.p + direction * distance - mi.Point3f(*self._center)
         return dr.select(direction.z < -1e-3, dr.normalize(from_center), direction)
 
     def _look_up_diffuse(
@@ -443,8 +498,8 @@ class ViewTracer:
         That of a photographed ground is a fraction of its photograph.
         """
         radiance = self._look_up_texel(si, masks, lit)
-        if self._photographed is not None:
-            below = dr.normalize(si.p - mi.Point3f(0.0, 0.0, self._photographed))
+        if self._photograph_height is not None:
+            below = dr.normalize(si.p - mi.Point3f(0.0, 0.0, self._photograph_height))
             for grid, mask in zip(self._grids, masks, strict=True):
                 if grid.warp is not None:
                     photograph = _look_up_sky(lit, below, to_local)
@@ -452,8 +507,11 @@ class ViewTracer:
         return radiance
 
     def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: LightMaps) -> Any:
-        """Return what the texels around a hit have, bilinear; 0 on no grid."""
-        first = mi.UInt32(0)
+        """Return what the texels around a hit have, bilinear; 0 on no grid.
+
+        `masks` tell, for each grid, whether the hit is on it.
+        """
+        first_cell = mi.UInt32(0)
         n_rows = mi.UInt32(1)
         n_columns = mi.UInt32(1)
         y = mi.Float(0.0)
@@ -464,22 +522,25 @@ class ViewTracer:
             y = dr.select(mask, grid_y, y)
             x = dr.select(mask, grid_x, x)
             on_any_grid = on_any_grid | mask
-            first = dr.select(mask, mi.UInt32(grid.first_cell), first)
+            first_cell = dr.select(mask, mi.UInt32(grid.first_cell), first_cell)
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
         row = y * mi.Float(n_rows) - 0.5
         column = x * mi.Float(n_columns) - 0.5
-        radiance = _look_up_bilinear(lit.texels, first, n_rows, n_columns, row, column)
+        radiance = _look_up_bilinear(
+            lit.texels, first_cell, n_rows, n_columns, row, column
+        )
         return dr.select(on_any_grid, radiance, 0.0)
 
 
-def _camera_numbers(
+def _make_camera_numbers(
     inputs: Mapping[str, Tensor], height: int, width: int
 ) -> Float32Array:
     """Return the `CAMERA_SIZE` numbers of a camera as the kernel takes them.
 
     They are its axes to the left, up and forward (9), its position (3), half its extent
-    along x and y, and its center along x and y.
+    along x and y at distance 1, and its center along x and y; the last four are of use
+    for a pinhole only.
     """
     matrix = inputs["camera.to_world"].detach().double().numpy()
     half_tangent = 0.0
@@ -500,14 +561,16 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
     with mitsuba_lock:
         # three channels a layer, all layers of a ray, ray by ray
         u, v, weight = (
-            np.stack([layer.numpy() for layer in channels[first::3]], axis=1).ravel()
-            for first in (4, 5, 6)
+            np.stack(
+                [layer.numpy() for layer in channels[first_channel::3]], axis=1
+            ).ravel()
+            for first_channel in (4, 5, 6)
         )
         (hits,) = np.nonzero(weight)
         n_layers = len(weight) // (math.prod(size) * RAYS_PER_PIXEL)
-        rest = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
+        radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
         return ViewSamples(
-            radiance=torch.from_numpy(rest).reshape(*size, 3),
+            radiance=torch.from_numpy(radiance).reshape(*size, 3),
             coverage=torch.from_numpy(channels[3].numpy().copy()).reshape(*size, 1),
             sample=torch.from_numpy(hits // n_layers),
             uv=torch.from_numpy(np.stack([u[hits], v[hits]], axis=1)),
@@ -518,7 +581,7 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
 
 def _look_up_bilinear(
     values: Any,
-    first: Any,
+    first_cell: Any,
     n_rows: Any,
     n_columns: Any,
     y: Any,
@@ -552,7 +615,7 @@ def _look_up_bilinear(
         right = dr.minimum(left + 1, n_columns - 1)
 
     def look_up_row(row: Any) -> Any:
-        row_start = first + row * n_columns
+        row_start = first_cell + row * n_columns
         return (
             _gather_color(values, row_start + left) * (1.0 - x_fraction)
             + _gather_color(values, row_start + right) * x_fraction
@@ -569,7 +632,8 @@ def _gather_color(values: Any, index: Any) -> Any:
 def _look_up_sky(lit: LightMaps, direction: Any, to_local: Any) -> Any:
     """Look the environment up in a direction, as Mitsuba does.
 
-    Rows go from pole to pole, and there are copies of columns at both ends.
+    The first row is one pole and the last the other, and the map has a copy of a column
+    at each end, where it goes round.
     """
     n_rows, n_columns = lit.sky_shape
     x, y = texel_rays.compute_map_position(direction, to_local)
@@ -585,7 +649,8 @@ def _look_up_blurred(
 ) -> Any:
     """Look up the environment blurred by a root mean square angle `spread`.
 
-    The value lies between the two maps whose widths are next to it.
+    The value lies between the two maps whose widths are next to it, by the logarithm; a
+    spread outside of all widths has the first or the last map.
     """
     n_rows, n_columns = lit.blurred_shape
     level = dr.clip(

@@ -79,30 +79,31 @@ def trace_texel_rays(
     """
     # The additive recurrence of the plastic number, which fills a square evenly
     # (Roberts 2018, The unreasonable effectiveness of quasirandom sequences).
-    steps = np.array([0.7548776662466927, 0.5698402909980532])
+    increments = np.array([0.7548776662466927, 0.5698402909980532])
     points = _to_drjit_points(
-        mi.Point2f, (np.arange(1, n_rays + 1)[:, None] * steps) % 1.0
+        mi.Point2f, (np.arange(1, n_rays + 1)[:, None] * increments) % 1.0
     )
-    count = len(positions)
-    shifts = np.random.default_rng(seed).random((count, 2), dtype=np.float32)
-    met_cells = np.empty((count, n_rays), dtype=np.int32)
+    n_texels = len(positions)
+    shifts = np.random.default_rng(seed).random((n_texels, 2), dtype=np.float32)
+    met_cells = np.empty((n_texels, n_rays), dtype=np.int32)
     texels_per_launch = max(1, RAYS_PER_LAUNCH // n_rays)
-    for begin in range(0, count, texels_per_launch):
-        batch = slice(begin, min(count, begin + texels_per_launch))
-        lane = dr.arange(mi.UInt32, (batch.stop - begin) * n_rays)
+    for start in range(0, n_texels, texels_per_launch):
+        batch = slice(start, min(n_texels, start + texels_per_launch))
+        # one lane for each ray, texel by texel
+        lane = dr.arange(mi.UInt32, (batch.stop - start) * n_rays)
         texel = lane // n_rays
         ray_index = lane % n_rays
         shift = _to_drjit_points(mi.Point2f, shifts[batch], texel)
         square = dr.gather(mi.Point2f, points, ray_index) + shift
-        square -= dr.floor(square)
+        square -= dr.floor(square)  # shifted points come in at the other edge
         met = _trace_batch(
             scene,
             grids,
             sky_shape,
-            _to_drjit_points(mi.Normal3f, normals[batch], texel),
-            _to_drjit_points(mi.Point3f, positions[batch], texel),
-            square,
-            (seed, begin),
+            normal=_to_drjit_points(mi.Normal3f, normals[batch], texel),
+            position=_to_drjit_points(mi.Point3f, positions[batch], texel),
+            square=square,
+            seed=(seed, start),
         )
         met_cells[batch] = met.numpy().reshape(-1, n_rays)
     return met_cells
@@ -111,7 +112,10 @@ def trace_texel_rays(
 def _find_sky_cell(
     scene: MitsubaScene, direction: Any, sky_shape: tuple[int, int]
 ) -> Any:
-    """Return the cell of the environment, of rows and columns, that directions meet."""
+    """Return the index of the environment's cell that directions meet.
+
+    `sky_shape` is its number of rows and columns of cells.
+    """
     n_rows, n_columns = sky_shape
     column, row = compute_map_position(direction, world_to_map(scene))
     sky_column = mi.UInt32(column * n_columns) % n_columns
@@ -124,8 +128,8 @@ def _find_nearest_cell(grid: TexelGrid, si: Any) -> Any:
     y, x = compute_grid_position(grid, si.p, si.uv)
     return mi.Int32(
         grid.first_cell
-        + _cell_index(y, grid.shape[0]) * grid.shape[1]
-        + _cell_index(x, grid.shape[1])
+        + _compute_cell_index(y, grid.shape[0]) * grid.shape[1]
+        + _compute_cell_index(x, grid.shape[1])
     )
 
 
@@ -138,13 +142,20 @@ def _trace_batch(
     square: Any,
     seed: tuple[int, int],
 ) -> Any:
-    """Trace one launch of `trace_texel_rays`, by points of the unit square."""
+    """Trace one launch of `trace_texel_rays`, and return the cell that each ray meets.
+
+    Args:
+        scene, grids, sky_shape: as there.
+        normal, position: of the texel, for each ray.
+        square: point of the unit square from which the direction is made, for each ray.
+        seed: of the random numbers that decide whether a ray passes a cut-out.
+    """
     mitsuba_scene = scene._scene
     n_layers = count_cut_out_layers(scene)
     direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
     ray = mi.Ray3f(position + normal * RAY_OFFSET, direction)
-    chance = _sample_chances(n_layers, dr.width(square), seed)
-    si = find_opaque_hits(mitsuba_scene, ray, n_layers, chance)
+    thresholds = _sample_chances(n_layers, dr.width(square), seed)
+    si = find_opaque_hits(mitsuba_scene, ray, n_layers, thresholds)
 
     # What escapes meets a cell of the environment.
     n_cells = grids[-1].first_cell + grids[-1].n_cells
@@ -155,6 +166,7 @@ def _trace_batch(
     masks = find_hit_grids(mitsuba_scene, grids, si, direction)
     for grid, is_hit in zip(grids, masks, strict=True):
         if grid.warp is None and grid.side == 0:
+            # Only fronts of such a surface have texels: its backs are dark.
             is_hit &= dr.dot(si.n, direction) < 0.0
         met = dr.select(is_hit, _find_nearest_cell(grid, si), met)
     return met
@@ -177,12 +189,14 @@ def compute_visible_cosines(
         (n, k) cosines; 0 where something is in between.
     """
     # the transpose turns back
-    world = (directions @ np.array(world_to_map(scene))).astype(np.float32)
-    lane = dr.arange(mi.UInt32, len(positions) * len(world))
-    texel = lane // len(world)
+    world_directions = (directions @ np.array(world_to_map(scene))).astype(np.float32)
+    lane = dr.arange(mi.UInt32, len(positions) * len(world_directions))
+    texel = lane // len(world_directions)
     position = _to_drjit_points(mi.Point3f, positions, texel)
     normal = _to_drjit_points(mi.Normal3f, normals, texel)
-    direction = _to_drjit_points(mi.Vector3f, world, lane % len(world))
+    direction = _to_drjit_points(
+        mi.Vector3f, world_directions, lane % len(world_directions)
+    )
     cosine = dr.dot(normal, direction)
     is_above = cosine > 0.0
     active = is_above
@@ -199,7 +213,7 @@ def compute_visible_cosines(
     is_blocked = scene._scene.ray_test(ray, active)
     transmittance = dr.select(is_blocked, 0.0, transmittance)
     received = dr.select(is_above, cosine * transmittance, 0.0)
-    return np.asarray(received.numpy().reshape(len(positions), len(world)))
+    return np.asarray(received.numpy().reshape(len(positions), len(world_directions)))
 
 
 def is_visible_from_behind(
@@ -207,20 +221,24 @@ def is_visible_from_behind(
 ) -> bool:
     """Return whether backs of a shape's faces are visible from outside.
 
-    That is so through a window, for example. The positions (n, 3) lie on the shape.
+    That is so through a window, for example. Rays from outside and above aim at random
+    at the positions (n, 3), which lie on the shape; more than `MIN_BACK_FRACTION` of
+    those that hit the shape have to hit a back.
     """
     generator = np.random.default_rng(0)
-    directions = generator.standard_normal((RAYS_PER_LAUNCH >> 7, 3))
+    n_rays = RAYS_PER_LAUNCH >> 7  # enough for a fraction to a percent
+    directions = generator.standard_normal((n_rays, 3))  # from targets to origins
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions[:, 2] = np.abs(directions[:, 2])
     targets = positions[generator.integers(len(positions), size=len(directions))]
+    # outside of the shape from each of its points
     distance = 2.0 * float(np.ptp(positions, axis=0).max())
     inwards = _to_drjit_points(mi.Vector3f, (-directions).astype(np.float32))
     origins = (targets + distance * directions).astype(np.float32)
     ray = mi.Ray3f(_to_drjit_points(mi.Point3f, origins), inwards)
     n_layers = count_cut_out_layers(scene)
-    chance = _sample_chances(n_layers, len(directions), (0,))
-    si = find_opaque_hits(scene._scene, ray, n_layers, chance)
+    thresholds = _sample_chances(n_layers, len(directions), (0,))
+    si = find_opaque_hits(scene._scene, ray, n_layers, thresholds)
     grid = TexelGrid(name, 0, (1, 1))
     (is_hit,) = find_hit_grids(scene._scene, [grid], si, inwards)
     is_back = np.asarray((is_hit & (dr.dot(si.n, inwards) > 0.0)).numpy())
@@ -238,7 +256,8 @@ def find_opaque_hits(
     """Return the first hits of rays that light does not pass.
 
     A ray goes on through up to `n_layers` cut-outs, as long as the fraction of light
-    that passes all it has met is larger than its chance in [0, 1].
+    that passes all it has met is larger than its chance in [0, 1]: a random chance lets
+    rays pass as often as light does, and 0.5 lets them pass where most light does.
     """
     si = mitsuba_scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
     transmittance = mi.Float(1.0)
@@ -283,7 +302,8 @@ def find_hit_grids(
 def world_to_map(scene: MitsubaScene) -> Any:
     """Return the rotation from the world to the axes of the environment's map.
 
-    It is a list of three rows.
+    It is a list of three rows: the transpose, which is the inverse, of the rotation of
+    the scene's input `environment.to_world`.
     """
     matrix = scene.parameters["environment.to_world"].matrix
     return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3].T.tolist()
@@ -292,8 +312,8 @@ def world_to_map(scene: MitsubaScene) -> Any:
 def compute_map_position(direction: Any, to_local: Any) -> tuple[Any, Any]:
     """Return where a direction lies in the environment's map.
 
-    The position is a fraction of the map's width and one of its height; `to_local` is
-    that of `world_to_map`.
+    The position is a fraction of the map's width and one of its height, from the left
+    and from the top, which is straight up; `to_local` is that of `world_to_map`.
     """
     x, y, z = (
         row[0] * direction.x + row[1] * direction.y + row[2] * direction.z
@@ -304,7 +324,11 @@ def compute_map_position(direction: Any, to_local: Any) -> tuple[Any, Any]:
 
 
 def compute_grid_position(grid: TexelGrid, position: Any, uv: Any) -> tuple[Any, Any]:
-    """Return where in a grid something lies: fractions of its height and its width."""
+    """Return where in a grid something lies: fractions of its height and its width.
+
+    On a mesh that is by its texture coordinates, which repeat; on a plane by the
+    inverse of the grid's warp, and at its border further out.
+    """
     if grid.warp is None:
         return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
     center_x, center_y, scale, rate = grid.warp
@@ -317,7 +341,8 @@ def compute_grid_position(grid: TexelGrid, position: Any, uv: Any) -> tuple[Any,
     return row, column
 
 
-def _cell_index(fraction: Any, count: int) -> Any:
+def _compute_cell_index(fraction: Any, count: int) -> Any:
+    """Return the cell, of `count` along an axis, at a fraction in [0, 1] of it."""
     return mi.Int32(dr.minimum(fraction * count, count - 1.0))
 
 
@@ -365,7 +390,9 @@ class Lobes:
         """Return those of a diffuse surface."""
         ones = np.ones(N_ANGLES, dtype=np.float32)
         zeros = np.zeros(N_ANGLES, dtype=np.float32)
-        return cls(ones, zeros, ones, zeros, zeros, zeros)
+        return cls(
+            diffuse=ones, gloss=zeros, up=ones, along=zeros, core=zeros, tail=zeros
+        )
 
     @property
     def mean_reflectances(self) -> tuple[float, float]:
@@ -375,7 +402,7 @@ class Lobes:
 
 
 class _BsdfSamples(NamedTuple):
-    """Samples of a BSDF, each (ANGLES, LOBE_SAMPLES) float64."""
+    """Samples of a BSDF, each (N_ANGLES, N_LOBE_SAMPLES) float64."""
 
     grey: Float64Array  # value over a cosine density, for a base color of 0.5
     black: Float64Array  # the same for a base color of 0
@@ -429,9 +456,14 @@ def _sample_bsdf(
     normal: Float32Array,
     cosines: Float64Array,
 ) -> _BsdfSamples:
-    """Sample the BSDF at a point for each cosine of the angle of view."""
+    """Sample the BSDF at a point for each cosine (N_ANGLES,) of the angle of view.
+
+    Values are divided by the fraction of light that a cut-out stops, so that they are
+    those of an opaque surface. The same random numbers serve both base colors.
+    """
     n_samples = N_ANGLES * N_LOBE_SAMPLES
     cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), N_LOBE_SAMPLES)
+    # in the frame of the surface, whose z is the normal
     to_viewer = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
     noise = mi.load_dict({"type": "independent"})
     noise.seed(0, n_samples)
@@ -447,6 +479,8 @@ def _sample_bsdf(
         if key in scene.input_names:
             changed[key] = torch.full_like(scene.get_base_value(key), base_color)
         mitsuba_scene = scene.set_inputs(changed)
+        # A ray onto the point from just above makes the hit; then its viewer is
+        # replaced.
         start = mi.Point3f([float(x) for x in position + 1e-3 * normal])
         ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
         first_lane = dr.zeros(mi.UInt32, n_samples)
@@ -466,6 +500,7 @@ def _sample_bsdf(
     bsdf = si.bsdf()
     opacity = eval_opacity(si)
     black = dr.mean(bsdf.eval(context, si, cosine_direction) / opacity)
+    # What is transmitted, below the surface, is no gloss.
     bsdf_sample, bsdf_weight = bsdf.sample(context, si, sample1, sample2)
     is_reflected = (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0)
     weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
@@ -486,19 +521,21 @@ def _measure_spreads(
 ) -> tuple[Float64Array, Float64Array]:
     """Return root mean square angles (k,) of both halves of weighted samples (k, n).
 
-    The first is that of the half with smaller angles, the second that of the other.
+    The halves have equal weight: the first has the samples with smaller angles, the
+    second the others. A sample at the median counts for both, by fractions.
     """
     order = np.argsort(squared_angle, axis=1)
     weight = np.take_along_axis(weight, order, axis=1)
     squared_angle = np.take_along_axis(squared_angle, order, axis=1)
     total = weight.sum(axis=1, keepdims=True)
     weight_before = weight.cumsum(axis=1) - weight
-    near = np.clip(0.5 * total - weight_before, 0.0, weight)
-    half = np.maximum(0.5 * total[:, 0], 1e-12)
-    core = np.sqrt((near * squared_angle).sum(axis=1) / half)
-    tail = np.sqrt(((weight - near) * squared_angle).sum(axis=1) / half)
+    inner_weight = np.clip(0.5 * total - weight_before, 0.0, weight)
+    half_weight = np.maximum(0.5 * total[:, 0], 1e-12)
+    core = np.sqrt((inner_weight * squared_angle).sum(axis=1) / half_weight)
+    tail = np.sqrt(((weight - inner_weight) * squared_angle).sum(axis=1) / half_weight)
     return core, tail
 
 
 def _to_table(values: npt.NDArray[Any]) -> Float64Array:
+    """Convert numbers of all lanes to a table (N_ANGLES, N_LOBE_SAMPLES)."""
     return np.asarray(values, dtype=np.float64).reshape(N_ANGLES, N_LOBE_SAMPLES)

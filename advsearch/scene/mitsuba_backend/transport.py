@@ -93,23 +93,29 @@ def collect_paths(
     depth: int,
     spp: int,
     projector: Any,
+    unseen: Any = None,
 ) -> Paths:
     """Trace one pass of light paths and collect their vertices.
 
-    It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel.
+    It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel. The
+    parameter `key` is changed on the way, and has its value again at the end. Radiance
+    that is not finite is replaced by zero.
 
     Args:
         scene: Mitsuba's scene.
         parameters: what `mi.traverse` returns for the scene.
-        key: Mitsuba's key of a texture (h, w, 3): a base color, or the image of
-            the projector.
+        key: Mitsuba's key of a texture (h, w, 3): a base color, or the image of the
+            projector.
         noise: a sampler that is seeded for `spp` samples per pixel.
         size: height and width of the image.
         depth: maximum length of a path in segments.
         spp: samples per pixel.
         projector: Mitsuba's projector whose image `key` is; None for a base color.
+        unseen: Mitsuba's shape that camera rays see nothing of, nor behind it.
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
+    if unseen is not None:
+        weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
     first_hit, emitted, bounces = _trace_paths(scene, ray, weight, noise, depth)
 
     # The BSDFs are evaluated once more with the base color larger by `COLOR_STEP`:
@@ -142,10 +148,19 @@ def collect_paths(
     return _fetch_paths(channels, vertices, size, spp)
 
 
+def _find_hits(scene: Any, ray: Any, shape: Any) -> Any:
+    """Return which rays meet one of Mitsuba's shapes first."""
+    hit = scene.ray_intersect_preliminary(ray, coherent=True)
+    return hit.is_valid() & (hit.shape == mi.ShapePtr(shape))
+
+
 def _sample_camera_rays(
     sensor: Any, noise: Any, size: tuple[int, int], spp: int
 ) -> tuple[Any, Any]:
-    """Sample `spp` camera rays per pixel, row by row; return rays and weights."""
+    """Sample `spp` camera rays per pixel, row by row; return rays and weights.
+
+    Samples of a pixel follow one another; a lens without aperture has its center.
+    """
     height, width = size
     pixel = dr.arange(mi.UInt32, height * width * spp) // spp
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
@@ -160,6 +175,11 @@ def _accumulate_radiance(
 ) -> tuple[Any, list[tuple[Any, Any, Any]]]:
     """Accumulate radiance from the last vertex back to the camera.
 
+    Args:
+        bounces: of the vertices but for the last, from the camera on.
+        emitted: what each vertex emits; one more than bounces.
+        slopes: derivatives of both BSDF values of each bounce by the base color.
+
     Returns:
         The radiance that leaves the first vertex, without its emission; and for each
         vertex its texture coordinates, its weight (see the module) and whether it is
@@ -167,6 +187,7 @@ def _accumulate_radiance(
     """
     L = mi.Spectrum(0.0)
     vertices = list[tuple[Any, Any, Any]]()
+    # From the last to the first; `emitted[0]`, of the first vertex, is left out.
     for bounce, emitted_next, (slope_em, slope_bsdf) in zip(
         bounces[::-1], emitted[:0:-1], slopes[::-1], strict=True
     ):
@@ -197,7 +218,15 @@ def _fetch_paths(
     size: tuple[int, int],
     spp: int,
 ) -> Paths:
-    """Evaluate the kernel of a pass and fetch images and vertices into torch."""
+    """Evaluate the kernel of a pass and fetch images and vertices into torch.
+
+    Args:
+        channels: of the radiance and of the other images of `Paths`, in their order,
+            for each sample.
+        vertices: texture coordinates, weight and sharpness of each vertex.
+        size: height and width of the image.
+        spp: samples per pixel, which follow one another.
+    """
     n_samples = size[0] * size[1] * spp
     has_weight = _find_weighted_samples(vertices, n_samples)
     dr.eval(channels, vertices, has_weight)  # one kernel for the whole path
@@ -208,12 +237,12 @@ def _fetch_paths(
         image, [3, 1, 3, 3, 3], dim=-1
     )
     return Paths(
-        radiance.contiguous(),
-        coverage.contiguous(),
-        background.contiguous(),
-        albedo.contiguous(),
-        normal.contiguous(),
-        [
+        radiance=radiance.contiguous(),
+        coverage=coverage.contiguous(),
+        background=background.contiguous(),
+        albedo=albedo.contiguous(),
+        normal=normal.contiguous(),
+        vertices=[
             _fetch_vertices(*vertex, mask, spp)
             for vertex, mask in zip(vertices, has_weight, strict=True)
         ],
@@ -221,7 +250,10 @@ def _fetch_paths(
 
 
 def _fetch_vertices(uv: Any, weight: Any, sharp: Any, mask: Any, spp: int) -> Vertices:
-    """Fetch the vertices of the samples that a mask selects."""
+    """Fetch the vertices of the samples that a mask selects.
+
+    `uv`, `weight` and `sharp` are those of all samples; weights are divided by `spp`.
+    """
     index: Any = dr.compress(mask)
     if dr.width(index) == 0:
         empty = torch.zeros(0)
@@ -267,13 +299,19 @@ class Bounce:
         density.
         """
         bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
-        slope_em = self._slope(self.wo_em, self.bsdf_value_em, self.active_em)
-        slope_bsdf = self._slope(self.bsdf_sample.wo, bsdf_value, self.active_bsdf)
+        slope_em = self._compute_slope(self.wo_em, self.bsdf_value_em, self.active_em)
+        slope_bsdf = self._compute_slope(
+            self.bsdf_sample.wo, bsdf_value, self.active_bsdf
+        )
         pdf = dr.select(self.active_bsdf, self.bsdf_sample.pdf, 1.0)
         return slope_em, slope_bsdf / pdf
 
-    def _slope(self, wo: Any, value_before: Any, active: Any) -> Any:
-        """Return the change of a BSDF value over the change of the base color."""
+    def _compute_slope(self, wo: Any, value_before: Any, active: Any) -> Any:
+        """Return the change of a BSDF value over the change of the base color.
+
+        It is 0 where the change is no larger than rounding, since the BSDF there may
+        not depend on the color at all.
+        """
         value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, active)
         change = value - value_before
         exceeds_rounding = dr.max(dr.abs(change)) > ROUNDING_ERROR * dr.max(
@@ -324,6 +362,9 @@ def _trace_paths(
 ) -> tuple[list[Any], list[Any], list[Bounce]]:
     """Trace paths from camera rays; rays of weight 0 see nothing.
 
+    Emission that the vertex before has sampled too counts by its MIS weight. All paths
+    have `depth` segments at most; there is no Russian roulette.
+
     Returns:
         What the camera sees, channel by channel in the order of the images of `Paths`
         after the radiance; what each vertex emits, from the first one on; and how each
@@ -335,7 +376,7 @@ def _trace_paths(
     sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
     throughput = mi.Spectrum(1.0)
     has_cut_outs = _has_cut_outs(scene)
-    straight = mi.Bool(has_cut_outs)  # the path has gone through cut-outs alone
+    passed_straight = mi.Bool(has_cut_outs)  # the path has gone through cut-outs alone
     first_hit = _FirstHit(count)
 
     # Of the vertex before: the camera counts as one that reflects in one direction
@@ -372,19 +413,19 @@ def _trace_paths(
         active_next = active & (bounce.bsdf_sample.pdf > 0.0)
         sampled_type = bounce.bsdf_sample.sampled_type
         if has_cut_outs:
-            passes = active_next & mi.has_flag(sampled_type, mi.BSDFFlags.Null)
-            first_hit.put(si, bsdf, straight & active & ~passes)
-            straight &= passes
+            passes_through = active_next & mi.has_flag(sampled_type, mi.BSDFFlags.Null)
+            first_hit.put(si, bsdf, passed_straight & active & ~passes_through)
+            passed_straight &= passes_through
         bounces.append(bounce)
 
         # On to the next vertex.
-        delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
+        is_delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
         throughput = throughput * bounce.bsdf_weight
         active &= active_next
-        sharp = sharp & delta
+        sharp = sharp & is_delta
         prev_si = si
         prev_pdf = bounce.bsdf_sample.pdf
-        prev_delta = delta
+        prev_delta = is_delta
         ray = si.spawn_ray(si.to_world(bounce.bsdf_sample.wo))
     images = [coverage, *background, *first_hit.albedo, *first_hit.normal]
     return images, emitted, bounces
@@ -399,7 +440,16 @@ def _sample_bounce(
     noise: Any,
     active: Any,
 ) -> Bounce:
-    """Sample light towards a vertex, and the direction in which the path goes on."""
+    """Sample light towards a vertex, and the direction in which the path goes on.
+
+    Args:
+        scene: Mitsuba's scene.
+        si, bsdf: the vertex and its BSDF.
+        throughput: of the path before it.
+        sharp: whether no vertex before it scatters light.
+        noise: the sampler.
+        active: lanes whose path goes on here.
+    """
     context = mi.BSDFContext()
     mis_weight = mi.ad.integrators.common.mis_weight
 
@@ -417,7 +467,7 @@ def _sample_bounce(
         context, si, noise.next_1d(active), noise.next_2d(active), active
     )
     active_next = active & (bsdf_sample.pdf > 0.0)
-    delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+    is_delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     return Bounce(
         si=si,
         bsdf=bsdf,
@@ -429,7 +479,7 @@ def _sample_bounce(
         bsdf_value_em=bsdf_value_em,
         bsdf_sample=bsdf_sample,
         # a mirror's value has no derivative that could be evaluated
-        active_bsdf=active_next & ~delta,
+        active_bsdf=active_next & ~is_delta,
         bsdf_weight=dr.select(active_next, bsdf_weight, 0.0),
     )
 
@@ -462,18 +512,18 @@ def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Sur
     while dr.any(active):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        passes = _passes_camera_ray(scene, si, active)
-        stops = active & ~passes
+        passes_through = _passes_camera_ray(scene, si, active)
+        is_stopped = active & ~passes_through
         for index, shape in enumerate(shapes, 1):
-            shape_id[stops & (si.shape == mi.ShapePtr(shape))] = mi.UInt32(index)
-        face[stops] = si.prim_index
-        depth[stops] = dr.norm(si.p - eye)
-        z_depth[stops] = dr.dot(si.p - eye, forward)
-        normal[stops] = mi.Normal3f(si.sh_frame.n)
+            shape_id[is_stopped & (si.shape == mi.ShapePtr(shape))] = mi.UInt32(index)
+        face[is_stopped] = si.prim_index
+        depth[is_stopped] = dr.norm(si.p - eye)
+        z_depth[is_stopped] = dr.dot(si.p - eye, forward)
+        normal[is_stopped] = mi.Normal3f(si.sh_frame.n)
         # Mitsuba's rows of a texture begin at the top
-        uv[stops] = mi.Point2f(si.uv.x, 1.0 - si.uv.y)
+        uv[is_stopped] = mi.Point2f(si.uv.x, 1.0 - si.uv.y)
         ray = si.spawn_ray(ray.d)
-        active = passes
+        active = passes_through
 
     def to_image(value: Any) -> Tensor:
         image: Tensor = value.torch().reshape(height, width).cpu()

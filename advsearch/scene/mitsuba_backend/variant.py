@@ -105,7 +105,8 @@ def record_on_first_use(
     """
     frozen = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
 
-    def function(*arguments: Any) -> Any:
+    def call(*arguments: Any) -> Any:
+        """Record or replay, while nothing can be freed."""
         was_enabled = gc.isenabled()
         gc.disable()
         try:
@@ -114,7 +115,7 @@ def record_on_first_use(
             if was_enabled:
                 gc.enable()
 
-    return function
+    return call
 
 
 class Recordings(dict[Any, Callable[..., Any]]):
@@ -153,7 +154,7 @@ class Population:
 
     Attributes:
         changes: how often the population has changed.
-        unused: the ids of what has lost its owner.
+        unused: the ids of what has lost its owner, which are values of `changes`.
     """
 
     def __init__(self) -> None:

@@ -91,32 +91,32 @@ def write_scene(
         **make_scene_dict(description, scene.resolution, filter, scene.sampler),
     }
     # inputs that are not yet in what is written
-    remaining = {
+    remaining_inputs = {
         name: value.detach().cpu().numpy().astype(np.float32)
         for name, value in inputs.items()
     }
-    if "camera.fov" in remaining:  # along the larger side, as in the dictionary
-        xml_scene["camera"]["fov"] = float(remaining.pop("camera.fov")[0])
-    if "environment.padded" in remaining:
-        padded = remaining["environment.padded"]
-        remaining["environment.padded"] = padded[:, 1:-1]
+    if "camera.fov" in remaining_inputs:  # along the larger side, as in the dictionary
+        xml_scene["camera"]["fov"] = float(remaining_inputs.pop("camera.fov")[0])
+    if "environment.padded" in remaining_inputs:
+        padded = remaining_inputs["environment.padded"]
+        remaining_inputs["environment.padded"] = padded[:, 1:-1]
     if description.photograph is not None:
         xml_scene[GROUND_NAME] = {
             "type": "ply",
             "bsdf": make_diffuse(description.photograph.base_color.numpy()),
         }
     for part in (description.meshes[OBJECT], *description.parts):
-        _put_part(xml_scene, description, part, remaining)
-    not_set = [
+        _put_part(xml_scene, description, part, remaining_inputs)
+    unset_names = [
         name
-        for name in sorted(remaining)
+        for name in sorted(remaining_inputs)
         if not _put_input(
-            xml_scene, scene.declared_inputs[name][0].split("."), remaining[name]
+            xml_scene, scene.declared_inputs[name][0].split("."), remaining_inputs[name]
         )
     ]
-    if not_set:
+    if unset_names:
         raise InputError(
-            f"out: stock Mitsuba has nothing for {', '.join(not_set)}; "
+            f"out: stock Mitsuba has nothing for {', '.join(unset_names)}; "
             "export another run"
         )
     meshes = {
@@ -131,14 +131,14 @@ def _put_part(
     xml_scene: Plugin,
     description: SceneDescription,
     part: parts.ScenePart,
-    remaining: Plugin,
+    remaining_inputs: Plugin,
 ) -> None:
     """Put a part into a scene's dictionary, and take its inputs from the remaining."""
     if isinstance(part, parts.HazePart):
-        _put_haze(xml_scene, part, remaining)
+        _put_haze(xml_scene, part, remaining_inputs)
     elif isinstance(part, parts.MeshPart):
         xml_scene[part.name] = _make_mesh(
-            description.get_positioned_part(part), remaining
+            description.get_positioned_part(part), remaining_inputs
         )
     else:
         xml_scene |= translate_part(description.get_positioned_part(part)).plugins
@@ -148,13 +148,16 @@ def _put_part(
         )
 
 
-def _put_haze(scene: Plugin, haze: parts.HazePart, remaining: Plugin) -> None:
+def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> None:
     """Fill a ball and the camera in it with haze, unless its density is 0.
 
-    The haze's inputs are taken from the remaining ones.
+    The haze's inputs are taken from the remaining ones. Paths get `EXTRA_DEPTH` more
+    segments.
     """
-    density = remaining.pop(f"{haze.name}.density", np.array([haze.density])).tolist()
-    albedo = remaining.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
+    density = remaining_inputs.pop(
+        f"{haze.name}.density", np.array([haze.density])
+    ).tolist()
+    albedo = remaining_inputs.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
     if not density[0] > 0.0:
         return
     medium_name = f"{haze.name}-medium"
@@ -174,13 +177,20 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining: Plugin) -> None:
     scene["integrator"]["max_depth"] += EXTRA_DEPTH
 
 
-def _put_input(plugin: Plugin, key: list[str], value: Float32Array) -> bool:
+def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> bool:
     """Set a number, color, transform or image of a dictionary by Mitsuba's key.
+
+    Dictionaries on the way are copied, so that the scene's own stay as they are.
+
+    Args:
+        plugin: the dictionary, which is changed.
+        key_parts: Mitsuba's key, cut at its dots.
+        value: of the input.
 
     Returns:
         Whether the dictionary has such an entry.
     """
-    name, *rest = key
+    name, *inner_parts = key_parts
     if name.startswith("brdf_") and name not in plugin:
         # the surface of both sides is the only inner plugin
         inner_names = [
@@ -191,8 +201,8 @@ def _put_input(plugin: Plugin, key: list[str], value: Float32Array) -> bool:
     entry = plugin.get(name)
     if isinstance(entry, Mapping):
         plugin[name] = dict(entry)
-        return bool(rest) and _put_input(plugin[name], rest, value)
-    if rest or (entry is None and name not in OPTIONAL_ENTRIES):
+        return bool(inner_parts) and _put_input(plugin[name], inner_parts, value)
+    if inner_parts or (entry is None and name not in OPTIONAL_ENTRIES):
         return False
     if name == "bitmap":
         plugin[name] = mi.Bitmap(np.ascontiguousarray(value))
@@ -203,25 +213,31 @@ def _put_input(plugin: Plugin, key: list[str], value: Float32Array) -> bool:
     return True
 
 
-def _make_mesh(part: parts.MeshPart, remaining: Plugin) -> Plugin:
-    """Return a mesh's plugin, and take its inputs from the remaining ones."""
-    inputs = {
-        name.partition(".")[2]: remaining.pop(name)
-        for name in list(remaining)
+def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
+    """Return a mesh's plugin, and take its inputs from the remaining ones.
+
+    Base color, light and the surface's numbers are set here; vertices and normals are
+    in the file that is written. Other inputs of the mesh stay among the remaining ones.
+    """
+    part_inputs = {
+        name.partition(".")[2]: remaining_inputs.pop(name)
+        for name in list(remaining_inputs)
         if name.startswith(f"{part.name}.")
     }
-    if "base_color" in inputs:
-        linear = torch.from_numpy(inputs.pop("base_color"))
+    if "base_color" in part_inputs:
+        linear = torch.from_numpy(part_inputs.pop("base_color"))
         part = replace(part, base_color=linear_to_srgb(linear).numpy())
-    if "radiance" in inputs:
-        radiance = inputs.pop("radiance")
+    if "radiance" in part_inputs:
+        # one color (3,), or a texture (h, w, 3)
+        radiance = part_inputs.pop("radiance")
         size = radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)
         part = replace(part, emission=radiance.reshape(-1, *size))
     if part.surface is None:
+        # the surface's parameters, each (1,)
         numbers = {
-            name: float(inputs.pop(name)[0])
+            name: float(part_inputs.pop(name)[0])
             for name in MATERIAL_INPUTS
-            if name in inputs
+            if name in part_inputs
         }
         surface = make_principled(
             replace(part, material=replace(part.material, **numbers))
@@ -231,10 +247,12 @@ def _make_mesh(part: parts.MeshPart, remaining: Plugin) -> Plugin:
         surface = fill_base_color(
             part.surface, lambda options: make_base_texture(base_color, options)
         )
-    # the mesh that is written has them
-    inputs.pop("vertices", None)
-    inputs.pop("normals", None)
-    remaining |= {f"{part.name}.{name}": value for name, value in inputs.items()}
+    # The written mesh has them.
+    part_inputs.pop("vertices", None)
+    part_inputs.pop("normals", None)
+    remaining_inputs |= {
+        f"{part.name}.{name}": value for name, value in part_inputs.items()
+    }
     mesh: Plugin = {"type": "ply", "bsdf": surface}
     light = make_emitter(part)
     if light:
@@ -275,7 +293,7 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
             f"out: XML of Mitsuba cannot say the scene: {error}; export another run"
         ) from error
     root = ElementTree.fromstring(text)
-    # Mitsuba calls parameters by ids, and writes only those referred to
+    # Mitsuba names parameters by ids, but writes only those that are referred to.
     for entry in root.findall("*[@type]"):
         entry.set("id", entry.attrib.pop("name"))
     text = ElementTree.tostring(root, encoding="unicode")

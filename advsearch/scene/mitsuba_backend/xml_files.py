@@ -98,23 +98,31 @@ def read_scene(path: Path) -> Plugin:
     scene = _convert_plugin(path, state, 0, referred)
     # plugins with ids that stand within others, to which the rest of the file may refer
     for name in sorted(referred):
-        if _plain_name(name) not in scene and name in state.id_to_index:
+        if _make_plain_name(name) not in scene and name in state.id_to_index:
             index = state.id_to_index[name]
-            scene[_plain_name(name)] = _convert_plugin(path, state, index, set())
+            scene[_make_plain_name(name)] = _convert_plugin(path, state, index, set())
     return scene
 
 
 @dataclass
 class _SceneText:
-    """The text of a scene file and of the files that it includes."""
+    """The text of a scene file and of the files that it includes.
+
+    Attributes:
+        path: of the scene file.
+        references: finds files in its folder.
+        values: of `$names`, by name; the first default of a name counts.
+        size, elements, included: bytes, elements and included files so far.
+        lines_before: lines before the scene's first one.
+    """
 
     path: Path
     references: References
-    values: dict[str, str] = field(default_factory=dict)  # of `$names`
-    size: int = 0  # bytes so far
+    values: dict[str, str] = field(default_factory=dict)
+    size: int = 0
     elements: int = 0
-    included: int = 0  # files
-    lines_before: int = 0  # lines before the scene's first one
+    included: int = 0
+    lines_before: int = 0
 
     def parse(self, data: bytes) -> ElementTree.Element:
         """Return the tree of a file.
@@ -158,7 +166,11 @@ class _SceneText:
     def _set_handlers(
         self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
     ) -> None:
-        """Have a parser build a tree and refuse what no scene needs."""
+        """Have a parser build a tree and refuse what no scene needs.
+
+        Document types, entities and the elements alias and path; and more elements, or
+        deeper ones, than the limits. What stands outside of the root is left out.
+        """
         depth = 0
 
         def refuse(*_: object) -> None:
@@ -197,7 +209,11 @@ class _SceneText:
         parser.CommentHandler = lambda text: tree.comment(text) if depth else None
 
     def fill_element(self, element: ElementTree.Element) -> None:
-        """Replace `$names` by their values and includes by the files' elements."""
+        """Replace `$names` by their values and includes by the files' elements, in
+        place.
+
+        A default holds from where it stands on, in included files too.
+        """
         children: list[ElementTree.Element] = []
         for child in element:
             for key, text in child.items():
@@ -212,7 +228,10 @@ class _SceneText:
         element[:] = children
 
     def _include(self, name: str) -> list[ElementTree.Element]:
-        """Return the elements of another file."""
+        """Return the elements of another file: those in its scene, or its single one.
+
+        Raises FileFormatError if it may not be read, or too many are included.
+        """
         self.included += 1
         if self.included > MAX_INCLUDES:
             raise FileFormatError(
@@ -235,7 +254,7 @@ class _SceneText:
 
     def fill_text(self, text: str) -> str:
         """Replace the `$names` in a text by their values."""
-        result = ""
+        filled = ""
         # of the pieces, every second one is a name
         for index, piece in enumerate(re.split(r"\$(\w+)", text)):
             is_name = index % 2 == 1
@@ -244,14 +263,14 @@ class _SceneText:
                 raise FileFormatError(
                     f"{self.path}: ${name} has no value: no <default> has that name"
                 )
-            result += self.values[piece] if is_name else piece
+            filled += self.values[piece] if is_name else piece
             # a <default> may name others twice, and so on
-            if index and len(result) > MAX_TEXT_LENGTH:
+            if index and len(filled) > MAX_TEXT_LENGTH:
                 limit = f"expected at most {MAX_TEXT_LENGTH:,} letters, got more"
                 raise FileFormatError(
                     f"{self.path}: {format_name(text)}: {limit}; write the value out"
                 )
-        return result
+        return filled
 
 
 def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> Plugin:
@@ -263,7 +282,7 @@ def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> P
         index: index of the plugin in it; 0 is the scene.
         referred: is extended by the ids that the plugin refers to.
     """
-    kinds = mi.Properties.Type
+    types = mi.Properties.Type
     props = state.nodes[index].props
     entries: Plugin = {"type": props.plugin_name()}
     last_suffix: dict[str, int] = {}
@@ -278,19 +297,21 @@ def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> P
         last_suffix[wanted_name] = suffix
         entries[name] = entry
 
+    # Entries are plugins that stand inside, references to others, and plain values.
     for key in props.keys():
         kind = props.type(key)
         value = props[key]
         argument = "" if key.startswith("_arg_") else key
-        if kind == kinds.ResolvedReference:
+        if kind == types.ResolvedReference:
             node = state.nodes[value.index()]
             name = _get_node_name(node, argument, at_top=index == 0)
             put(
-                _plain_name(name), _convert_plugin(path, state, value.index(), referred)
+                _make_plain_name(name),
+                _convert_plugin(path, state, value.index(), referred),
             )
-        elif kind == kinds.Reference:
+        elif kind == types.Reference:
             referred.add(str(value.id()))
-            reference = {"type": "ref", "id": _plain_name(str(value.id()))}
+            reference = {"type": "ref", "id": _make_plain_name(str(value.id()))}
             put(argument or "ref", reference)
         else:
             put(
@@ -317,19 +338,21 @@ def _get_node_name(node: Any, argument: str, *, at_top: bool) -> str:
 def _convert_value(where: str, kind: Any, value: Any) -> object:
     """Return a number, a string, a color or a transform.
 
-    Numbers are finite and in float32's range; `where` is for errors.
+    Numbers are finite and in float32's range, and transforms affine and invertible;
+    others raise FileFormatError, which `where` begins. A color or a spectrum is a
+    plugin.
     """
-    kinds = mi.Properties.Type
+    types = mi.Properties.Type
     entry: object = value
-    numbers: Any = value if kind in (kinds.Float, kinds.Integer) else ()
-    if kind == kinds.Color:
+    numbers: Any = value if kind in (types.Float, types.Integer) else ()
+    if kind == types.Color:
         numbers = list(value)
         entry = {"type": "rgb", "value": numbers}
-    elif kind == kinds.Vector:
+    elif kind == types.Vector:
         entry = numbers = list(value)
-    elif kind == kinds.Transform:
+    elif kind == types.Transform:
         entry = numbers = np.array(value.matrix, np.float64)
-    elif kind == kinds.Spectrum:
+    elif kind == types.Spectrum:
         pairs = list(zip(value.wavelengths, value.values, strict=False))
         numbers = pairs or value.values
         entry = {"type": "spectrum", "value": pairs or value.values[0]}
@@ -338,12 +361,12 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
             f"{where}: expected a finite number, got "
             f"{format_name(str(np.asarray(numbers)))}; correct it"
         )
-    if kind == kinds.Transform and not abs(np.linalg.det(numbers[:3, :3])) > 0.0:
+    if kind == types.Transform and not abs(np.linalg.det(numbers[:3, :3])) > 0.0:
         raise FileFormatError(
             f"{where}: expected a transform that can be undone, got "
             "one that squashes; correct it"
         )
-    if kind == kinds.Transform and not np.array_equal(numbers[3], (0.0, 0.0, 0.0, 1.0)):
+    if kind == types.Transform and not np.array_equal(numbers[3], (0.0, 0.0, 0.0, 1.0)):
         raise FileFormatError(
             f"{where}: expected an affine transform, whose last row "
             "is 0 0 0 1; correct it"
@@ -351,7 +374,7 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     return entry
 
 
-def _plain_name(name: str) -> str:
+def _make_plain_name(name: str) -> str:
     """Return a name as Mitsuba's loader takes it: without dots."""
     return name.replace(".", "_")
 
@@ -415,7 +438,12 @@ def check_and_read_files(
 
 
 class _FileReader:
-    """Check the plugins of a scene file, and read the files that they name."""
+    """Check the plugins of a scene file, and read the files that they name.
+
+    Args:
+        path: of the scene file.
+        notes: is extended by warnings about images.
+    """
 
     def __init__(self, path: Path, notes: list[str]) -> None:
         self._path = path
@@ -429,7 +457,12 @@ class _FileReader:
         }
 
     def check(self, plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin with all in it checked and read."""
+        """Return a plugin with all in it checked and read.
+
+        Raises FileFormatError for a plugin that does not come with Mitsuba, for a file
+        that only Mitsuba reads, and for the name of a material that is no single word:
+        Mitsuba makes the name of a file of it.
+        """
         kind = str(plugin["type"])
         if kind not in STOCK_PLUGINS:
             raise FileFormatError(
@@ -462,7 +495,11 @@ class _FileReader:
         return self._readers[kind](entries)
 
     def _find_file(self, kind: str, name: object) -> Path:
-        """Return the path of a file that is in the folder of the scene."""
+        """Return the path of a file that is in the folder of the scene.
+
+        The name may be that of a file elsewhere: then one with its last part counts.
+        `kind` is what needs it, for errors.
+        """
         try:
             self._references.get(str(name))
         except FileNotFoundError:
@@ -509,8 +546,8 @@ class _FileReader:
         if scale == 1.0:
             linear = light.read_rows(0, height)
         else:
-            smaller = (max(1, round(height * scale)), max(1, round(width * scale)))
-            linear = average_in_bands(light.read_rows, light.size, smaller)
+            reduced_size = (max(1, round(height * scale)), max(1, round(width * scale)))
+            linear = average_in_bands(light.read_rows, light.size, reduced_size)
         return {**plugin, "bitmap": linear, "raw": True}
 
     def _read_envmap(self, plugin: Plugin) -> Plugin:

@@ -30,6 +30,9 @@ from advsearch.trust.stored_files import track_opened_files
 def import_place(spec: str) -> EnvironmentAsset:
     """Read a place with its light, the first in its file or the one that is named.
 
+    A bundled environment wins over a file of the light's name. With lux, a radiance of
+    1 is so bright that level ground under the open sky gets them.
+
     Raises:
         FileFormatError, InputError: a file is missing, damaged, outside of the folder,
             or says something else.
@@ -53,28 +56,28 @@ def import_place(spec: str) -> EnvironmentAsset:
         light = file.lights[light_name]
         place = read_place(path, file, light.variant)
         if light.map in list_environments():
-            lit = load_environment(light.map)
+            environment = load_environment(light.map)
         else:
-            lit = import_environment(resolve_sibling_path(path, light.map))
+            environment = import_environment(resolve_sibling_path(path, light.map))
     candelas = None
     if light.lux is not None:
-        arriving = compute_irradiance(
-            torch.from_numpy(lit.radiance.copy())
+        illuminance = compute_irradiance(
+            torch.from_numpy(environment.radiance.copy())
         ) @ torch.tensor(LUMINANCE)
-        if float(arriving) <= 0.0:
+        if float(illuminance) <= 0.0:
             raise InputError(
                 f"{path}: lights.{light_name}: expected a map with light for its lux, "
                 f"got {light.map}, which is black "
                 "where the sky is; leave lux out"
             )
-        candelas = light.lux / float(arriving)
+        candelas = light.lux / float(illuminance)
     return replace(
-        lit,
+        environment,
         name=place.name
         if requested_light is None
         else make_safe_name(Path(f"{place.name}-{light_name}.x")),
         source=spec,
-        warnings=(*lit.warnings, *place.notes),
+        warnings=(*environment.warnings, *place.notes),
         photographed=False,
         ground=None,
         candelas=candelas,

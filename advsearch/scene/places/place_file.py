@@ -60,11 +60,10 @@ def split_light(spec: str) -> tuple[str, str | None]:
     None where it names no light.
     """
     file, mark, light = spec.rpartition("#")
-    return (
-        (file, light)
-        if mark and file.lower().endswith(SUFFIXES) and not os.path.exists(spec)
-        else (spec, None)
-    )
+    # A file may have a # in its own name.
+    if mark and file.lower().endswith(SUFFIXES) and not os.path.exists(spec):
+        return file, light
+    return spec, None
 
 
 def read_place_file(path: Path) -> PlaceFile:
@@ -86,9 +85,9 @@ def read_place_file(path: Path) -> PlaceFile:
     try:
         return PlaceFile.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = format_name(".".join(map(str, first["loc"])), quoted=False)
-        problem = first["msg"].removeprefix("Value error, ")[:200]
+        first_error = error.errors(include_url=False, include_input=False)[0]
+        where = format_name(".".join(map(str, first_error["loc"])), quoted=False)
+        problem = first_error["msg"].removeprefix("Value error, ")[:200]
         raise FileFormatError(
             f"{path}: {where or 'the file'}: {problem}; docs/scenes.md has an example"
         ) from None
@@ -160,6 +159,9 @@ def make_place_parts(
 ) -> tuple[MeshPart, ...]:
     """Return the meshes of a place with lengths in the metres of one object size.
 
+    What they emit is in the unit of the light's radiance. Meshes that are lamps emit
+    only if they shine, and then what the place's file says.
+
     Args:
         place: the place.
         metres: of one object size.
@@ -167,15 +169,15 @@ def make_place_parts(
             and its lamps stay off.
         is_dark: whether its lamps shine.
     """
-    unit = np.float32(candelas or DEFAULT_LUMINANCE)
-    shines = is_dark and candelas is not None
-    laid: list[MeshPart] = []
+    radiance_unit = np.float32(candelas or DEFAULT_LUMINANCE)
+    are_lamps_on = is_dark and candelas is not None
+    scene_parts: list[MeshPart] = []
     for part in place.parts:
         emission = part.emission
         if part.name in place.file.lamps:
             emission = (
                 np.array([[place.file.lamps[part.name]]], np.float32)
-                if shines
+                if are_lamps_on
                 else None
             )
         solids = tuple(
@@ -183,13 +185,13 @@ def make_place_parts(
             for name, (outline, low, high) in part.solids
         )
         mesh = replace(part.mesh, vertices=part.mesh.vertices / np.float32(metres))
-        laid.append(
+        scene_parts.append(
             replace(
                 part,
                 place=place,
                 mesh=mesh,
                 solids=solids,
-                emission=None if emission is None else emission / unit,
+                emission=None if emission is None else emission / radiance_unit,
             )
         )
-    return tuple(laid)
+    return tuple(scene_parts)

@@ -132,16 +132,17 @@ def _read_extension(path: Path, model: type[M], content: object) -> M:
     try:
         return model.model_validate({} if content is None else content)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"]))[:80]
+        first_error = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first_error["loc"]))[:80]
         raise damaged(
             path,
-            f"extensions as glTF has them ({where}: {first['msg'][:100]})",
+            f"extensions as glTF has them ({where}: {first_error['msg'][:100]})",
             "others",
         ) from None
 
 
-def _extension_of(entry: Entry, name: str) -> object:
+def _get_extension(entry: Entry, name: str) -> object:
+    """Return an extension of an entry of the header; None if it has none."""
     return entry.extensions.get(name) if isinstance(entry.extensions, dict) else None
 
 
@@ -179,7 +180,7 @@ def read_place_meshes(
     variant_index = None if variant is None else _find_variant(path, header, variant)
     with without_pillows_limit(), np.errstate(all="ignore"):
         primitives, surfaces = _read_primitives(file, variant_index, notes)
-    note_left_out(_without_supported_extensions(header), notes)
+    note_left_out(_drop_supported_extensions(header), notes)
     _note_left_out(header, primitives, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))
     groups = _group_by_material(header, primitives)
@@ -196,7 +197,7 @@ def read_place_meshes(
     return parts, list(notes)
 
 
-def _without_supported_extensions(header: Header) -> Header:
+def _drop_supported_extensions(header: Header) -> Header:
     """Return the header without the extensions that only places support."""
     used = [name for name in header.extensionsUsed if name not in PLACE_EXTENSIONS]
     required = [
@@ -227,7 +228,8 @@ def _note_left_out(
 
 
 def _find_variant(path: Path, header: Header, variant: str) -> int:
-    extension = _read_extension(path, _Variants, _extension_of(header, VARIANTS))
+    """Return the index of a variant; raises UnknownNameError if the file has none such."""
+    extension = _read_extension(path, _Variants, _get_extension(header, VARIANTS))
     names = [entry.name for entry in extension.variants]
     if variant not in names:
         raise UnknownNameError(f"variant of {path.name}:", variant, names)
@@ -238,7 +240,7 @@ def _select_material(
     path: Path, header: Header, primitive: Primitive, variant: int | None
 ) -> int | None:
     """Return the index of the material that a primitive has in a variant."""
-    extension = _extension_of(primitive, VARIANTS)
+    extension = _get_extension(primitive, VARIANTS)
     if variant is None or extension is None:
         return primitive.material
     for mapping in _read_extension(path, _Mappings, extension).mappings:
@@ -272,6 +274,8 @@ def _read_primitives(
     file: GltfFile, variant: int | None, notes: Notes
 ) -> tuple[list[PosedPrimitive], dict[int | None, ImportedSurface]]:
     """Read the primitives that the file's nodes show, and the surfaces they use.
+
+    A mesh that several nodes show is read once, and is there at each of their poses.
 
     Args:
         file: the glTF file.
@@ -323,8 +327,10 @@ def _read_pieces(
     for mesh in meshes:
         for index, primitive in enumerate(header.meshes[mesh].primitives):
             material = _select_material(file.path, header, primitive, variant)
-            varied = primitive.model_copy(update={"material": material})
-            piece = read_primitive(file, varied, header.meshes[mesh].extras, False)
+            variant_primitive = primitive.model_copy(update={"material": material})
+            piece = read_primitive(
+                file, variant_primitive, header.meshes[mesh].extras, False
+            )
             if piece is not None and len(piece.part.faces):
                 pieces[mesh, index] = piece
     return pieces
@@ -337,26 +343,29 @@ def _fit_surfaces(
 
     Raises FileFormatError, InputError: there are too many materials or texels.
     """
-    by_material: dict[int | None, list[PrimitiveData]] = {}
+    pieces_by_material: dict[int | None, list[PrimitiveData]] = {}
     for piece in pieces.values():
-        by_material.setdefault(piece.material, []).append(piece)
-    _check_materials(file.path, len(by_material))
+        pieces_by_material.setdefault(piece.material, []).append(piece)
+    _check_materials(file.path, len(pieces_by_material))
     surfaces = GltfSurfaces(file, notes, TEXTURE_LIMIT)
-    fitted: dict[int | None, tuple[ImportedSurface, Float64Array, Float64Array]] = {}
-    texels = 0
-    for material, members in by_material.items():
-        fitted[material] = surfaces.make_surface(material, members)
-        texels += _count_texels(fitted[material][0])
+    fit_by_material: dict[
+        int | None, tuple[ImportedSurface, Float64Array, Float64Array]
+    ] = {}
+    n_texels = 0
+    for material, members in pieces_by_material.items():
+        fit_by_material[material] = surfaces.make_surface(material, members)
+        n_texels += _count_texels(fit_by_material[material][0])
         check_most(
             file.path,
-            texels,
+            n_texels,
             MAX_TEXELS,
             "textures of at most {} texels, counted for each material",
         )
-    return fitted
+    return fit_by_material
 
 
 def _check_materials(path: Path, count: int) -> None:
+    """Raise InputError if a file has more than `MAX_MESHES` materials."""
     if count > MAX_MESHES:
         raise InputError(
             f"{path}: expected at most {MAX_MESHES} materials, got "
@@ -365,6 +374,7 @@ def _check_materials(path: Path, count: int) -> None:
 
 
 def _count_texels(surface: ImportedSurface) -> int:
+    """Return the texels of all images of a surface."""
     images = (surface.texture, surface.normal_map, surface.emission)
     return sum(
         texels.shape[0] * texels.shape[1] for texels in images if texels is not None
@@ -376,48 +386,49 @@ def _group_by_material(
 ) -> dict[NameAndMaterial, list[ImportedPart]]:
     """Return the primitives of each mesh, by its name and the material in the variant.
 
-    In the order of materials.
+    A mesh has the name of its own material, also where the variant changes all of it.
+    Where the variant changes a part of what has that material, this part has the name
+    of the other one. In the order of materials.
     """
     variant_materials: dict[int | None, set[int | None]] = {}
     for primitive in primitives:
         materials = variant_materials.setdefault(primitive.material, set())
         materials.add(primitive.variant_material)
-    groups: dict[NameAndMaterial, list[ImportedPart]] = {}
+    parts_by_mesh: dict[NameAndMaterial, list[ImportedPart]] = {}
     for material, variant_material, part in primitives:
         # the variant changes a part of what has this material
         is_split = len(variant_materials[material]) > 1
         is_covered = is_split and variant_material != material
         name = _name_material(header, variant_material if is_covered else material)
-        groups.setdefault((name, variant_material), []).append(part)
+        parts_by_mesh.setdefault((name, variant_material), []).append(part)
 
-    def material_order(item: tuple[NameAndMaterial, list[ImportedPart]]) -> int:
+    def get_material_order(item: tuple[NameAndMaterial, list[ImportedPart]]) -> int:
         (_, material), _ = item
         return -1 if material is None else material
 
-    return dict(sorted(groups.items(), key=material_order))
+    return dict(sorted(parts_by_mesh.items(), key=get_material_order))
 
 
 def _name_material(header: Header, index: int | None) -> str:
-    return (
-        UNNAMED
-        if index is None
-        else header.materials[index].name or f"material {index}"
-    )
+    """Return the name of a material by its index, or one for a material without."""
+    if index is None:
+        return UNNAMED
+    return header.materials[index].name or f"material {index}"
 
 
 def _make_part(
     path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface
 ) -> MeshPart:
     """Return one mesh of a place from its parts and their surface."""
-    color = (
-        np.full(3, NEUTRAL_GREY, np.float32) if surface.color is None else surface.color
-    )
-    base = (
-        np.broadcast_to(color, (2, 2, len(color)))
-        if surface.texture is None
-        else surface.texture
-    )
-    opacity = np.ascontiguousarray(base[..., 3]) if base.shape[-1] == 4 else None
+    color = surface.color
+    if color is None:
+        color = np.full(3, NEUTRAL_GREY, np.float32)
+    texture = surface.texture
+    if texture is None:
+        texture = np.broadcast_to(color, (2, 2, len(color)))
+    opacity = None
+    if texture.shape[-1] == 4:
+        opacity = np.ascontiguousarray(texture[..., 3])
     try:
         mesh = _join(members)
     except InputError as error:  # which knows of no file
@@ -425,7 +436,7 @@ def _make_part(
     return MeshPart(
         name=name,
         mesh=mesh,
-        base_color=np.ascontiguousarray(base[..., :3]),
+        base_color=np.ascontiguousarray(texture[..., :3]),
         material=Material().with_values(vars(surface), ""),
         opacity=opacity,
         normal_map=surface.normal_map,
@@ -436,7 +447,12 @@ def _make_part(
 def _with_finish(
     path: Path, header: Header, index: int | None, part: MeshPart
 ) -> MeshPart:
-    """Return a mesh with the specular and the clear coat of its material."""
+    """Return a mesh with the specular and the clear coat of its material.
+
+    Specular is so large that the surface reflects as much as by its index of refraction
+    when it faces the light. The gloss of a coat needs a surface in Mitsuba's words; a
+    mesh with cut-outs or bumps has none, and its coat has Mitsuba's own gloss.
+    """
     entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
     ior = finish.KHR_materials_ior.ior
@@ -461,37 +477,43 @@ def _with_finish(
 
 
 def _join(members: Sequence[ImportedPart]) -> Mesh:
-    """Join parts of a file to one mesh, z up, its front along +x."""
-    turn = compute_rotation("y", "+z")
+    """Join parts of a file to one mesh, z up, its front along +x.
+
+    Texture coordinates that are missing are 0; normals that are missing are those of
+    faces.
+    """
+    rotation = compute_rotation("y", "+z")  # glTF's axes
     vertices = list[Float64Array]()
     faces = list[IntArray]()
     normals = list[Float64Array]()
     uvs = list[Float64Array]()
-    count = 0
+    n_vertices = 0
     for part in map(_with_normals, members):
         part_normals = part.normals
-        if part_normals is None:
-            part_normals = np.zeros_like(part.vertices)
+        assert part_normals is not None
         part_uvs = part.uvs
         if part_uvs is None:
             part_uvs = np.zeros((len(part.vertices), 2))
         vertices.append(part.vertices)
-        faces.append(part.faces + count)
+        faces.append(part.faces + n_vertices)
         normals.append(part_normals)
         uvs.append(part_uvs)
-        count += len(part.vertices)
+        n_vertices += len(part.vertices)
     directions = np.concatenate(normals)
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     return Mesh(
-        (np.concatenate(vertices) @ turn.T).astype(np.float32),
+        (np.concatenate(vertices) @ rotation.T).astype(np.float32),
         np.concatenate(faces).astype(np.uint32),
-        (directions / np.maximum(lengths, 1e-12) @ turn.T).astype(np.float32),
+        (directions / np.maximum(lengths, 1e-12) @ rotation.T).astype(np.float32),
         np.concatenate(uvs).astype(np.float32),
     )
 
 
 def _with_normals(part: ImportedPart) -> ImportedPart:
-    """Return a part with the normals of its faces where it has none."""
+    """Return a part with the normals of its faces where it has none.
+
+    Then every face has vertices of its own. Normals are not of unit length yet.
+    """
     if part.normals is not None:
         return part
     corners = part.vertices[part.faces]

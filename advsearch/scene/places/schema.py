@@ -31,15 +31,17 @@ class _Entry(BaseModel):
 
 
 def _is_convex(corners: Float64Array) -> bool:
-    """Return whether corners (K, 2), in turn, turn to one side only, and hold an
-    area.
+    """Return whether corners (K, 2), in turn, turn to one side only, and hold an area.
+
+    Either side will do; a corner on a straight line does not count, within rounding.
     """
     edges = np.roll(corners, -1, axis=0) - corners
-    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
+    # cross products of successive edges
+    cross_products = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(
         edges[:, 0], -1
     )
-    smallest = float(turns.min())
-    largest = float(turns.max())
+    smallest = float(cross_products.min())
+    largest = float(cross_products.max())
     rounding = 1e-9 * max(-smallest, largest)
     return rounding > 0.0 and (smallest >= -rounding or largest <= rounding)
 
@@ -67,10 +69,10 @@ class SolidEntry(_Entry):
     @model_validator(mode="after")
     def _check_form(self) -> SolidEntry:
         """Check that an entry has one convex outline, or a radius and positions."""
-        is_round = self.at is not None and self.radius is not None
-        if is_round == (self.outline is not None) or (self.at is None) != (
-            self.radius is None
-        ):
+        has_positions = self.at is not None
+        has_radius = self.radius is not None
+        has_outline = self.outline is not None
+        if has_positions != has_radius or has_radius == has_outline:
             raise ValueError(
                 "expected either an outline, or a radius and the "
                 "positions that it is at"
@@ -107,6 +109,7 @@ class ValidEntry(_Entry):
 
     @model_validator(mode="after")
     def _check_order(self) -> ValidEntry:
+        """Check that bounds have the lower one first."""
         for axis, bounds in (("x", self.x), ("y", self.y), ("z", self.z)):
             if bounds is not None and bounds[0] >= bounds[1]:
                 raise ValueError(f"{axis}: expected the lower bound first")
@@ -125,6 +128,7 @@ class PictureEntry(_Entry):
 
     @model_validator(mode="after")
     def _check_inside(self) -> PictureEntry:
+        """Check that the object, at 0, is between the bounds."""
         for axis, (low, high) in (("x", self.x), ("y", self.y)):
             if not low < 0.0 < high:
                 raise ValueError(

@@ -63,8 +63,8 @@ class SurfaceView:
             there are 2 sides with light of their own, from its back.
 
     Args:
-        seen: of all cameras.
-        number: index of the camera.
+        samples: of all cameras.
+        camera_index: index of the camera.
         shape: rows and columns of the fine grid.
         sides: of the object that have light of their own.
     """
@@ -76,24 +76,28 @@ class SurfaceView:
         shape: tuple[int, int],
         sides: int = 1,
     ) -> None:
+        """Make the matrix of one camera's samples: four entries for each ray that hits."""
         self.base_radiance = samples.radiance[camera_index]
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
         n_cells = shape[0] * shape[1]
-        first_sample = camera_index * height * width * RAYS_PER_PIXEL
-        bounds = torch.tensor([camera_index, camera_index + 1]) * (
-            height * width * RAYS_PER_PIXEL
-        )
-        begin, end = torch.searchsorted(samples.sample, bounds).tolist()
-        pixel = (samples.sample[begin:end] - first_sample) // RAYS_PER_PIXEL
-        columns, fractions = find_bilinear_weights(samples.uv[begin:end].numpy(), shape)
-        is_back = samples.is_back[begin:end].numpy()
+        n_rays = height * width * RAYS_PER_PIXEL
+        first_sample = camera_index * n_rays
+        bounds = torch.tensor([camera_index, camera_index + 1]) * n_rays
+        start, end = torch.searchsorted(samples.sample, bounds).tolist()
+        pixel = (samples.sample[start:end] - first_sample) // RAYS_PER_PIXEL
+        # (n, 4) cells and weights of the bilinear look-ups; those on the back are in
+        # the second half of the columns.
+        columns, fractions = find_bilinear_weights(samples.uv[start:end].numpy(), shape)
+        is_back = samples.is_back[start:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
-        weights = fractions * samples.weight[begin:end].numpy()[:, None]
+        weights = fractions * samples.weight[start:end].numpy()[:, None]
+        # Samples are in the order of pixels, with four entries each.
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
-        entries = weights.ravel(), columns.ravel(), row_starts.astype(np.int32)
         self.matrix = scipy.sparse.csr_matrix(
-            entries, (height * width, sides * n_cells), copy=False
+            (weights.ravel(), columns.ravel(), row_starts.astype(np.int32)),
+            (height * width, sides * n_cells),
+            copy=False,
         )
 
     def compute_radiance(self, reflected: Tensor) -> Tensor:
@@ -107,7 +111,7 @@ class SurfaceView:
 
 
 def multiply_sparse(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
-    """Return a sparse matrix times columns (k, 3); differentiable in these."""
+    """Return a sparse matrix (n, k) times columns (k, 3); differentiable in these."""
 
     def multiply(factor: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
         return torch.from_numpy(factor @ values.numpy())
@@ -177,6 +181,15 @@ class Arrangement:
         inputs: the scene's own, assembled, without those that may change.
         texture: rows and columns of the base color.
         seed: of the rays.
+
+    Attributes:
+        inputs: scene inputs that stay.
+        texels: those of all surfaces: the object's front, its back if it has light of
+            its own, and the ground.
+        n_sides: sides of the object that have light of their own, 1 or 2.
+        fine_shape: rows and columns of the fine grid.
+        lobes: of each surface.
+        world_to_map: (3, 3) rotation to the axes of the environment's map.
     """
 
     def __init__(
@@ -186,6 +199,7 @@ class Arrangement:
         texture: tuple[int, int],
         seed: int,
     ) -> None:
+        """Lay texels over all surfaces, trace what they see, and measure how they look."""
         scene = renderer.scene
         self._scene = scene
         self.inputs = {
@@ -193,29 +207,35 @@ class Arrangement:
         }
         scene.set_inputs(self.inputs)
         description = scene.definition[0]
-        vertices = self._object_buffer("vertices")
-        normals = self._object_buffer("normals")
-        middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        vertices = self._get_object_buffer("vertices")
+        normals = self._get_object_buffer("normals")
+        object_center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         charts = rasterize_charts(description.meshes[OBJECT].mesh, OBJECT_TEXELS)
-        surfaces = self._texels_on_object(charts, vertices, normals)
+        surfaces = self._make_object_texels(charts, vertices, normals)
         self.n_sides = len(surfaces)
+        # The ground goes on from the center of the object; a photographed one shows
+        # what was taken from `capture_height`.
         photograph = description.photograph
         self._has_ground = description.number("ground.size") > 0.0
         if self._has_ground:
-            center = (float(middle[0]), float(middle[1]))
-            reach = self._ground_reach(photograph is not None)
-            surfaces.append(texels.make_ground_texels(GROUND_NAME, 0.0, reach, center))
+            ground_center = (float(object_center[0]), float(object_center[1]))
+            reach = self._compute_ground_reach(photograph is not None)
+            surfaces.append(
+                texels.make_ground_texels(GROUND_NAME, 0.0, reach, ground_center)
+            )
         self.texels: texels.LitTexels = texels.join_texels(surfaces)
         self._refine(texture)
 
+        # What texels see of the sky and of each other, as matrices; and matrices from
+        # the light on the object's texels to the fine grid, side by side.
         met_cells = trace_texel_rays(
             scene,
             self.texels.grids,
-            texels.SKY_SHAPE,
-            self.texels.positions,
-            self.texels.normals,
-            RAYS_PER_TEXEL,
-            seed,
+            sky_shape=texels.SKY_SHAPE,
+            positions=self.texels.positions,
+            normals=self.texels.normals,
+            n_rays=RAYS_PER_TEXEL,
+            seed=seed,
         )
         self._view_matrices = texels.make_view_matrices(
             met_cells, self.texels.texel_of_cell, len(self.texels.positions)
@@ -228,17 +248,20 @@ class Arrangement:
                     charts,
                     self.fine_shape,
                     vertices,
-                    (1 - 2 * side) * normals,
+                    normals if side == 0 else -normals,
                     self._find_buried(met_cells, side),
                 )
             )
         if self._has_ground:
             self._smooth = self._make_ground_smoothing(surfaces[-1], met_cells)
+        # Gloss: both sides of the object have the same, and the ground has none.
         self.lobes = [self._measure_object()] * self.n_sides
         self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
-        self._photographed = None if photograph is None else description.capture_height
+        self._capture_height = (
+            None if photograph is None else description.capture_height
+        )
         self.world_to_map = torch.tensor(world_to_map(scene), dtype=torch.float32)
-        self._below = self._find_ground_below(middle)
+        self._ground_below = self._find_ground_below(object_center)
         model = description.camera_model
         if model is not None and "camera.lens" in self.inputs:
             model = model.with_numbers(self.inputs["camera.lens"])
@@ -246,19 +269,23 @@ class Arrangement:
             scene,
             self.texels.grids,
             self.lobes,
-            texels.BLUR_WIDTHS,
-            self._photographed,
-            model,
-            middle,
+            widths=texels.BLUR_WIDTHS,
+            photograph_height=self._capture_height,
+            model=model,
+            center=object_center,
         )
 
     def _refine(self, texture: tuple[int, int]) -> None:
-        """Choose the shape of the fine grid, and how a texture is upsampled to it."""
+        """Set the shape of the fine grid, and the matrix that upsamples a texture to
+        it.
+
+        A texture smaller than `MIN_FINE_SIZE` is enlarged by a whole factor.
+        """
         factor = max(1, math.ceil(MIN_FINE_SIZE / min(texture)))
         self.fine_shape = texture[0] * factor, texture[1] * factor
-        self._finer = None
+        self._upsampling = None
         if factor > 1:
-            self._finer = _make_upsampling_matrix(texture, self.fine_shape)
+            self._upsampling = _make_upsampling_matrix(texture, self.fine_shape)
 
     def _make_ground_smoothing(
         self, ground: texels.LitTexels, met_cells: Ints
@@ -271,7 +298,7 @@ class Arrangement:
         sees_sky = (ground_cells >= len(self.texels.texel_of_cell)).any(axis=1)
         return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
-    def _object_buffer(self, buffer: str) -> Float32Array:
+    def _get_object_buffer(self, buffer: str) -> Float32Array:
         """Return the object's vertices or normals (V, 3)."""
         name = f"{OBJECT}.{buffer}"
         values = (
@@ -282,7 +309,7 @@ class Arrangement:
         rows: Float32Array = values.reshape(-1, 3).numpy()
         return rows
 
-    def _texels_on_object(
+    def _make_object_texels(
         self, charts: Charts, vertices: Float32Array, normals: Float32Array
     ) -> list[texels.LitTexels]:
         """Return the texels of the object; of both sides if its back is visible."""
@@ -294,7 +321,7 @@ class Arrangement:
             for side in (1, -1)
         ]
 
-    def _ground_reach(self, is_photographed: bool) -> float:
+    def _compute_ground_reach(self, is_photographed: bool) -> float:
         """Return half the width of the ground; a photographed one has no end."""
         if is_photographed:
             return math.inf
@@ -309,13 +336,18 @@ class Arrangement:
         cells = met_cells[self.texels.select_grid(side)]
         if self.n_sides == 1:
             return np.asarray((cells < 0).mean(axis=1) > BURIED_FRACTION)
-        back = self.texels.grids[1]
-        is_back = (cells >= back.first_cell) & (cells < back.first_cell + back.n_cells)
+        back_grid = self.texels.grids[1]
+        is_back = (cells >= back_grid.first_cell) & (
+            cells < back_grid.first_cell + back_grid.n_cells
+        )
         sees_sky = (cells >= len(self.texels.texel_of_cell)).any(axis=1)
         return np.asarray((is_back.mean(axis=1) > BURIED_FRACTION) & ~sees_sky)
 
     def _measure_object(self) -> Lobes:
-        """Measure the object's BSDF at one of its most opaque texels."""
+        """Measure the object's BSDF at one of its most opaque texels.
+
+        It is taken for that of the full surface.
+        """
         front = self.texels.select_grid(0)
         opacity = self._scene.definition[0].meshes[OBJECT].opacity
         candidates = np.arange(front.start, front.stop)
@@ -335,7 +367,7 @@ class Arrangement:
             self.texels.normals[texel],
         )
 
-    def _find_ground_below(self, middle: Float32Array) -> tuple[Tensor, Tensor]:
+    def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
         """Find the ground in the blurred maps, seen from the object's center.
 
         Returns:
@@ -343,16 +375,18 @@ class Arrangement:
             map's axes in which its photograph has what is seen there.
         """
         directions = texels.compute_directions(texels.BLURRED_SHAPE)
-        world = directions @ self.world_to_map
+        world_directions = directions @ self.world_to_map
         if not self._has_ground:
             return torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool), directions
-        distance = float(middle[2]) / (-world[..., 2]).clamp_min(1e-6)
-        points = torch.from_numpy(middle).float() + world * distance[..., None]
-        reach = self._ground_reach(self._photographed is not None)
-        in_reach = (points[..., :2].abs() <= reach).all(dim=-1)
-        camera = torch.tensor([0.0, 0.0, self._photographed or 0.0])
-        from_camera = (points - camera) @ self.world_to_map.T
-        return (world[..., 2] < -1e-3) & in_reach, from_camera
+        distance = float(center[2]) / (-world_directions[..., 2]).clamp_min(1e-6)
+        points = (
+            torch.from_numpy(center).float() + world_directions * distance[..., None]
+        )
+        reach = self._compute_ground_reach(self._capture_height is not None)
+        is_in_reach = (points[..., :2].abs() <= reach).all(dim=-1)
+        capture_position = torch.tensor([0.0, 0.0, self._capture_height or 0.0])
+        from_camera = (points - capture_position) @ self.world_to_map.T
+        return (world_directions[..., 2] < -1e-3) & is_in_reach, from_camera
 
     @property
     def entries(self) -> int:
@@ -380,11 +414,18 @@ class Arrangement:
         """Return a base color (h, w, 3) on the fine grid, (cells, 3);
         differentiable.
         """
-        flat = color.reshape(-1, 3)
-        return flat if self._finer is None else multiply_sparse(self._finer, flat)
+        flat_color = color.reshape(-1, 3)
+        return (
+            flat_color
+            if self._upsampling is None
+            else multiply_sparse(self._upsampling, flat_color)
+        )
 
     def compute_light(self, padded: Tensor, color: Tensor) -> ArrangementLight:
         """Return the light of an environment, for a base color of the object.
+
+        The base color counts for light between surfaces; what the object itself
+        reflects to the camera is left to `ArrangementLight.compute_reflected`.
 
         Args:
             padded: (H, W + 2, 3) map of the environment.
@@ -392,32 +433,34 @@ class Arrangement:
         """
         with torch.no_grad():
             sky = texels.prepare_sky(padded)
-            reflectance = self._reflectance(color, padded)
-            arriving = texels.compute_irradiance(
+            reflectance = self._compute_reflectance(color, padded)
+            irradiance = texels.compute_irradiance(
                 self._view_matrices,
                 sky,
-                self._hot_cosines(sky),
+                self._find_hot_cosines(sky),
                 reflectance,
                 BOUNCES,
             )
-            leaving = reflectance * arriving / math.pi
+            leaving = reflectance * irradiance / math.pi
             surroundings = sky.map
             far_ground = torch.ones(1, 3)
             if self._has_ground:
                 ground = self.texels.select_grid(self.n_sides)
-                leaving[ground] = self._leaving_ground(arriving, leaving, padded)
-                far_ground = self._far_ground(leaving[ground])
+                leaving[ground] = self._compute_ground_radiance(
+                    irradiance, leaving, padded
+                )
+                far_ground = self._compute_far_ground(leaving[ground])
                 surroundings = self._put_ground(surroundings, far_ground, padded)
-            on_sides = [
-                to_fine @ arriving[self.texels.select_grid(side)]
+            side_irradiances = [
+                to_fine @ irradiance[self.texels.select_grid(side)]
                 for side, to_fine in enumerate(self._to_fine)
             ]
             texel_of_cell = torch.from_numpy(self.texels.texel_of_cell)
             cells = torch.cat([leaving[texel_of_cell], far_ground])
-            lit = make_light_maps(cells, padded, texels.blur_map(surroundings))
-            return ArrangementLight(torch.cat(on_sides), lit)
+            light_maps = make_light_maps(cells, padded, texels.blur_map(surroundings))
+            return ArrangementLight(torch.cat(side_irradiances), light_maps)
 
-    def _hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
+    def _find_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
         """Return the visible cosines (n, k) towards what is hot; None if nothing is."""
         hot_directions = sky.hot[0]
         if not len(hot_directions):
@@ -431,22 +474,24 @@ class Arrangement:
         )
         return torch.from_numpy(cosines)
 
-    def _leaving_ground(
-        self, arriving: Tensor, leaving: Tensor, padded: Tensor
+    def _compute_ground_radiance(
+        self, irradiance: Tensor, leaving: Tensor, padded: Tensor
     ) -> Tensor:
-        """Return what leaves the ground's texels, smoothed.
+        """Return what leaves the ground's texels (n, 3), smoothed.
 
-        Of a photographed ground it is the fraction of its photograph that it shows.
+        It is radiance; of a photographed ground the fraction of its photograph that it
+        shows. `irradiance` and `leaving` are those of all texels.
         """
         ground = self.texels.select_grid(self.n_sides)
-        if self._photographed is None:
+        if self._capture_height is None:
             return self._smooth @ leaving[ground]
-        full_light = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
-        return self._smooth @ (arriving[ground] / full_light)
+        open_irradiance = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+        return self._smooth @ (irradiance[ground] / open_irradiance)
 
-    def _far_ground(self, leaving: Tensor) -> Tensor:
-        """Return what leaves the ground far off (1, 3): the object hides little
-        there.
+    def _compute_far_ground(self, leaving: Tensor) -> Tensor:
+        """Return what leaves the ground far off (1, 3): the object hides little there.
+
+        It is the mean of the texels (n, 3) at the border.
         """
         cells = leaving.reshape(*self.texels.grids[-1].shape, 3)
         border = torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]])
@@ -455,16 +500,24 @@ class Arrangement:
     def _put_ground(
         self, surroundings: Tensor, far_ground: Tensor, padded: Tensor
     ) -> Tensor:
-        """Put the ground into a map (h, w, 3) of what surrounds the object."""
-        is_hidden, from_camera = self._below
+        """Put the ground into a map (h, w, 3) of what surrounds the object.
+
+        It is that far off; of a photographed one the fraction of its photograph.
+        """
+        is_hidden, photograph_directions = self._ground_below
         ground = far_ground
-        if self._photographed is not None:
-            photograph = texels.look_up_environment(padded, from_camera.reshape(-1, 3))
+        if self._capture_height is not None:
+            photograph = texels.look_up_environment(
+                padded, photograph_directions.reshape(-1, 3)
+            )
             ground = far_ground * photograph.reshape(*texels.BLURRED_SHAPE, 3)
         return torch.where(is_hidden[..., None], ground, surroundings)
 
-    def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
-        """Return the reflectance (n, 3) of all texels for even light."""
+    def _compute_reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
+        """Return the reflectance (n, 3) of all texels for even light.
+
+        That is the base color times the diffuse fraction, plus the gloss.
+        """
         n_rows, n_columns = self.texels.grids[0].shape
         fine = self.upsample(color).reshape(*self.fine_shape, 3).permute(2, 0, 1)[None]
         pooled = functional.adaptive_avg_pool2d(fine, (n_rows, n_columns))[0]
@@ -472,30 +525,38 @@ class Arrangement:
         object_cells = torch.from_numpy(self.texels.cells[self.texels.select_grid(0)])
         colors = [pooled[object_cells]] * self.n_sides
         if self._has_ground:
-            colors.append(self._ground_color(padded))
+            colors.append(self._compute_ground_color(padded))
         reflectances = []
         for surface_color, surface in zip(colors, self.lobes, strict=True):
             diffuse, gloss = torch.tensor(surface.mean_reflectances)
             reflectances.append(surface_color * diffuse + gloss)
         return torch.cat(reflectances)
 
-    def _ground_color(self, padded: Tensor) -> Tensor:
-        """Return the base color (n, 3) of the ground's texels."""
+    def _compute_ground_color(self, padded: Tensor) -> Tensor:
+        """Return the base color (n, 3) of the ground's texels.
+
+        A photographed one has that which shows the photograph under the open sky.
+        """
         ground = self.texels.positions[self.texels.select_grid(self.n_sides)]
-        if self._photographed is None:
+        if self._capture_height is None:
             srgb = torch.tensor(self._scene.definition[0].ground_color)
             return srgb_to_linear(srgb).expand(len(ground), 3)
-        camera = torch.tensor([0.0, 0.0, self._photographed])
-        directions = (torch.from_numpy(ground) - camera) @ self.world_to_map.T
+        capture_position = torch.tensor([0.0, 0.0, self._capture_height])
+        directions = (torch.from_numpy(ground) - capture_position) @ self.world_to_map.T
         photograph = texels.look_up_environment(padded, directions)
-        full_light = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
-        return (photograph * math.pi / full_light).clamp_max(MAX_GROUND_REFLECTANCE)
+        open_irradiance = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+        return (photograph * math.pi / open_irradiance).clamp_max(
+            MAX_GROUND_REFLECTANCE
+        )
 
 
 def _make_upsampling_matrix(
     texture: tuple[int, int], fine: tuple[int, int]
 ) -> scipy.sparse.csr_matrix:
-    """Return the matrix from the texels of a small texture to the fine grid."""
+    """Return the matrix from the texels of a small texture to the fine grid.
+
+    Bilinear, so that each row has four entries.
+    """
     n_rows, n_columns = fine
     y, x = np.meshgrid(
         (np.arange(n_rows) + 0.5) / n_rows,

@@ -61,10 +61,10 @@ class MapFingerprint:
     @classmethod
     def compute(cls, padded: Tensor) -> MapFingerprint:
         """Return the fingerprint of a map (H, W + 2, 3)."""
-        flat = padded.reshape(-1, 3)
-        mean = flat.mean(dim=0)
-        step = max(1, len(flat) // N_COMPARED_TEXELS)
-        return cls(mean, flat[::step] / mean.clamp_min(1e-12))
+        texels = padded.reshape(-1, 3)
+        mean = texels.mean(dim=0)
+        stride = max(1, len(texels) // N_COMPARED_TEXELS)
+        return cls(mean, texels[::stride] / mean.clamp_min(1e-12))
 
     def find_factor(self, other: MapFingerprint) -> Tensor | None:
         """Return how many times as bright (3,) another map is.
@@ -104,6 +104,7 @@ class SurfaceRenderer(Predictor):
     n_traced_images = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
+        """Fix everything as it is at u but cameras, environment and base color."""
         super().__init__(traced)
         self.n_dropped = 0
         self.stored_lights: dict[MapFingerprint, ArrangementLight] = {}
@@ -161,10 +162,16 @@ class SurfaceRenderer(Predictor):
 
     @property
     def n_entries(self) -> int:
+        """Number of entries of the arrangement's matrices."""
         return self.arrangement.entries
 
     @property
     def n_bytes(self) -> int:
+        """Memory of the arrangement and the stored lights.
+
+        With a fixed light only that counts, since the arrangement is another renderer's
+        too.
+        """
         if self.fixed_light is not None:  # the rest is shared
             return self.fixed_light.bytes
         lights = sum(light.bytes for light in self.stored_lights.values())
@@ -181,17 +188,17 @@ class SurfaceRenderer(Predictor):
         """Return the light under the environment of scene inputs, and its factor (3,).
 
         Exposures and tints of one map have one light. It is computed on first use, and
-        up to `MAX_BYTES` of lights are stored.
+        up to `MAX_BYTES` of lights are stored: the oldest go first.
         """
-        sketch = MapFingerprint.compute(
+        fingerprint = MapFingerprint.compute(
             inputs.get(ENVIRONMENT_INPUT, self._base[ENVIRONMENT_INPUT]).detach()
         )
-        for stored_sketch, light in self.stored_lights.items():
-            factor = stored_sketch.find_factor(sketch)
+        for stored_fingerprint, light in self.stored_lights.items():
+            factor = stored_fingerprint.find_factor(fingerprint)
             if factor is not None:
                 return light, factor
         light = self.compute_light(inputs)
-        self.stored_lights[sketch] = light
+        self.stored_lights[fingerprint] = light
         while len(self.stored_lights) > 1 and self.n_bytes > scale_limit(MAX_BYTES):
             oldest = next(iter(self.stored_lights))
             self.stored_lights.pop(oldest)
@@ -214,31 +221,33 @@ class SurfaceRenderer(Predictor):
     def trace_views(
         self, inputs: Sequence[Mapping[str, Tensor]]
     ) -> Iterator[LitCameraView]:
-        """Yield what the cameras of scene inputs see.
+        """Yield what the cameras of scene inputs see, environment by environment.
 
         Those under one environment are traced in one launch, while the results of the
         launch before are used.
         """
         lights = [self._choose_light(camera_inputs) for camera_inputs in inputs]
         cameras_of_light: dict[ArrangementLight, list[int]] = {}
-        for number, (light, _) in enumerate(lights):
-            cameras_of_light.setdefault(light, []).append(number)
+        for camera_index, (light, _) in enumerate(lights):
+            cameras_of_light.setdefault(light, []).append(camera_index)
         cameras = [
             self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
         ]
         launches = (
             self.arrangement.start_tracing(
-                [cameras[number] for number in numbers], light
+                [cameras[camera_index] for camera_index in camera_indices], light
             )
-            for light, numbers in cameras_of_light.items()
+            for light, camera_indices in cameras_of_light.items()
         )
-        running = next(launches)
-        for light, numbers in cameras_of_light.items():
-            samples = running()
-            running = next(launches, running)
-            for index, number in enumerate(numbers):
+        finish_launch = next(launches)
+        for light, camera_indices in cameras_of_light.items():
+            samples = finish_launch()
+            # The next launch runs while these samples are used; the last has none after
+            # it.
+            finish_launch = next(launches, finish_launch)
+            for index, camera_index in enumerate(camera_indices):
                 view = self.arrangement.make_view(samples, index)
-                yield LitCameraView(number, view, light, lights[number][1])
+                yield LitCameraView(camera_index, view, light, lights[camera_index][1])
 
     def compose_images(
         self,
@@ -259,26 +268,31 @@ class SurfaceRenderer(Predictor):
         fine = self.arrangement.upsample(color)
         reflected = dict[ArrangementLight, Tensor]()
         images = dict[int, Tensor]()
-        for look in views:
-            if look.light not in reflected:
-                reflected[look.light] = look.light.compute_reflected(fine)
-            radiance = look.view.compute_radiance(reflected[look.light]) * look.factor
-            images[look.camera_index] = self.path_renderer.finish_image(
-                radiance,
-                inputs[look.camera_index],
-                full_configurations[look.camera_index],
+        for lit_view in views:
+            if lit_view.light not in reflected:
+                reflected[lit_view.light] = lit_view.light.compute_reflected(fine)
+            radiance = (
+                lit_view.view.compute_radiance(reflected[lit_view.light])
+                * lit_view.factor
             )
-        return torch.stack([images[number] for number in range(len(inputs))])
+            images[lit_view.camera_index] = self.path_renderer.finish_image(
+                radiance,
+                inputs[lit_view.camera_index],
+                full_configurations[lit_view.camera_index],
+            )
+        return torch.stack(
+            [images[camera_index] for camera_index in range(len(inputs))]
+        )
 
     def predict_images(self, us: Sequence[Tensor]) -> list[Tensor]:
         """Return images of configurations that differ in camera and environment alone.
 
-        Many are made in one launch.
+        `batch_size` of them are made in one launch.
         """
         images = list[Tensor]()
         with torch.no_grad():
-            for begin in range(0, len(us), self.batch_size):
-                batch = us[begin : begin + self.batch_size]
+            for start in range(0, len(us), self.batch_size):
+                batch = us[start : start + self.batch_size]
                 inputs = [self.compute_inputs(u) for u in batch]
                 images += self.compose_images(
                     self.trace_views(inputs), inputs, self.base_color, batch
@@ -286,10 +300,12 @@ class SurfaceRenderer(Predictor):
         return images
 
     def predict_radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        (look,) = self.trace_views([inputs])
+        """Return the radiance (H, W, 3) of scene inputs, with their own base color."""
+        (lit_view,) = self.trace_views([inputs])
         fine = self.arrangement.upsample(self.get_color(inputs))
         return (
-            look.view.compute_radiance(look.light.compute_reflected(fine)) * look.factor
+            lit_view.view.compute_radiance(lit_view.light.compute_reflected(fine))
+            * lit_view.factor
         )
 
 
@@ -345,18 +361,20 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
 def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     """Return the names of the scene inputs that some controls change.
 
-    `varying` has the names of controls, or of groups of coordinates.
+    Their coordinates are set to some fractions of their ranges, all at once, and the
+    inputs compared with those at the start. `varying` has the names of controls, or of
+    groups of coordinates.
     """
     changed: set[str] = set()
     with torch.no_grad():
-        start = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-        for value in PROBE_FRACTIONS:
+        start_inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
+        for fraction in PROBE_FRACTIONS:
             u = renderer.start.clone()
             for group in renderer.space.groups:
                 if group.control in varying or group.name in varying:
-                    u[group.coordinates] = value
+                    u[group.coordinates] = fraction
             inputs = renderer.scene.assembly(renderer.space.inputs(u))
-            for name in start.keys() | inputs.keys():
-                if inputs_differ(start.get(name), inputs.get(name)):
+            for name in start_inputs.keys() | inputs.keys():
+                if inputs_differ(start_inputs.get(name), inputs.get(name)):
                     changed.add(name)
     return frozenset(changed)

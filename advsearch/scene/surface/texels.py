@@ -67,25 +67,28 @@ class LitTexels:
 
 
 def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
-    """Join the texels of several surfaces, each with one grid."""
-    first_texels = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
-    first_cells = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
+    """Join the texels of several surfaces, each with one grid.
+
+    Cells and texels are numbered on from one surface to the next.
+    """
+    texel_bounds = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
+    cell_bounds = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
     grids = []
     cells = []
     texel_of_cell = []
-    for texels, first_texel, first_cell in zip(
-        surfaces, first_texels[:-1], first_cells[:-1], strict=True
+    for texels, texel_offset, cell_offset in zip(
+        surfaces, texel_bounds[:-1], cell_bounds[:-1], strict=True
     ):
-        grids.append(replace(texels.grids[0], first_cell=int(first_cell)))
-        cells.append(texels.cells + first_cell)
-        texel_of_cell.append(texels.texel_of_cell + first_texel)
+        grids.append(replace(texels.grids[0], first_cell=int(cell_offset)))
+        cells.append(texels.cells + cell_offset)
+        texel_of_cell.append(texels.texel_of_cell + texel_offset)
     return LitTexels(
         grids=tuple(grids),
         positions=np.concatenate([texels.positions for texels in surfaces]),
         normals=np.concatenate([texels.normals for texels in surfaces]),
         cells=np.concatenate(cells),
         texel_of_cell=np.concatenate(texel_of_cell),
-        first_texels=tuple(int(first_texel) for first_texel in first_texels),
+        first_texels=tuple(int(texel_offset) for texel_offset in texel_bounds),
     )
 
 
@@ -105,10 +108,11 @@ def make_mesh_texels(
         side: of its faces, as `TexelGrid` has it.
     """
     position, normal = _interpolate(charts, vertices, normals)
+    # right in cells that are covered: texels have the order of these
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
     rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(
-        grids=(TexelGrid(name, 0, charts.is_covered.shape, None, side),),
+        grids=(TexelGrid(name, 0, charts.is_covered.shape, warp=None, side=side),),
         positions=position[rows, columns],
         normals=normal[rows, columns],
         cells=np.flatnonzero(charts.is_covered),
@@ -129,11 +133,12 @@ def make_ground_texels(
         center: x and y of the object's center.
     """
     reach = min(reach, MAX_GROUND_REACH)
+    # so that the texels at the center are `MIN_TEXEL_WIDTH` wide
     rate = _find_warp_rate(reach / (MIN_TEXEL_WIDTH * GROUND_TEXELS / 2.0))
     scale = reach / math.sinh(rate)
-    position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
-    offset = scale * np.sinh(rate * position)
-    y, x = np.meshgrid(offset + center[1], offset + center[0], indexing="ij")
+    axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
+    axis_offset = scale * np.sinh(rate * axis_position)
+    y, x = np.meshgrid(axis_offset + center[1], axis_offset + center[0], indexing="ij")
     positions = np.stack([x, y, np.full_like(x, height)], axis=-1)
     positions = positions.reshape(-1, 3).astype(np.float32)
     up = np.array([0.0, 0.0, 1.0], dtype=np.float32)
@@ -143,12 +148,12 @@ def make_ground_texels(
     )
     cells = np.arange(GROUND_TEXELS * GROUND_TEXELS)
     return LitTexels(
-        (grid,),
-        np.asarray(positions, np.float32),
-        normals,
-        cells,
-        cells,
-        (0, GROUND_TEXELS * GROUND_TEXELS),
+        grids=(grid,),
+        positions=np.asarray(positions, np.float32),
+        normals=normals,
+        cells=cells,  # every cell is a texel
+        texel_of_cell=cells,
+        first_texels=(0, GROUND_TEXELS * GROUND_TEXELS),
     )
 
 
@@ -160,11 +165,11 @@ def _find_warp_rate(ratio: float) -> float:
     lower = 1e-3
     upper = 20.0
     for _ in range(60):
-        middle = 0.5 * (lower + upper)
-        if math.sinh(middle) / middle < ratio:
-            lower = middle
+        rate = 0.5 * (lower + upper)
+        if math.sinh(rate) / rate < ratio:
+            lower = rate
         else:
-            upper = middle
+            upper = rate
     return lower
 
 
@@ -193,10 +198,8 @@ def _weigh_neighbours(
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
-    texel_of_position = (
-        np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
-    )
-    texel_of_position = np.where(charts.is_covered, texel_of_position, -1)
+    texel_at = np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
+    texel_at = np.where(charts.is_covered, texel_at, -1)
 
     def weigh(row: IntArray, column: IntArray, texel: IntArray) -> Float64Array:
         """Return the weights (N,) of the neighbours at rows and columns."""
@@ -214,7 +217,7 @@ def _weigh_neighbours(
     for row, column in _iter_neighbourhood(y, x):
         inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
         clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
-        texel = np.where(inside, texel_of_position[clipped], -1)
+        texel = np.where(inside, texel_at[clipped], -1)
         neighbours.append(texel)
         weights.append(weigh(row, column, texel))
     return np.stack(neighbours, axis=1), np.stack(weights, axis=1)
@@ -227,19 +230,20 @@ def _use_nearest_texel(
     texel_index: IntArray,
     weights: Float64Array,
 ) -> None:
-    """Give the nearest texel all the weight where no neighbour counts, in place.
+    """Give the nearest texel all the weight where no neighbour counts.
 
-    Arguments are those and the results of `_weigh_neighbours`.
+    `texel_index` and `weights` are changed in place, in their first column. Arguments
+    are those and the results of `_weigh_neighbours`.
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
-    lost = weights.sum(axis=1) < 1e-6
-    nearest_row = np.round(y[lost]).astype(int).clip(0, n_rows - 1)
-    nearest_column = np.round(x[lost]).astype(int).clip(0, n_columns - 1)
-    texel_index[lost, 0] = texels.texel_of_cell[
+    is_unweighted = weights.sum(axis=1) < 1e-6
+    nearest_row = np.round(y[is_unweighted]).astype(int).clip(0, n_rows - 1)
+    nearest_column = np.round(x[is_unweighted]).astype(int).clip(0, n_columns - 1)
+    texel_index[is_unweighted, 0] = texels.texel_of_cell[
         nearest_row * n_columns + nearest_column
     ]
-    weights[lost, 0] = 1.0
+    weights[is_unweighted, 0] = 1.0
 
 
 def make_lookup_matrix(
@@ -266,21 +270,28 @@ def make_lookup_matrix(
     Returns:
         Sparse, (cells of the finer grid, texels of the first surface).
     """
-    buried = buried & ~buried.all()
+    buried = buried & ~buried.all()  # if all are buried, none counts as such
     fine_charts = rasterize_charts(charts.mesh, shape)
     position, normal = _interpolate(fine_charts, vertices, normals)
     rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
     points = position[rows, columns]
     point_normals = normal[rows, columns]
-    texel_width = _texel_width(charts, vertices)
+    texel_width = _compute_texel_width(charts, vertices)
     n_rows, n_columns = charts.is_covered.shape
+    # centers of the finer cells in the grid of the charts
     grid_position = (
         (rows + 0.5) * n_rows / shape[0] - 0.5,
         (columns + 0.5) * n_columns / shape[1] - 0.5,
     )
 
     texel_index, weights = _weigh_neighbours(
-        texels, charts, grid_position, points, point_normals, texel_width, buried
+        texels,
+        charts,
+        grid_position=grid_position,
+        points=points,
+        normals=point_normals,
+        texel_width=texel_width,
+        buried=buried,
     )
     _use_nearest_texel(texels, charts, grid_position, texel_index, weights)
     weights /= weights.sum(axis=1, keepdims=True)
@@ -297,6 +308,8 @@ def _make_sparse(
 ) -> Tensor:
     """Return a sparse matrix of weights (N, neighbours) that are not negligible.
 
+    Weights of 0.001 and less are left out.
+
     Args:
         fine_cell: (N,) rows of the matrix.
         texel_index: (N, neighbours) its columns.
@@ -309,8 +322,12 @@ def _make_sparse(
     return to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
 
 
-def _texel_width(charts: Charts, vertices: Float32Array) -> float:
-    """Return the mean width of a texel in world space, for vertices (V, 3) there."""
+def _compute_texel_width(charts: Charts, vertices: Float32Array) -> float:
+    """Return the mean width of a texel in world space, for vertices (V, 3) there.
+
+    The mesh is scaled evenly to the world, so that the ratio of extents is that of
+    widths.
+    """
     extent = float(np.ptp(charts.mesh.vertices, axis=0).max())
     scale = np.ptp(vertices, axis=0).max() / max(extent, 1e-12)
     area = float(charts.compute_areas()[charts.is_covered].mean()) * float(scale) ** 2
@@ -332,7 +349,8 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     """Return the matrix that smooths the light of a ground, by 5 x 5 binomial weights.
 
     Texels that see nothing of the sky lie under something. What is next to it is not
-    mixed with their darkness.
+    mixed with their darkness: they have the smoothed light of the nearest texel that
+    sees some.
 
     Args:
         ground: the texels of a ground.
@@ -343,17 +361,17 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     """
     width = ground.grids[0].shape[0]
     is_used = (sees_sky if sees_sky.any() else ~sees_sky).reshape(width, width)
-    source = _find_nearest(is_used)
-    band = scipy.sparse.diags_array(
+    nearest_used = _find_nearest(is_used)
+    axis_weights = scipy.sparse.diags_array(
         BINOMIAL, offsets=range(-2, 3), shape=(width, width), dtype=np.float64
     )
     weights = scipy.sparse.csr_array(
-        scipy.sparse.kron(band, band)
+        scipy.sparse.kron(axis_weights, axis_weights)
         @ scipy.sparse.diags_array(is_used.ravel().astype(float))
     )
     row_sums = np.repeat(weights.sum(axis=1), np.diff(weights.indptr))
     weights.data /= np.maximum(row_sums, 1e-12)
-    return to_torch_csr(weights.astype(np.float32)[source])
+    return to_torch_csr(weights.astype(np.float32)[nearest_used])
 
 
 def _interpolate(
@@ -419,7 +437,12 @@ class SkyLight:
 
 
 def prepare_sky(padded: Tensor) -> SkyLight:
-    """Prepare an environment's map (H, W + 2, 3) for look-ups."""
+    """Prepare an environment's map (H, W + 2, 3) for look-ups.
+
+    What is brighter than `HOT_FACTOR` times the mean is hot: that excess gets rays of
+    its own, and the rest stays in the cells. If it has no more than `MIN_HOT_FRACTION`
+    of the light, nothing is hot. The map for gloss has all light.
+    """
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, n_rows)
@@ -427,20 +450,22 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE_WEIGHTS
-    mean = float((luminance * sine).sum() / sine.sum())
-    hot_fraction = (1.0 - HOT_FACTOR * mean / luminance.clamp_min(1e-12)).clamp_min(0.0)
+    mean_luminance = float((luminance * sine).sum() / sine.sum())
+    hot_fraction = (
+        1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
+    ).clamp_min(0.0)
     hot_power = hot_fraction * luminance * sine
-    if float(hot_power.sum()) > MIN_HOT_FRACTION * mean * float(sine.sum()):
+    if float(hot_power.sum()) > MIN_HOT_FRACTION * mean_luminance * float(sine.sum()):
         hot = _sample_hot(radiance * hot_fraction[..., None], hot_power)
-        even = radiance * (1.0 - hot_fraction[..., None])
+        remaining = radiance * (1.0 - hot_fraction[..., None])
     else:
         hot = (torch.zeros(0, 3), torch.zeros(0, 3))
-        even = radiance
+        remaining = radiance
     return SkyLight(
-        padded,
-        _pool(even, sine, SKY_SHAPE).reshape(-1, 3),
-        _pool(radiance, sine, BLURRED_SHAPE),
-        hot,
+        padded=padded,
+        cells=_average_cells(remaining, sine, SKY_SHAPE).reshape(-1, 3),
+        map=_average_cells(radiance, sine, BLURRED_SHAPE),
+        hot=hot,
     )
 
 
@@ -461,6 +486,7 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     n_rows, n_columns = power.shape
     cumulative = torch.cumsum(power.double().reshape(-1), 0)
     index = torch.arange(HOT_RAYS, dtype=torch.float64)
+    # Texels evenly by their power: a texel with half of it has half of the rays.
     texel = torch.searchsorted(
         cumulative, (index + 0.5) / HOT_RAYS * cumulative[-1]
     ).clamp_max(power.numel() - 1)
@@ -482,7 +508,7 @@ def _normalize_luminance(color: Tensor) -> Tensor:
 
 
 def _to_tent(uniform: Tensor) -> Tensor:
-    """Map numbers in [0, 1] to [-1, 1] with the density of a tent."""
+    """Map numbers in [0, 1] to [-1, 1] with the density of a tent (inverse CDF)."""
     return torch.where(
         uniform < 0.5,
         (2.0 * uniform).sqrt() - 1.0,
@@ -491,14 +517,21 @@ def _to_tent(uniform: Tensor) -> Tensor:
 
 
 def _to_direction(polar: Tensor, azimuth: Tensor, dim: int) -> Tensor:
-    """Return unit directions in the axes of the environment's map."""
+    """Return unit directions in the axes of the environment's map.
+
+    `polar` is the angle from straight up; the axes are stacked as dimension `dim`.
+    """
     x = polar.sin() * azimuth.sin()
     z = -polar.sin() * azimuth.cos()
     return torch.stack([x, polar.cos(), z], dim=dim)
 
 
-def _pool(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return mean radiance by solid angle in the cells of a coarser map."""
+def _average_cells(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return mean radiance by solid angle in the cells of a coarser map.
+
+    Radiance is (H, W, 3), the solid angles (H, W); the result is (*size, 3).
+    """
+    # The solid angles are pooled as a fourth channel.
     weighted = torch.cat([radiance * sine[..., None], sine[..., None]], dim=-1)
     pooled = functional.adaptive_avg_pool2d(weighted.permute(2, 0, 1)[None], size)
     pooled = pooled[0].permute(1, 2, 0)
@@ -508,8 +541,9 @@ def _pool(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
 def blur_map(radiance: Tensor) -> Tensor:
     """Blur a map (h, w, 3) by each of `BLUR_WIDTHS`.
 
-    They are root mean squares over both directions. Rows and columns are blurred one
-    after the other, more along rows towards the poles.
+    They are root mean squares over both directions. Columns are blurred by a Gaussian
+    over the polar angle, then rows, which go round, in the frequency domain: more
+    towards the poles, where a row is short.
 
     Returns:
         (widths, h, w, 3).
@@ -518,18 +552,18 @@ def blur_map(radiance: Tensor) -> Tensor:
     polar = (torch.arange(n_rows) + 0.5) * math.pi / n_rows
     frequency = torch.arange(n_columns // 2 + 1)
     maps = []
-    for width in BLUR_WIDTHS:
-        sigma = width / math.sqrt(2.0)
-        squared = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
-        across_rows = torch.exp(-squared) * polar.sin()[None, :]
-        across_rows = across_rows / across_rows.sum(dim=1, keepdim=True)
-        along_rows = torch.exp(
+    for blur_width in BLUR_WIDTHS:
+        sigma = blur_width / math.sqrt(2.0)
+        exponent = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
+        column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
+        column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
+        row_filter = torch.exp(
             -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
         )
-        rows_blurred = across_rows @ radiance.reshape(n_rows, -1)
-        spectrum = torch.fft.rfft(rows_blurred.reshape(n_rows, n_columns, 3), dim=1)
+        column_blurred = column_kernel @ radiance.reshape(n_rows, -1)
+        spectrum = torch.fft.rfft(column_blurred.reshape(n_rows, n_columns, 3), dim=1)
         maps.append(
-            torch.fft.irfft(spectrum * along_rows[..., None], n=n_columns, dim=1)
+            torch.fft.irfft(spectrum * row_filter[..., None], n=n_columns, dim=1)
         )
     return torch.stack(maps).clamp_min(0.0)
 
@@ -565,10 +599,10 @@ def compute_irradiance(
     from_sky = sky_view @ sky.cells
     if direct is not None:
         from_sky = from_sky + direct @ sky.hot[1]
-    arriving = from_sky
+    irradiance = from_sky
     for _ in range(bounces):
-        arriving = from_sky + texel_view @ (reflectance * arriving / math.pi)
-    return arriving
+        irradiance = from_sky + texel_view @ (reflectance * irradiance / math.pi)
+    return irradiance
 
 
 def make_view_matrices(
@@ -590,6 +624,7 @@ def make_view_matrices(
     def make_matrix(
         mask: BoolArray, column: npt.NDArray[np.integer[Any]], width: int
     ) -> Tensor:
+        """Return a matrix in which each ray of a mask counts pi / n_rays."""
         values = np.full(len(column), math.pi / n_rays, dtype=np.float32)
         entries = (values, (row[mask], column))
         return to_torch_csr(scipy.sparse.coo_matrix(entries, (count, width)).tocsr())

@@ -101,29 +101,30 @@ class Lighting:
 def find_lighting(renderer: Renderer) -> Lighting:
     """Find the groups of coordinates that change nothing but light and finished images.
 
-    The inputs of configurations are compared, so that it holds for whatever sets them.
-    A light that is no input would be in every basis image: if there is one, only groups
-    that change the finished image are returned.
+    The inputs of configurations are compared, so that it holds for whatever sets them:
+    each group is varied alone, the others staying in the middle between the start and
+    the center of the unit cube. A light that is no input would be in every basis image:
+    if there is one, only groups that change the finished image are returned.
     """
-    middle = 0.5 * renderer.start + 0.25
+    reference = 0.5 * renderer.start + 0.25
     groups = {}
-    harmonic = set()
-    bright = []
+    harmonic_groups = set()
+    brightest_values = []
     with torch.no_grad():
-        base_inputs = renderer.scene.assembly(renderer.space.inputs(middle))
+        base_inputs = renderer.scene.assembly(renderer.space.inputs(reference))
         for group in renderer.space.groups:
-            effect = _measure_effect(renderer, group, middle, base_inputs)
+            effect = _measure_effect(renderer, group, reference, base_inputs)
             if effect is None:
                 continue
             if not effect.changed <= IMAGE_INPUTS and has_fixed_lights(renderer):
                 continue
             groups[group.name] = effect.changed
             if effect.is_harmonic:
-                harmonic.add(group.name)
+                harmonic_groups.add(group.name)
             elif ENVIRONMENT_INPUT in effect.changed:
                 brightest = effect.brightest[group.coordinates]
-                bright.append((group.coordinates, brightest))
-    return Lighting(groups, frozenset(harmonic), tuple(bright))
+                brightest_values.append((group.coordinates, brightest))
+    return Lighting(groups, frozenset(harmonic_groups), tuple(brightest_values))
 
 
 class _Effect(NamedTuple):
@@ -135,18 +136,18 @@ class _Effect(NamedTuple):
 
 
 def _measure_effect(
-    renderer: Renderer, group: Group, middle: Tensor, base_inputs: Inputs
+    renderer: Renderer, group: Group, reference: Tensor, base_inputs: Inputs
 ) -> _Effect | None:
     """Return what a group changes; None if that is more than light.
 
-    `base_inputs` are those of the configuration `middle`, with which others are
+    `base_inputs` are those of the configuration `reference`, with which others are
     compared.
     """
     changed: set[str] = set()
     is_harmonic = False
     max_power = -1.0
-    brightest = middle
-    for configuration in _sample_configurations(group, middle):
+    brightest = reference
+    for configuration in _sample_configurations(group, reference):
         inputs = renderer.scene.assembly(renderer.space.inputs(configuration))
         for name in base_inputs.keys() | inputs.keys():
             change = _find_change(
@@ -166,21 +167,25 @@ def _measure_effect(
     return _Effect(frozenset(changed), is_harmonic, brightest)
 
 
-def _sample_configurations(group: Group, middle: Tensor) -> Iterator[Tensor]:
-    """Yield configurations in which a group has several values, and others
-    `middle`'s.
+def _sample_configurations(group: Group, reference: Tensor) -> Iterator[Tensor]:
+    """Yield configurations in which a group has several values, and others those of
+    `reference`.
+
+    All coordinates of the group have the same value: some fractions of its range, or
+    the options of a choice, of which at most `MAX_OPTIONS` are taken, evenly. A group
+    of several coordinates has a random point as well.
     """
     fractions = list(PROBE_FRACTIONS)
     if group.options:
-        step = -(-group.options // MAX_OPTIONS)
-        options = range(0, group.options, step)
+        stride = -(-group.options // MAX_OPTIONS)
+        options = range(0, group.options, stride)
         fractions = [(option + 0.5) / group.options for option in options]
     values = [torch.full((group.size,), fraction) for fraction in fractions]
     if group.size > 1:
         generator = torch.Generator().manual_seed(0)
         values.append(torch.rand(group.size, generator=generator))
     for group_values in values:
-        configuration = middle.clone()
+        configuration = reference.clone()
         configuration[group.coordinates] = group_values
         yield configuration
 
@@ -197,7 +202,12 @@ class _Change(Enum):
 def _find_change(
     name: str, before: Tensor | None, after: Tensor | None, n_coordinates: int
 ) -> _Change:
-    """Return how a group of coordinates changes an input."""
+    """Return how a group of coordinates changes an input.
+
+    A map of the environment is compared with multiples of itself, then with those of
+    spherical harmonics too; any other input may only be the light of a lamp, or one of
+    the finished image.
+    """
     if before is None or after is None:
         return _Change.OTHER
     if not inputs_differ(before, after):
@@ -210,31 +220,41 @@ def _find_change(
         return _Change.POWER
     if n_coordinates == 1:  # one number adds no harmonics of a choice
         return _Change.OTHER
-    basis = torch.cat([before[None], _make_harmonic_maps(before)])
+    harmonic_basis = torch.cat([before[None], _make_harmonic_maps(before)])
     # rejects most other changes in a tenth of the time
     if not _is_explained(
-        basis[:, ::COARSE_STEP, ::COARSE_STEP], after[::COARSE_STEP, ::COARSE_STEP]
+        harmonic_basis[:, ::COARSE_STEP, ::COARSE_STEP],
+        after[::COARSE_STEP, ::COARSE_STEP],
     ):
         return _Change.OTHER
-    return _Change.HARMONICS if _is_explained(basis, after) else _Change.OTHER
+    return _Change.HARMONICS if _is_explained(harmonic_basis, after) else _Change.OTHER
 
 
 def _is_explained(basis: Tensor, target: Tensor) -> bool:
-    """Return whether a map is a sum of basis maps, where it and the first are lit."""
+    """Return whether a map (H, W, 3) is a sum of basis maps (k, H, W, 3).
+
+    Only texels count where it and the first basis map are lit: what is added may be cut
+    off at zero elsewhere.
+    """
     is_lit = ((basis[0] > 0.0) & (target > 0.0)).to(torch.float32)
-    span = BasisMaps(basis * is_lit)
-    residual = target * is_lit - span.compose(span.fit_weights(target * is_lit))
+    basis_maps = BasisMaps(basis * is_lit)
+    residual = target * is_lit - basis_maps.compose(
+        basis_maps.fit_weights(target * is_lit)
+    )
     return float(residual.norm()) <= MAX_RELATIVE_DIFFERENCE * float(target.norm())
 
 
 def _make_harmonic_maps(like: Tensor) -> Tensor:
     """Return spherical harmonics of degrees 0 to 2 as maps (9, H, W, 3).
 
-    Each is lifted to at least zero by a multiple of the first. Size and mean are those
-    of the map `like`.
+    Each is lifted to at least zero by a multiple of the first, which is constant, since
+    light cannot be negative. Size and mean are those of the map `like`, with its copied
+    columns at both ends.
     """
     basis = compute_real_harmonics(like.shape[0], like.shape[1] - 2)
+    # (9, H, W): the last column before the first, and the first after the last
     padded = torch.cat([basis[:, -1:], basis, basis[:, :1]], dim=1).permute(2, 0, 1)
+    # The first is 1 everywhere, so that subtracting the minimum adds a multiple of it.
     lifted = padded - padded.amin(dim=(1, 2), keepdim=True).clamp_max(0.0)
     scaled = lifted * float(like.mean().clamp_min(1e-12))
     return scaled[..., None].expand(-1, -1, -1, 3).contiguous()
@@ -247,17 +267,18 @@ class BasisMaps:
     maps: Tensor  # (k, H, W, 3), all at least zero
 
     def fit_weights(self, target: Tensor) -> Tensor:
-        """Return the weights (k, 3) with which the maps come nearest to a map.
+        """Return the weights (k, 3) with which the maps come nearest to a map (H, W,
+        3).
 
-        That is (H, W, 3); the weights are differentiable.
+        With several maps it is the weighted least squares fit; a single map is taken
+        for proportional to the target. The weights are differentiable.
         """
-        flat = target.permute(2, 0, 1).reshape(3, -1, 1)
-        # It is a multiple of the only map, and the brightest texel of each channel has
-        # the factor.
+        flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)
+        # Exact and cheap: the factor of a channel, at the map's brightest texel.
         if len(self.maps) == 1:
             texel, brightness = self._brightest
-            return (flat[..., 0].gather(1, texel) / brightness.clamp_min(TINY)).T
-        weights: Tensor = (self._inverse @ flat)[..., 0].T
+            return (flat_target[..., 0].gather(1, texel) / brightness.clamp_min(TINY)).T
+        weights: Tensor = (self._inverse @ flat_target)[..., 0].T
         return weights
 
     def compose(self, weights: Tensor) -> Tensor:
@@ -269,8 +290,8 @@ class BasisMaps:
         """The brightest texel of the first map in each channel (3, 1), and its
         value.
         """
-        flat = self.maps[0].reshape(-1, 3)
-        return flat.argmax(dim=0)[:, None], flat.amax(dim=0)[:, None]
+        texels = self.maps[0].reshape(-1, 3)
+        return texels.argmax(dim=0)[:, None], texels.amax(dim=0)[:, None]
 
     @cached_property
     def _inverse(self) -> Tensor:
@@ -278,9 +299,9 @@ class BasisMaps:
         count, height, width, _ = self.maps.shape
         polar = (torch.arange(height) + 0.5) * torch.pi / height
         sine = torch.sin(polar)[:, None].expand(height, width).reshape(-1)
-        columns = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
-        weighted = columns * sine
-        gram = weighted @ columns.transpose(1, 2)
+        channel_maps = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
+        weighted = channel_maps * sine  # (3, k, H W)
+        gram = weighted @ channel_maps.transpose(1, 2)  # (3, k, k)
         inverse: Tensor = torch.linalg.pinv(gram) @ weighted
         return inverse.float()
 
@@ -297,10 +318,16 @@ class LightBasis:
         inputs: scene inputs whose map is the environment's first basis map.
 
     Attributes:
-        inputs_of_light: the inputs of each light, in which all others are dark.
+        inputs_of_light: the inputs of each light, in which all others are dark: first
+            that of all light that does not change, if there is any, and of projectors;
+            then each lamp that changes, at a radiance or intensity of one; then each
+            basis map of the environment. There is at least one, if a dark one.
     """
 
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
+        """Split the light of the inputs: what stays, lamps that change, the
+        environment.
+        """
         patterns = {
             name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
         }
@@ -311,23 +338,28 @@ class LightBasis:
             else renderer.scene.get_base_value(name)
             for name in sorted(names)
         }
+        # In the inputs of a light all others are dark.
         dark = {name: torch.zeros_like(value) for name, value in values.items()}
-        moved = lighting.changed_inputs
-        # light that does not change
-        still = {
+        changed_names = lighting.changed_inputs
+        fixed_values = {
             name: value
             for name, value in values.items()
-            if name in patterns or (name not in moved and bool((value > 0.0).any()))
+            if name in patterns
+            or (name not in changed_names and bool((value > 0.0).any()))
         }
-        self._lamps = sorted(moved & names - {ENVIRONMENT_INPUT})
-        changes_environment = ENVIRONMENT_INPUT in moved
-        self._still = bool(still) or not (self._lamps or changes_environment)
-        self.inputs_of_light: list[Inputs] = [{**dark, **still}] if self._still else []
+        self._lamps = sorted(changed_names & names - {ENVIRONMENT_INPUT})
+        changes_environment = ENVIRONMENT_INPUT in changed_names
+        self._has_fixed_light = bool(fixed_values) or not (
+            self._lamps or changes_environment
+        )
+        self.inputs_of_light: list[Inputs] = (
+            [{**dark, **fixed_values}] if self._has_fixed_light else []
+        )
         self.inputs_of_light += [{**dark, name: torch.ones(3)} for name in self._lamps]
-        self._span: BasisMaps | None = None
+        self._basis_maps: BasisMaps | None = None
         if changes_environment:
             maps = _make_basis_maps(renderer, lighting, values[ENVIRONMENT_INPUT])
-            self._span = BasisMaps(maps)
+            self._basis_maps = BasisMaps(maps)
             self.inputs_of_light += [
                 {**dark, ENVIRONMENT_INPUT: basis} for basis in maps
             ]
@@ -336,23 +368,26 @@ class LightBasis:
         """Return the weight (lights, 3) of each light in scene inputs;
         differentiable.
         """
-        weights = [torch.ones(1, 3)] if self._still else []
+        weights = [torch.ones(1, 3)] if self._has_fixed_light else []
         weights += [inputs[name].reshape(1, 3) for name in self._lamps]
-        if self._span is not None:
-            weights.append(self._span.fit_weights(inputs[ENVIRONMENT_INPUT]))
+        if self._basis_maps is not None:
+            weights.append(self._basis_maps.fit_weights(inputs[ENVIRONMENT_INPUT]))
         return torch.cat(weights)
 
 
 def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> Tensor:
-    """Return the environment's basis maps (k, H, W, 3), of which one is given."""
+    """Return the environment's basis maps (k, H, W, 3), the first of which is `first`.
+
+    The others are spherical harmonics, if some group adds them.
+    """
     if not lighting.harmonic_groups:
         return first[None]
     start_inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-    start = start_inputs[ENVIRONMENT_INPUT]
+    start_map = start_inputs[ENVIRONMENT_INPUT]
     # harmonics are added where the environment is not cut off at zero
     is_added = first > 0.0
-    if start.shape == first.shape:
-        is_added = is_added | (start <= 0.0)
+    if start_map.shape == first.shape:
+        is_added = is_added | (start_map <= 0.0)
     harmonics = _make_harmonic_maps(first) * is_added.to(torch.float32)
     return torch.cat([first[None], harmonics])
 
@@ -366,7 +401,7 @@ class BasisRenderer(Predictor):
     Args:
         traced, seed, tick: as for `LinearRenderer`.
         u: (d,) configuration; what does not change is as it is there.
-        moving: what changes; None finds it.
+        changing: what changes; None finds it.
     """
 
     def __init__(
@@ -378,6 +413,9 @@ class BasisRenderer(Predictor):
         *,
         changing: Lighting | None = None,
     ) -> None:
+        """Trace a basis image for each light, with the matrices of base colors under
+        it.
+        """
         super().__init__(traced)
         with torch.no_grad():
             changing = changing or find_lighting(traced)
@@ -400,7 +438,7 @@ class BasisRenderer(Predictor):
                         u,
                         noise_seed,
                         tick,
-                        names=base_colors if index else linear,
+                        names=linear if index == 0 else base_colors,
                         light=light_inputs,
                     )
                 )
@@ -408,20 +446,29 @@ class BasisRenderer(Predictor):
 
     @property
     def n_traced_images(self) -> int:
+        """Number of basis images, each traced with its matrices."""
         return len(self._renderers)
 
     @property
     def n_entries(self) -> int:
+        """Number of entries of all lights' matrices."""
         return sum(renderer.n_entries for renderer in self._renderers)
 
     @property
     def n_bytes(self) -> int:
+        """Memory of all lights' matrices and basis images."""
         return sum(renderer.n_bytes for renderer in self._renderers)
 
     def predict_radiance(self, inputs: Inputs) -> Tensor:
+        """Return radiance (H, W, 3), and coverage as a fourth channel if there is a
+        backdrop.
+
+        Coverage is the same under any light.
+        """
         images = [renderer.predict_radiance(inputs) for renderer in self._renderers]
         weights = self._lights.compute_weights(inputs)
         basis = torch.stack(images)[..., :3]
+        # l: lights, c: channels
         radiance = torch.einsum("lc,lhwc->hwc", weights, basis)
         return torch.cat([radiance, images[0][..., 3:]], dim=-1)
 
@@ -432,38 +479,46 @@ HAZE = Refusal("there is haze", RefusalCause.HAZE)
 def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal | None:
     """Return why images of a space cannot be predicted; None if they can.
 
+    A group that is searched may change the finished image, haze, light (if nothing
+    varies), or inputs to which radiance is linear, for which it needs the adjoint; and
+    at least one has to need a render. Haze and a missing denoiser are reasons only
+    where nothing else is.
+
     Args:
         renderer: of the space.
         varying: names of controls that vary. They are fixed for each matrix, whatever
             they change; if there are any, light may not change.
     """
-    linear = find_linear_inputs(renderer)
-    searched = [group for group in renderer.plan.groups if group.control not in varying]
-    lit = {} if varying else find_lighting(renderer).groups
+    linear_inputs = find_linear_inputs(renderer)
+    searched_groups = [
+        group for group in renderer.plan.groups if group.control not in varying
+    ]
+    light_groups = {} if varying else find_lighting(renderer).groups
     parts = renderer.scene.definition[0].parts
     haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
-    for group in searched:
+    for group in searched_groups:
         if group.is_forced and group.estimator not in ("none", "image"):
             return Refusal(f"the estimator of {group.name} is forced")
-        reached = renderer.routes.get(group.name, frozenset())
-        is_haze = bool(reached) and all(
-            name.startswith(haze_prefixes) for name in reached
+        changed_inputs = renderer.routes.get(group.name, frozenset())
+        is_haze = bool(changed_inputs) and all(
+            name.startswith(haze_prefixes) for name in changed_inputs
         )
-        if group.estimator == "image" or group.name in lit or is_haze:
+        if group.estimator == "image" or group.name in light_groups or is_haze:
             continue
-        if reached & find_light_inputs(renderer) and has_fixed_lights(renderer):
+        if changed_inputs & find_light_inputs(renderer) and has_fixed_lights(renderer):
             return Refusal(
                 f"{group.name} changes light, and the scene has other lights of its own"
             )
-        if group.estimator != "adjoint" or not reached <= linear:
+        if group.estimator != "adjoint" or not changed_inputs <= linear_inputs:
             allowed = "base colours" if varying else "base colours and light"
             return Refusal(f"{group.name} changes more than {allowed}")
     if not any(
-        renderer.routes.get(group.name) or lit.get(group.name) for group in searched
+        renderer.routes.get(group.name) or light_groups.get(group.name)
+        for group in searched_groups
     ):
         return Refusal("nothing that is searched needs a render to be differentiated")
     if renderer.scene.is_volumetric and not all(
-        group.name in lit for group in searched
+        group.name in light_groups for group in searched_groups
     ):
         return HAZE
     return None if renderer.formation.denoiser == "oidn" else NOISE
@@ -476,23 +531,27 @@ def make_predictor(
 
     Arguments as for `LinearRenderer`.
     """
-    moving = find_lighting(renderer)
-    if moving.changed_inputs:
-        return BasisRenderer(renderer, u, seed, tick, changing=moving)
+    lighting = find_lighting(renderer)
+    if lighting.changed_inputs:
+        return BasisRenderer(renderer, u, seed, tick, changing=lighting)
     return LinearRenderer(renderer, u, seed, tick)
 
 
 def count_lights(renderer: Renderer) -> int:
     """Return the number of lights that have a basis image; 1 where no light changes."""
-    moving = find_lighting(renderer)
-    if not moving.changed_inputs:
+    lighting = find_lighting(renderer)
+    if not lighting.changed_inputs:
         return 1
     inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-    return len(LightBasis(renderer, moving, inputs).inputs_of_light)
+    return len(LightBasis(renderer, lighting, inputs).inputs_of_light)
 
 
 def count_samples(renderer: Renderer) -> int:
-    """Return the samples per pixel that are traced before anything can be predicted."""
+    """Return the samples per pixel that are traced before anything can be predicted.
+
+    Each light has those of all its matrices, or those of its basis image if it has
+    none.
+    """
     inputs: set[str] = set()
     for group in renderer.plan.groups:
         inputs |= renderer.routes.get(group.name, frozenset())

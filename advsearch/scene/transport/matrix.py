@@ -56,9 +56,9 @@ class PackedImage:
     The numbers are multiples of its mean, so that the image may have any brightness.
 
     Args:
-        picture: the image.
-        small: unpack it at each call; otherwise it is unpacked once, for a search that
-            needs it in every step.
+        image: the image.
+        is_small: unpack it at each call; otherwise it is unpacked once, for a search
+            that needs it in every step.
     """
 
     def __init__(self, image: Tensor, is_small: bool = True) -> None:
@@ -95,10 +95,13 @@ class ColoredRows:
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
+        """Make an empty matrix."""
         self._shape = (rows, columns)
         self._small = small
         self.entries = 0
-        self._csr_pair: tuple[Tensor, Tensor] | None = None  # and its transpose
+        # the matrix of fractions and its transpose, after `finish`, if not small
+        self._csr_pair: tuple[Tensor, Tensor] | None = None
+        # the sum of all that was added, before `finish`
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         self._packed: _PackedRows | None = None
         has_small_columns = small and columns <= 1 << 16
@@ -133,19 +136,28 @@ class ColoredRows:
             rows: (n,) ascending.
             columns: (n, k) that take part in each; several may be the same.
             fractions: (n, k) fractions of the columns.
-            weights: (n, 3) colors.
+            weights: (n, 3) colors. Their mean weighs the fractions against those of
+                other entries of the row, and their sum is the row's color.
         """
         if not len(rows):
             return
-        row_starts = np.searchsorted(rows, np.arange(self._shape[0] + 1))
-        row_starts = row_starts * columns.shape[1]
-        values = (fractions * np.abs(weights).mean(axis=1, keepdims=True)).ravel()
-        added = scipy.sparse.csr_matrix(
-            (values, columns.ravel().astype(np.int32), row_starts.astype(np.int32)),
+        # Rows are ascending, so that entries are in the order of compressed rows
+        # already; each has k columns.
+        first_entries = np.searchsorted(rows, np.arange(self._shape[0] + 1))
+        first_entries = first_entries * columns.shape[1]
+        entry_weights = (
+            fractions * np.abs(weights).mean(axis=1, keepdims=True)
+        ).ravel()
+        added_matrix = scipy.sparse.csr_matrix(
+            (
+                entry_weights,
+                columns.ravel().astype(np.int32),
+                first_entries.astype(np.int32),
+            ),
             self._shape,
         )
-        added.sum_duplicates()
-        self._sum = self._sum + added if self._sum.nnz else added
+        added_matrix.sum_duplicates()
+        self._sum = self._sum + added_matrix if self._sum.nnz else added_matrix
         self.entries = int(self._sum.nnz)
         for channel in range(3):
             self._colors[:, channel] += np.bincount(
@@ -153,15 +165,17 @@ class ColoredRows:
             )
 
     def finish(self, image_shape: tuple[int, int], smooth: Smooth | None) -> None:
-        """Get ready to multiply.
+        """Get ready to multiply: scale rows to add up to one, and store them.
+
+        What `add` has collected is released; nothing may be added afterwards.
 
         Args:
             image_shape: height and width of the image whose pixels are the rows.
             smooth: removes the noise from the image of all rows' colors.
         """
-        sums = np.asarray(self._sum.sum(axis=1)).ravel()
-        factors = np.where(sums > 0.0, 1.0 / np.maximum(sums, 1e-30), 0.0)
-        fractions = self._sum.data * np.repeat(factors, np.diff(self._sum.indptr))
+        row_sums = np.asarray(self._sum.sum(axis=1)).ravel()
+        normalizers = np.where(row_sums > 0.0, 1.0 / np.maximum(row_sums, 1e-30), 0.0)
+        fractions = self._sum.data * np.repeat(normalizers, np.diff(self._sum.indptr))
         if self._small:
             self._packed = _PackedRows(
                 fractions.astype(np.float16),
@@ -211,8 +225,8 @@ class TextureTransport:
     It is filled by `add_pass`, and then `finish` is called once.
 
     Args:
-        picture: height and width of the radiance in pixels.
-        texture: height and width of the base color in texels.
+        image_shape: height and width of the radiance in pixels.
+        texture_shape: height and width of the base color in texels.
         small: take as little memory as there is room for one of many matrices.
     """
 
@@ -223,41 +237,53 @@ class TextureTransport:
         *,
         small: bool = False,
     ) -> None:
-        self._picture = image_shape
-        self._texture = texture_shape
-        self._cells = (
+        """Make empty matrices: from texels, and from cells of `CELL_SIZE` texels."""
+        self._image_shape = image_shape
+        self._texture_shape = texture_shape
+        # rounded up: the last cells of rows and columns may have fewer texels
+        self._cell_shape = (
             -(-texture_shape[0] // CELL_SIZE),
             -(-texture_shape[1] // CELL_SIZE),
         )
-        cell_heights = _cell_sizes(texture_shape[0], self._cells[0])
-        cell_widths = _cell_sizes(texture_shape[1], self._cells[1])
+        cell_heights = _compute_cell_sizes(texture_shape[0], self._cell_shape[0])
+        cell_widths = _compute_cell_sizes(texture_shape[1], self._cell_shape[1])
         self._texels_in_cell = (cell_heights[:, None] * cell_widths[None, :])[
             :, :, None
         ]
         n_pixels = image_shape[0] * image_shape[1]
-        self._first = ColoredRows(n_pixels, texture_shape[0] * texture_shape[1], small)
-        self._later = ColoredRows(n_pixels, self._cells[0] * self._cells[1], small)
+        n_texels = texture_shape[0] * texture_shape[1]
+        n_cells = self._cell_shape[0] * self._cell_shape[1]
+        # from texels that a pixel sees sharply; and from cells, by scattered light
+        self._sharp = ColoredRows(n_pixels, n_texels, small)
+        self._scattered = ColoredRows(n_pixels, n_cells, small)
 
     @property
     def entries(self) -> int:
-        return self._first.entries + self._later.entries
+        """Number of entries of both matrices."""
+        return self._sharp.entries + self._scattered.entries
 
     @property
     def bytes(self) -> int:
-        return self._first.bytes + self._later.bytes
+        """Memory of both matrices when they are finished."""
+        return self._sharp.bytes + self._scattered.bytes
 
     def add_pass(self, vertices: Sequence[Vertices], fraction: float) -> None:
         """Add a pass of paths.
+
+        A vertex that a pixel sees sharply counts for four texels, as a bilinear
+        look-up; another one for the cell that it lies in.
 
         Args:
             vertices: by their index in the path.
             fraction: the fraction of all samples that the pass has.
         """
-        n_rows, n_columns = self._cells
+        n_rows, n_columns = self._cell_shape
         for vertex in vertices:
             sharp = vertex.select(vertex.is_sharp)
-            texels, fractions = find_bilinear_weights(sharp.uv.numpy(), self._texture)
-            self._first.add(
+            texels, fractions = find_bilinear_weights(
+                sharp.uv.numpy(), self._texture_shape
+            )
+            self._sharp.add(
                 sharp.pixel.numpy(),
                 texels.astype(np.int64),
                 fractions,
@@ -269,7 +295,7 @@ class TextureTransport:
             row = np.floor(uv[:, 1] * n_rows).astype(np.int64)
             cell = row.clip(0, n_rows - 1) * n_columns + column.clip(0, n_columns - 1)
             cell = cell[:, None]
-            self._later.add(
+            self._scattered.add(
                 scattered.pixel.numpy(),
                 cell,
                 np.ones_like(cell, dtype=np.float32),
@@ -284,8 +310,8 @@ class TextureTransport:
                 texels change by one is such an image. None leaves the colors of the
                 rows as they were sampled.
         """
-        self._first.finish(self._picture, smooth)
-        self._later.finish(self._picture, smooth)
+        self._sharp.finish(self._image_shape, smooth)
+        self._scattered.finish(self._image_shape, smooth)
 
     def __call__(self, change: Tensor) -> Tensor:
         """Return the change of radiance (H, W, 3) for a change of the base color.
@@ -298,10 +324,14 @@ class TextureTransport:
         return radiance
 
     def multiply(self, change: Tensor) -> Tensor:
-        """Return J times (h, w, 3), as (H, W, 3)."""
-        n_rows, n_columns = self._cells
-        bottom = CELL_SIZE * n_rows - self._texture[0]
-        right = CELL_SIZE * n_columns - self._texture[1]
+        """Return J times a change of the base color (h, w, 3), as (H, W, 3).
+
+        A cell has the mean of its texels; the last cells of rows and columns may have
+        fewer.
+        """
+        n_rows, n_columns = self._cell_shape
+        bottom = CELL_SIZE * n_rows - self._texture_shape[0]
+        right = CELL_SIZE * n_columns - self._texture_shape[1]
         padded = change
         if right or bottom:
             padded = functional.pad(change, (0, 0, 0, right, 0, bottom))
@@ -309,24 +339,36 @@ class TextureTransport:
             dim=2
         )
         cell_sums = row_sums.reshape(n_rows, CELL_SIZE, n_columns, 3).sum(dim=1)
-        pooled = cell_sums / self._texels_in_cell
-        radiance = self._first.multiply(change.reshape(-1, 3)).add_(
-            self._later.multiply(pooled.reshape(-1, 3))
+        cell_means = cell_sums / self._texels_in_cell
+        radiance = self._sharp.multiply(change.reshape(-1, 3)).add_(
+            self._scattered.multiply(cell_means.reshape(-1, 3))
         )
-        return radiance.reshape(*self._picture, 3)
+        return radiance.reshape(*self._image_shape, 3)
 
     def multiply_transposed(self, cotangent: Tensor) -> Tensor:
-        """Return the transpose of J times (H, W, 3), as (h, w, 3)."""
-        flat = cotangent.reshape(-1, 3)
-        first = self._first.multiply_transposed(flat).reshape(*self._texture, 3)
-        later = self._later.multiply_transposed(flat).reshape(*self._cells, 3)
-        later = later / self._texels_in_cell
-        spread = later[:, None, :, None].expand(-1, CELL_SIZE, -1, CELL_SIZE, -1)
-        spread = spread.reshape(self._cells[0] * CELL_SIZE, -1, 3)
-        return first + spread[: self._texture[0], : self._texture[1]]
+        """Return the transpose of J times (H, W, 3), as (h, w, 3).
+
+        What a cell gets is spread evenly over its texels.
+        """
+        pixel_cotangent = cotangent.reshape(-1, 3)
+        texel_values = self._sharp.multiply_transposed(pixel_cotangent).reshape(
+            *self._texture_shape, 3
+        )
+        cell_values = self._scattered.multiply_transposed(pixel_cotangent).reshape(
+            *self._cell_shape, 3
+        )
+        cell_values = cell_values / self._texels_in_cell
+        spread_cells = cell_values[:, None, :, None].expand(
+            -1, CELL_SIZE, -1, CELL_SIZE, -1
+        )
+        spread_cells = spread_cells.reshape(self._cell_shape[0] * CELL_SIZE, -1, 3)
+        return (
+            texel_values
+            + spread_cells[: self._texture_shape[0], : self._texture_shape[1]]
+        )
 
 
-def _cell_sizes(n_texels: int, n_cells: int) -> Tensor:
+def _compute_cell_sizes(n_texels: int, n_cells: int) -> Tensor:
     """Return how many texels each cell has along one axis; the last may have fewer."""
     first_texels = CELL_SIZE * torch.arange(n_cells)
     return (n_texels - first_texels).clamp(max=CELL_SIZE).float()
@@ -350,7 +392,7 @@ def find_bilinear_weights(
 ) -> tuple[npt.NDArray[np.int32], Float32Array]:
     """Return the four texels of each bilinear look-up, and their fractions.
 
-    The look-up repeats at the border.
+    Texel centers lie at half numbers; the look-up repeats at the border.
 
     Args:
         uv: (n, 2) texture coordinates.
@@ -363,21 +405,24 @@ def find_bilinear_weights(
     columns, column_fractions = _find_linear_weights(uv[:, 0] * width - 0.5, width)
     rows, row_fractions = _find_linear_weights(uv[:, 1] * height - 0.5, height)
     texels = [row * width + column for row in rows for column in columns]
-    fractions = [
+    weights = [
         row_fraction * column_fraction
         for row_fraction in row_fractions
         for column_fraction in column_fractions
     ]
-    return np.stack(texels, axis=1), np.stack(fractions, axis=1)
+    return np.stack(texels, axis=1), np.stack(weights, axis=1)
 
 
 def _find_linear_weights(
     position: Float32Array, count: int
 ) -> tuple[list[npt.NDArray[np.int32]], list[Float32Array]]:
-    """Return the two neighbours of positions among `count`, and their fractions."""
-    first = np.floor(position).astype(np.int32)
+    """Return the two neighbours of positions (n,) among `count`, and their fractions.
+
+    After the last one comes the first again.
+    """
+    lower = np.floor(position).astype(np.int32)
     fraction = (position - np.floor(position)).astype(np.float32)
-    return [first % count, (first + 1) % count], [1.0 - fraction, fraction]
+    return [lower % count, (lower + 1) % count], [1.0 - fraction, fraction]
 
 
 COLLECTED_SPP = 128
@@ -433,7 +478,7 @@ class LinearRenderer(Predictor):
         u: (d,) configuration at which it is linearised.
         seed: of the noise.
         tick: is called with samples per pixel as they are traced; there are
-            `samples_to_collect` in all.
+            `count_samples` in all.
         spp: samples per pixel.
         quick: remove the noise from the rows of the matrix as from the base image,
             which they resemble, and not by the denoiser.
@@ -460,11 +505,19 @@ class LinearRenderer(Predictor):
         light: Inputs = MappingProxyType({}),
         collected: LinearizedScene | None = None,
     ) -> None:
+        """Trace the base image and the matrices, unless they were collected elsewhere."""
         super().__init__(traced)
         if collected is None:
             with torch.no_grad():
                 collected = _collect(
-                    traced.copy_with(), u, seed, tick, spp, quick, names, light
+                    renderer=traced.copy_with(),
+                    u=u,
+                    seed=seed,
+                    tick=tick,
+                    spp=spp,
+                    quick=quick,
+                    names=names,
+                    light=light,
                 )
         self.collected = collected
         self.non_finite = collected.non_finite
@@ -472,11 +525,13 @@ class LinearRenderer(Predictor):
 
     @property
     def n_entries(self) -> int:
+        """Number of entries of all matrices."""
         transports = self.collected.transports.values()
         return sum(transport.entries for transport in transports)
 
     @property
     def n_bytes(self) -> int:
+        """Memory of all matrices and the base image, 8 bytes a pixel."""
         height, width = self.path_renderer.formation.resolution
         transports = self.collected.transports.values()
         return sum(transport.bytes for transport in transports) + 8 * height * width
@@ -484,13 +539,20 @@ class LinearRenderer(Predictor):
     def release_scene(self, space: InputSpace) -> None:
         """Release the scene, which only tracing needs; the images stay.
 
-        `space` is the same space without a scene.
+        The renderer is a copy, so that others that share it keep their scene. `space`
+        is the same space without a scene.
         """
         self.path_renderer = self.path_renderer.copy_with()
         del self.path_renderer.scene
         self.path_renderer.space = space
 
     def predict_radiance(self, inputs: Inputs) -> Tensor:
+        """Return radiance (H, W, 3), and coverage as a fourth channel if there is a
+        backdrop.
+
+        That is the base image, and for each matrix what the base color's difference
+        from that of the linearisation adds. Coverage stays as it is.
+        """
         base = self.collected.base_image()
         radiance = base[..., :3]
         crop = self.path_renderer.crop
@@ -524,14 +586,26 @@ def _collect(
     names: OptionalNames,
     light: Inputs,
 ) -> LinearizedScene:
-    """Trace what a `LinearRenderer` needs; arguments as there."""
+    """Trace what a `LinearRenderer` needs; arguments as there.
+
+    Inputs that belong to the finished image are set apart. Without a matrix the base
+    image is an ordinary render; otherwise it is the mean of the paths that fill the
+    matrices. With a backdrop, radiance leaves out the background, and coverage is its
+    fourth channel.
+    """
     non_finite_before = renderer.non_finite
-    traced = dict(renderer.scene.assembly(renderer.space.inputs(u)))
-    applied = {name: traced.pop(name) for name in list(traced) if name in IMAGE_INPUTS}
-    traced |= dict(light)
-    linear = find_linear_inputs(renderer) if names is None else names
+    scene_inputs = dict(renderer.scene.assembly(renderer.space.inputs(u)))
+    image_inputs = {
+        name: scene_inputs.pop(name)
+        for name in list(scene_inputs)
+        if name in IMAGE_INPUTS
+    }
+    scene_inputs |= dict(light)
+    linear_names = find_linear_inputs(renderer) if names is None else names
     linearized_at = {
-        name: value.clone() for name, value in traced.items() if name in linear
+        name: value.clone()
+        for name, value in scene_inputs.items()
+        if name in linear_names
     }
     transports = {
         name: TextureTransport(
@@ -541,47 +615,71 @@ def _collect(
         )
         for name, value in linearized_at.items()
     }
-    hide = "backdrop.color" in applied
+    has_backdrop = "backdrop.color" in image_inputs
     if not transports:
-        base = renderer.render_radiance(traced, seed, spp, hide)
+        base = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
         tick(spp)
     else:
         with renderer.scene.limit_window(renderer.window):
-            paths = _fill_transports(renderer, transports, traced, seed, tick, spp)
-        radiance = paths.radiance - paths.background if hide else paths.radiance
+            paths = _fill_transports(
+                renderer, transports, scene_inputs, seed, tick, spp
+            )
+        radiance = paths.radiance - paths.background if has_backdrop else paths.radiance
         radiance = renderer.replace_non_finite(radiance)
         base, smooth = _make_smooth(renderer, radiance, paths, quick)
         for transport in transports.values():
             transport.finish(smooth)
-        if hide:
+        if has_backdrop:
             base = torch.cat([base, paths.coverage], dim=-1)
+            base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
         if renderer.crop is not None:
             base = renderer.crop.window.paste(base, renderer.crop.surroundings)
     return LinearizedScene(
         transports=transports,
         linearized_at=linearized_at,
-        image_inputs=applied,
+        image_inputs=image_inputs,
         base_image=PackedImage(base, is_small=quick),
         non_finite=renderer.non_finite - non_finite_before,
     )
 
 
+def _append_plane_change(
+    renderer: Renderer, base: Tensor, traced: Inputs, seed: int, spp: int
+) -> Tensor:
+    """Return a base image with the change of the plane that takes the shadow.
+
+    It stays as it is there. Without such a plane the image stays as it is.
+    """
+    if renderer.scene.plane_radiance is None:
+        return base
+    image = renderer.render_radiance(traced, seed, spp, True)
+    if renderer.crop is not None:
+        image = renderer.crop.window.select(image)
+    return torch.cat([base, image[..., 4:]], dim=-1)
+
+
 def _fill_transports(
     renderer: Renderer,
     transports: Mapping[str, TextureTransport],
-    traced: Inputs,
+    scene_inputs: Inputs,
     seed: int,
     tick: ProgressCallback,
     spp: int,
 ) -> Paths:
-    """Trace paths for each matrix and add them; return the mean images of all."""
+    """Trace paths for each matrix and add them; return the mean images of all.
+
+    The vertices of a pass are released when they are added, and tracing stops with a
+    `TransportTooLargeError` as soon as all matrices take more than `MAX_BYTES`.
+    """
     samples, n_passes = plan_passes(renderer, spp)
     height, width = _traced_size(renderer)
     images: list[Paths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
             noise_seed = seeds.stream(seed, f"transport {name}", index)
-            paths = renderer.scene.collect_paths(traced, name, noise_seed, samples)
+            paths = renderer.scene.collect_paths(
+                scene_inputs, name, noise_seed, samples
+            )
             transport.add_pass(paths.vertices, 1.0 / n_passes)
             size = sum(filled.bytes for filled in transports.values())
             if size + 8 * height * width > scale_limit(MAX_BYTES):
@@ -598,7 +696,10 @@ def _make_smooth(
 ) -> tuple[Tensor, Smooth | None]:
     """Denoise the base image; return it, and what removes the noise from a row's image.
 
-    Without a denoiser the image stays as it is, and there is no such function.
+    If quick, that multiplies by the ratio of the denoised and the noisy base image, at
+    most `MAX_CORRECTION` either way; else it denoises, guided by the normals and by
+    where surfaces are. Without a denoiser the image stays as it is, and there is no
+    such function.
     """
     if renderer.formation.denoiser != "oidn":
         return radiance, None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -93,13 +93,6 @@ def test_norm_balls_alone_are_pgd_bit_for_bit(blocks: tuple[Block, ...], seed: i
     assert [r.step_size for r in ours.history] == [r.step_size for r in theirs.history]
 
 
-def test_without_noise_it_is_pgd_with_more_momentum() -> None:
-    domain = replace(domain_of((BALL,)), exact=True)
-    _, first = played(domain, Auto(), 25)
-    _, second = played(domain, PGD(momentum=0.75), 25)
-    assert torch.equal(torch.stack(first.seen), torch.stack(second.seen))
-
-
 @once_each("name, price, steps", DOMAINS, [(0, False), (12, False), (12, True)], [1, 2, 3, 7, 40])
 def test_it_stays_inside_and_spends_its_budget_exactly(name: str, price: tuple[int, bool], steps: int) -> None:
     """`Smooth` itself checks that every configuration lies in the domain."""
@@ -113,72 +106,7 @@ def test_it_stays_inside_and_spends_its_budget_exactly(name: str, price: tuple[i
         assert set(problem.asked) <= {False, "free" if ball and free else True}
 
 
-@pytest.mark.parametrize("name", DOMAINS)
-def test_the_same_seed_gives_the_same_search_and_another_another(name: str) -> None:
-    domain = domain_of(DOMAINS[name], 12, True)
-    runs = [played(domain, Auto(), 24, seed)[1].seen for seed in (3, 3, 4)]
-    assert all(torch.equal(a, b) for a, b in zip(runs[0], runs[1], strict=True))
-    assert not all(torch.equal(a, b) for a, b in zip(runs[0], runs[2], strict=True))
-
-
-def test_old_states_replay_the_same_future() -> None:
-    problem = Smooth(domain_of(DOMAINS["texture and pose"], 12, True))
-    policy = Auto()
-
-    def play(state: object, steps: int, index: int) -> tuple[object, list[Tensor]]:
-        seen = []
-        for k in range(index, index + steps):
-            (proposal,), state = policy.propose(state, 1)  # type: ignore[arg-type]
-            seen.append(proposal.u)
-            evaluation = problem(Query(proposal.u, k, number=k, gradient=proposal.gradient))
-            state = policy.update(state, [(proposal.u, evaluation)])
-        return state, seen
-
-    state: object = policy.start(problem.domain, torch.Generator().manual_seed(0), 30)
-    for middle in (4, 8, 8):  # in the screen, with the surrogate, in the ascent
-        state, _ = play(state, middle, 0)
-        once, again = play(state, 5, 20)[1], play(state, 5, 20)[1]
-        assert torch.equal(torch.stack(once), torch.stack(again))
-
-
-@pytest.mark.parametrize("number", [1, 5, 15, 30, 42])
-def test_an_interrupt_keeps_the_best_so_far(number: int) -> None:
-    problem = Smooth(domain_of(POSE), noise=0.0)
-
-    def evaluate(query: Query) -> Evaluation:
-        if len(problem.seen) == number:
-            raise KeyboardInterrupt
-        return problem(query)
-
-    result = search(partial(map, evaluate), problem.domain, Auto(), steps=40, seed=0)
-    assert result.ending is Ending.INTERRUPTED
-    assert problem.value(result.best_u) == pytest.approx(max(problem.value(u) for u in problem.seen))
-
-
-@pytest.mark.parametrize("blocks", [POSE, (BALL, *POSE), (Block(30),)])
-def test_values_that_are_not_finite_are_the_worst(blocks: tuple[Block, ...]) -> None:
-    """Half of the box cannot be evaluated."""
-    problem = Smooth(domain_of(blocks))
-
-    def evaluate(query: Query) -> Evaluation:
-        evaluation = problem(query)
-        bad = query.number % 3 != 0 and float(query.u[-1]) > 0.6
-        return Evaluation(math.nan, evaluation.gradient, False) if bad else evaluation
-
-    result = search(partial(map, evaluate), problem.domain, Auto(), steps=40, seed=0)
-    assert result.stopped is Ending.BUDGET_SPENT
-    assert 0 < result.non_finite_objectives < 25
-
-
 # ---- what the renders are for
-
-
-def test_the_screen_is_half_of_a_box_and_gradients_by_differences_are_never_worth_it() -> None:
-    result, problem = played(domain_of(POSE, cost=12), Auto(), 40)
-    assert result.gradients == 0
-    screen = torch.stack(problem.seen[1:20])
-    for j in range(6):  # 19 Sobol points: at least one in each quarter of every coordinate
-        assert sorted(set((screen[:, j] * 4).int().tolist())) == [0, 1, 2, 3]
 
 
 def test_free_gradients_end_a_search_and_lead_one_in_many_dimensions() -> None:
@@ -203,13 +131,6 @@ def test_a_texture_beside_a_pose_takes_free_gradients_where_there_are_some() -> 
     assert len({tuple(x) for x in moved.tolist()}) > 5
 
 
-def test_choices_visit_every_option_at_its_middle() -> None:
-    _, problem = played(domain_of((Block(1, options=5),)), Auto(), 30)
-    seen = torch.stack(problem.seen)[1:, 0]
-    assert all(abs(float(u) * 5 % 1 - 0.5) < 1e-5 for u in seen[:29])
-    assert len({int(u * 5) for u in seen}) == 5
-
-
 @pytest.mark.medium
 def test_an_angle_is_searched_across_its_seam() -> None:
     """A peak of width 0.03 on the seam, whose both sides are equally good."""
@@ -232,32 +153,6 @@ def test_an_angle_is_searched_across_its_seam() -> None:
 
 
 # ---- the parts
-
-
-def test_coordinates_go_to_the_box_and_back() -> None:
-    domain = domain_of((BALL, Block(2, low=0.25, high=0.75), CHOICE, Block(1, periodic=True)))
-    box = find_box_coordinates(domain)
-    assert box.where.tolist() == [40, 41, 42, 43]
-    x = torch.tensor([0.0, 1.0, 0.375, 0.9])
-    u = box.to_configuration(domain.start, x)
-    assert torch.allclose(u[40:], torch.tensor([0.25, 0.75, 0.375, 0.9]))
-    assert torch.equal(u[:40], domain.start[:40])
-    assert torch.allclose(box.from_configuration(u), x)
-    tidy = box.normalize(torch.tensor([[-1.0, 2.0, 0.3, 1.25]]))
-    assert torch.allclose(tidy, torch.tensor([[0.0, 1.0, 0.375, 0.25]]))
-
-
-def test_distances_know_angles_and_choices() -> None:
-    box = find_box_coordinates(domain_of((Block(1), Block(1, periodic=True), CHOICE)))
-
-    def distance(a: list[float], b: list[float]) -> float:
-        points = box.embed(torch.tensor([a, b]), torch.ones(3).double())
-        return float((points[0] - points[1]).norm())
-
-    assert distance([0.1, 0.5, 0.1], [0.4, 0.5, 0.1]) == pytest.approx(0.3)
-    assert distance([0.1, 0.01, 0.1], [0.1, 0.99, 0.1]) == pytest.approx(0.04, rel=0.01)
-    assert distance([0.1, 0.5, 0.1], [0.1, 0.5, 0.2]) == 0.0
-    assert distance([0.1, 0.5, 0.1], [0.1, 0.5, 0.9]) == distance([0.1, 0.5, 0.1], [0.1, 0.5, 0.4]) == pytest.approx(1)
 
 
 def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> None:

@@ -3,7 +3,6 @@ cut."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
@@ -89,30 +88,3 @@ def test_of_a_batch_that_is_cut_the_first_count(policy: str) -> None:
         )
 
     assert known(8, 11) == known(1, 11)
-
-
-@pytest.mark.parametrize("policy", ["cmaes", "nes", "random", "sobol", "portfolio of races"])
-def test_a_population_fills_a_batch(policy: str) -> None:
-    assert max(proposed(FORMS[policy], NUMBERS, 4)[1]) == 4
-
-
-def test_restarts_step_together_along_their_gradients() -> None:
-    """Four at a time, and with a whole gradient by differences for each."""
-    assert proposed(FORMS["restarts"], NUMBERS, 1000)[1] == [4] * 10
-    assert proposed(FORMS["restarts"], COSTLY, 1000)[1][:2] == [4, 4]
-    assert proposed(FORMS["restarts"], NUMBERS, 3)[1][:4] == [3, 3, 3, 3]
-
-
-def test_the_whole_screen_of_auto_is_one_batch_and_then_every_point_waits_for_the_one_before() -> None:
-    sizes = proposed(FORMS["auto"], COSTLY, 1000)[1]
-    assert sizes == [math.ceil(STEPS / 2)] + [1] * (STEPS // 2)
-
-
-def test_combinations_of_options_come_together_where_each_has_one_render_in_a_round() -> None:
-    domain = Domain(torch.tensor([0.2, 0.9]), (Block(1, options=16), Block(1, options=2)))
-    assert max(proposed(FORMS["pgd"], domain, 1000)[1]) > 4
-
-
-@pytest.mark.parametrize("policy", ["adam", "pgd"])
-def test_steps_along_a_gradient_come_alone(policy: str) -> None:
-    assert set(proposed(FORMS[policy], NUMBERS, 9)[1]) == {1}

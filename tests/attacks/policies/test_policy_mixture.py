@@ -13,7 +13,6 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.candidates import FailureRate, Failures, estimate_failure_rate
 from advsearch.attacks.evaluation import limit_to_single_thread
-from advsearch.errors import InputError
 
 BOX = Domain(
     torch.full((4,), 0.5),
@@ -100,37 +99,3 @@ def test_an_interval_covers_as_often_as_it_says() -> None:
             told = estimate_failure_rate(1.0 / density, bounds, x < truth, torch.zeros(150, dtype=torch.bool))
         missed += not told.interval[0] <= truth <= told.interval[1]
     assert missed <= 5
-
-
-def test_nothing_is_estimated_from_few_failures_and_what_is_unknown_widens_the_interval() -> None:
-    weights, none = torch.ones(100), torch.zeros(100, dtype=torch.bool)
-    few = none.clone()
-    few[:5] = True
-    told = estimate_failure_rate(weights, weights, few, none)
-    assert told.estimate is None and told.effective == pytest.approx(5.0)
-    assert told.interval[0] < 0.05 < told.interval[1] < 0.2
-    unknown = none.clone()
-    unknown[50:] = True
-    wide = estimate_failure_rate(weights, weights, few, unknown)
-    assert wide.interval[0] == pytest.approx(told.interval[0]) and wide.interval[1] > 0.55
-    assert estimate_failure_rate(weights, weights, none, none).interval == pytest.approx((0.0, 0.05), abs=0.04)
-    assert estimate_failure_rate(weights, weights, ~none, none).interval[1] == 1.0
-
-
-def test_options_that_no_search_can_have_are_refused() -> None:
-    for given in ({"components": 0}, {"even": 0.01}, {"even": 1.5}, {"population": 1}):
-        with pytest.raises(InputError, match=next(iter(given))):
-            make_policy("mixture", **given)
-    domain = Domain(torch.full((51,), 0.5), (Block(51),))
-    with pytest.raises(InputError, match="at most 50 numbers, got 51; use pgd or auto"):
-        make_policy("mixture").start(domain, torch.Generator().manual_seed(0), 10)
-
-
-def test_no_share_is_told_of_a_ball_whose_draws_are_projected() -> None:
-    domain = Domain(torch.full((2,), 0.5), (Block(2, "l2", 0.1),))
-
-    def evaluate(query: Query) -> Evaluation:
-        return Evaluation(float(query.u[0]), None, bool(query.u[0] > 0.55))
-
-    known = search(partial(map, evaluate), domain, make_policy("mixture"), steps=60, seed=0, candidates=0).failures
-    assert known is not None and known.failure_rate is None and known.n_failures > 0

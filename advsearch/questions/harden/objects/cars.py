@@ -52,10 +52,11 @@ def _outline(
     """
     cosine = np.cos(angle)
     sine = np.sin(angle)
-    reach = np.where(cosine >= 0.0, front - middle, middle - rear)
-    return middle + reach * np.sign(cosine) * np.abs(cosine) ** (
-        2 / power
-    ), half * np.sign(sine) * np.abs(sine) ** (2 / power)
+    half_length = np.where(cosine >= 0.0, front - middle, middle - rear)
+    exponent = 2 / power
+    x = middle + half_length * np.sign(cosine) * np.abs(cosine) ** exponent
+    y = half * np.sign(sine) * np.abs(sine) ** exponent
+    return x, y
 
 
 def _shell(
@@ -82,16 +83,16 @@ def _shell(
         (0, cut, opposite - cut, opposite + cut, COLUMNS - cut, COLUMNS)
     ):
         part_points = points[:, first : last + 1]
-        u, v = (shapes.mean_lengths(part_points, axis) for axis in (1, 0))
-        size = (float(u[-1]), float(v[-1]))
+        u = shapes.mean_lengths(part_points, axis=1)
+        v = shapes.mean_lengths(part_points, axis=0)
         patches.append(
             shapes.grid(
                 "paint",
                 part_points,
                 normals[:, first : last + 1],
-                size,
-                v / v[-1],
-                u / u[-1],
+                size=(float(u[-1]), float(v[-1])),
+                down=v / v[-1],
+                across=u / u[-1],
             )
         )
     return patches
@@ -133,6 +134,7 @@ def _shell_normals(points: Array) -> Array:
 
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
+    """Return the function of x that a spline through knots (x, z) is."""
     curve = shapes.spline(knots, 200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
@@ -199,14 +201,17 @@ _CABIN_POWER = 4.6
 
 
 def _deck(x: Array, y: Array) -> Array:
+    """Return the height of the top of the body, a little higher in the middle."""
     return np.asarray(_WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2))
 
 
 def _body_height(share: Array, x: Array, y: Array) -> Array:
+    """Return z at a fraction of the height between the body's bottom and its top."""
     return np.asarray(_BOTTOM(x) + share * (_deck(x, y) - _BOTTOM(x)))
 
 
 def _cabin_height(share: Array, x: Array, y: Array) -> Array:
+    """Return z at a fraction of the height between the deck and the curved roof."""
     low = _deck(x, y) - 0.03
     return np.asarray(low + share * (_ROOF(x) + 0.035 * (1.0 - (y / 0.6) ** 2) - low))
 
@@ -512,6 +517,7 @@ def _panes(t: Texels) -> Array:
 
 
 def _lamps(t: Texels) -> Array:
+    """Paint headlights: two bright lamps on each side, with dark rings around them."""
     _, y, z = t.xyz.T
     out = np.abs(y)
     lamp = np.minimum(np.hypot(out - 0.58, z - 0.62), np.hypot(out - 0.71, z - 0.64))
@@ -526,6 +532,7 @@ def _lamps(t: Texels) -> Array:
 
 
 def _tail(t: Texels) -> Array:
+    """Paint taillights: dark red with a bright stripe."""
     z = t.xyz[:, 2]
     return mix(
         parse_hex_color("8e0d12"),
@@ -535,6 +542,7 @@ def _tail(t: Texels) -> Array:
 
 
 def _slats(t: Texels) -> Array:
+    """Paint dark trim, with bright slats in the upper grille."""
     x, _, z = t.xyz.T
     slat = np.where(
         (x > 1.9) & (z > 0.48),
@@ -584,7 +592,11 @@ def car(draw: ParameterSampler) -> Instance:
         "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2
     )
     stretch = np.array(
-        [draw(1.0, 0.94, 1.07), draw(1.0, 0.96, 1.05), draw(1.0, 0.95, 1.1)]
+        [
+            draw(1.0, low=0.94, high=1.07),
+            draw(1.0, low=0.96, high=1.05),
+            draw(1.0, low=0.95, high=1.1),
+        ]
     )
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
     metal = draw.sample_color("c4c7ca", "8d9094", "2d2f31", wild=0.0)
@@ -603,8 +615,8 @@ def car(draw: ParameterSampler) -> Instance:
     return Instance(
         shapes.stretch_patches(patches, stretch),
         paints,
-        FINISHES["paint"],
-        detail,
-        FINISHES,
+        material=FINISHES["paint"],
+        detail=detail,
+        finishes=FINISHES,
         drives=True,
     )

@@ -57,7 +57,13 @@ def _shelves(
 ) -> list[AtlasRectangle] | None:
     """Pack rectangles (w, h), w >= h, on shelves of a square, the highest first.
 
-    None if they do not fit.
+    A rectangle goes on the lowest shelf that has room for it, or opens a new shelf on
+    top of the others. None if they do not fit.
+
+    Args:
+        sizes: in object units.
+        scale: texels per unit.
+        side: of the square in texels.
     """
     cells = [
         (
@@ -66,6 +72,7 @@ def _shelves(
         )
         for width, height in sizes
     ]
+    # by height, then width
     order = sorted(
         range(len(cells)), key=lambda index: (-cells[index][1], -cells[index][0], index)
     )
@@ -86,7 +93,7 @@ def _shelves(
             shelves.append(shelf)
             top += height
         rectangles[index] = AtlasRectangle(
-            shelf.filled, shelf.bottom, width, height, False
+            x=shelf.filled, y=shelf.bottom, width=width, height=height, is_rotated=False
         )
         shelf.filled += width
     return [rectangles[index] for index in range(len(cells))]
@@ -340,13 +347,15 @@ def sample_material(
     """Sample a material with a roughness within `spread`, and sometimes another
     coat.
     """
-    sampled_roughness = draw(roughness, roughness - spread, roughness + spread)
-    sampled_clearcoat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
-    metallic = draw(0.0, 0.3, 0.8) if draw.chance(0.06) else 0.0
+    sampled_roughness = draw(roughness, low=roughness - spread, high=roughness + spread)
+    sampled_clearcoat = (
+        draw(clearcoat, low=0.0, high=1.0) if draw.chance(0.3) else clearcoat
+    )
+    metallic = draw(0.0, low=0.3, high=0.8) if draw.chance(0.06) else 0.0
     values = {
         "roughness": min(max(sampled_roughness, 0.12), 0.95),
         "metallic": metallic,
-        "specular": draw(0.5, 0.3, 0.7),
+        "specular": draw(0.5, low=0.3, high=0.7),
         "clearcoat": sampled_clearcoat,
     }
     return assets.Material(**{name: round(value, 4) for name, value in values.items()})

@@ -52,16 +52,16 @@ def _post(
 @family(metres=0.01)
 def chair(draw: ParameterSampler) -> Instance:
     """Faces +x; the back stands at -x."""
-    wide = draw(43.0, 36.0, 50.0)
-    deep = draw(42.0, 36.0, 48.0)
-    seat = draw(45.0, 40.0, 50.0)
-    total = draw(92.0, 78.0, 108.0)
-    thick = draw(3.6, 2.4, 5.5)
-    leg = draw(2.1, 1.5, 3.0)
-    splay = draw(1.5, 0.0, 6.0)
-    lean = draw(5.0, 1.0, 11.0)
+    wide = draw(43.0, low=36.0, high=50.0)
+    deep = draw(42.0, low=36.0, high=48.0)
+    seat = draw(45.0, low=40.0, high=50.0)
+    total = draw(92.0, low=78.0, high=108.0)
+    thick = draw(3.6, low=2.4, high=5.5)
+    leg = draw(2.1, low=1.5, high=3.0)
+    splay = draw(1.5, low=0.0, high=6.0)
+    lean = draw(5.0, low=1.0, high=11.0)
     section = _leg_section(draw)
-    taper = (leg * draw(0.75, 0.55, 1.0), leg)
+    taper = (leg * draw(0.75, low=0.55, high=1.0), leg)
     x = deep / 2 - leg - 0.4
     y = wide / 2 - leg - 0.4
     patches: list[Patch] = []
@@ -83,11 +83,11 @@ def chair(draw: ParameterSampler) -> Instance:
             steps=3,
             cells=2,
         )
-    if draw.chance(0.55, True):
+    if draw.chance(0.55, canonical=True):
         patches += _chair_rungs(draw, seat, splay, x, y, leg, section)
     patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
     rotated = shapes.transform_patches(
-        patches, shapes.rotation("z", draw(8.0, -25.0, 25.0))
+        patches, shapes.rotation("z", draw(8.0, low=-25.0, high=25.0))
     )
     return Instance(
         rotated, _chair_paints(draw, total), sample_material(draw, 0.45, 0.2)
@@ -96,7 +96,7 @@ def chair(draw: ParameterSampler) -> Instance:
 
 def _leg_section(draw: ParameterSampler) -> Array:
     """Sample the section (M, 2) of the legs of a chair: square or round."""
-    square = draw.chance(0.5, True)
+    square = draw.chance(0.5, canonical=True)
     return (
         shapes.rectangle(2.0, 2.0, 0.5, 2) if square else shapes.ellipse(1.0, 1.0, 16)
     )
@@ -132,7 +132,7 @@ def _chair_rungs(
 ) -> list[Patch]:
     """Create the rungs between the legs of a chair."""
     patches = list[Patch]()
-    low = seat * draw(0.36, 0.25, 0.6)
+    low = seat * draw(0.36, low=0.25, high=0.6)
     spread = splay * (1.0 - low / seat)
     front_x = x + spread
     side_y = y + spread
@@ -209,7 +209,7 @@ def _chair_back(
             (leg, 0.85 * leg),
         )
     tilt = shapes.rotation("y", -float(np.degrees(np.arctan2(lean, total - seat))))
-    depth = draw(1.6, 1.2, 2.4)
+    depth = draw(1.6, low=1.2, high=2.4)
 
     def slat(
         tag: str, z: float, width: float, height: float, shift: float = 0.0
@@ -233,7 +233,7 @@ def _chair_back(
             patches += slat(
                 "up",
                 (low + top) / 2,
-                inner * draw(0.075, 0.05, 0.11),
+                inner * draw(0.075, low=0.05, high=0.11),
                 top - low + 1.0,
                 inner * ((i + 1) / (count + 1) - 0.5),
             )
@@ -241,9 +241,9 @@ def _chair_back(
         count = int(draw.pick(3, 2, 4))
         for i in range(count):
             z = seat + high * (0.28 + 0.66 * i / max(1, count - 1))
-            patches += slat("cross", z, inner, high * draw(0.15, 0.1, 0.2))
+            patches += slat("cross", z, inner, high * draw(0.15, low=0.1, high=0.2))
     else:
-        tall = draw(0.6, 0.35, 0.75) * high
+        tall = draw(0.6, low=0.35, high=0.75) * high
         patches += slat(
             "cushion" if draw.chance(0.3) else "up",
             total - tall / 2 - 0.04 * high,
@@ -258,7 +258,7 @@ def _shade(
 ) -> list[Patch]:
     """An open lampshade with a thin wall, standing free from `low` to `high`."""
     wall = 0.25
-    belly = draw(0.0, -0.1, 0.12) * wide
+    belly = draw(0.0, low=-0.1, high=0.12) * wide
     outer = shapes.spline(
         [(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)],
         14,
@@ -280,7 +280,7 @@ def _lamp_base(
     under = [(0.0, 0.0), (radius - 0.4, 0.0)]
     top = [(stem, low), (0.0, low)]
     if style == "disc":
-        thick = draw(2.0, 1.2, 3.2)
+        thick = draw(2.0, low=1.2, high=3.2)
         corners = [
             under[-1],
             (radius, 0.4),
@@ -293,8 +293,8 @@ def _lamp_base(
             shapes.round_corners(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6
         )
         return shapes.lathe([("base", under), ("base", side), ("base", top)], 44)
-    belly = radius * draw(1.12, 0.95, 1.4)
-    at = draw(0.38, 0.28, 0.6) * low
+    belly = radius * draw(1.12, low=0.95, high=1.4)
+    at = draw(0.38, low=0.28, high=0.6) * low
     waist = [(0.45 * belly, 0.72 * low)]
     if style == "gourd":
         waist = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
@@ -334,11 +334,13 @@ def _shade_paint(
         for band in (between(0.0, low + 1.4), between(total - 1.4, 2 * total)):
             weave = over(weave, band, solid(accent))
     elif kind == "stripes":
-        weave = stripes(linen, accent, draw(5.0, 3.0, 9.0), draw(0.4, 0.2, 0.6))
+        weave = stripes(
+            linen, accent, draw(5.0, low=3.0, high=9.0), draw(0.4, low=0.2, high=0.6)
+        )
     elif kind == "dots":
-        weave = dots(weave, accent, draw(6.0, 4.0, 9.0))
+        weave = dots(weave, accent, draw(6.0, low=4.0, high=9.0))
     elif kind == "rings":
-        weave = rings(linen, accent, draw(6.0, 3.0, 10.0))
+        weave = rings(linen, accent, draw(6.0, low=3.0, high=10.0))
     elif kind == "gradient":
         weave = gradient(linen, shade(linen, 0.6), low, total)
     else:
@@ -350,13 +352,13 @@ def _shade_paint(
 @family(metres=0.01)
 def lamp(draw: ParameterSampler) -> Instance:
     """Make a table lamp of random proportions, shade and base."""
-    total = draw(48.0, 42.0, 58.0)
-    tall = draw(20.0, 14.0, 24.0)
-    wide = draw(16.5, 12.0, 19.0)
-    narrow = wide * draw(0.6, 0.35, 1.0)
+    total = draw(48.0, low=42.0, high=58.0)
+    tall = draw(20.0, low=14.0, high=24.0)
+    wide = draw(16.5, low=12.0, high=19.0)
+    narrow = wide * draw(0.6, low=0.35, high=1.0)
     low = total - tall
-    radius = draw(7.4, 6.0, 9.5)
-    stem = draw(0.8, 0.6, 1.3)
+    radius = draw(7.4, low=6.0, high=9.5)
+    stem = draw(0.8, low=0.6, high=1.3)
     style = draw.pick("body", "disc", "gourd")
     base = _lamp_base(draw, style, low + 0.25 * tall, radius, stem)
     patches = base + _shade(draw, low, total, wide, narrow)

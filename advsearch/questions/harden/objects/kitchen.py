@@ -29,8 +29,8 @@ from advsearch.questions.harden.objects.textures import (
 def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """A spout along +x with an open, hollow end."""
     path = _spout_path(draw, radius, height)
-    root = draw(1.75, 1.3, 2.2)
-    end = draw(0.72, 0.55, 0.95)
+    root = draw(1.75, low=1.3, high=2.2)
+    end = draw(0.72, low=0.55, high=0.95)
     scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
     tangent, first, second = shapes.compute_frames(path, (0.0, 1.0, 0.0))
     order = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
@@ -53,8 +53,14 @@ def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
 def _spout_path(draw: ParameterSampler, radius: float, height: float) -> Array:
     """Sample the path (18, 3) of a spout."""
     style = draw.pick("curved", "straight")
-    start = np.array([radius * 0.72, 0.0, height * draw(0.34, 0.26, 0.42)])
-    tip = np.array([radius * draw(1.85, 1.6, 2.0), 0.0, height * draw(0.94, 0.8, 1.02)])
+    start = np.array([radius * 0.72, 0.0, height * draw(0.34, low=0.26, high=0.42)])
+    tip = np.array(
+        [
+            radius * draw(1.85, low=1.6, high=2.0),
+            0.0,
+            height * draw(0.94, low=0.8, high=1.02),
+        ]
+    )
     bend = 0.22 if style == "curved" else 0.04
     middle = (start + tip) / 2 + np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
     above = (
@@ -66,8 +72,8 @@ def _spout_path(draw: ParameterSampler, radius: float, height: float) -> Array:
 @family(metres=0.01)
 def teapot(draw: ParameterSampler) -> Instance:
     """Make a teapot with spout, handle and lid of random proportions."""
-    radius = draw(7.2, 6.4, 8.0)
-    height = draw(10.2, 8.0, 12.5)
+    radius = draw(7.2, low=6.4, high=8.0)
+    height = draw(10.2, low=8.0, high=12.5)
     side, body = _teapot_body(draw, radius, height)
     grip = _teapot_handle(draw, side, radius, height)
     patches = [
@@ -84,10 +90,10 @@ def _teapot_body(
     draw: ParameterSampler, radius: float, height: float
 ) -> tuple[Array, list[Patch]]:
     """Return the profile of the side, and the body with its lid and knob."""
-    foot = radius * draw(0.58, 0.5, 0.75)
-    mouth = radius * draw(0.48, 0.42, 0.6)
-    belly_height = draw(0.45, 0.35, 0.58)
-    fullness = draw(0.9, 0.82, 0.97)
+    foot = radius * draw(0.58, low=0.5, high=0.75)
+    mouth = radius * draw(0.48, low=0.42, high=0.6)
+    belly_height = draw(0.45, low=0.35, high=0.58)
+    fullness = draw(0.9, low=0.82, high=0.97)
     knots = [
         (foot, 0.5),
         (radius * fullness, 0.5 * belly_height * height),
@@ -96,8 +102,8 @@ def _teapot_body(
         (mouth, height),
     ]
     side = shapes.spline(knots, 26)
-    dome = draw(1.5, 0.7, 2.4)
-    knob_radius = draw(1.0, 0.7, 1.4)
+    dome = draw(1.5, low=0.7, high=2.4)
+    knob_radius = draw(1.0, low=0.7, high=1.4)
     top = height + dome + 0.2
     rim = [
         (mouth, height),
@@ -142,21 +148,23 @@ def _teapot_handle(
     draw: ParameterSampler, side: Array, radius: float, height: float
 ) -> list[Patch]:
     """Create the handle on the +x side of a body with a profile (K, 2)."""
-    span = draw(0.9, 0.75, 1.0)
+    span = draw(0.9, low=0.75, high=1.0)
     high = height * 0.84
     low = height * (0.84 - 0.62 * span)
     top_root, low_root = (shapes.radius_at_height(side, z) - 0.25 for z in (high, low))
-    reach = radius * draw(0.72, 0.5, 0.9)
-    lift = draw(0.05, -0.02, 0.2) * height
+    reach = radius * draw(0.72, low=0.5, high=0.9)
+    lift = draw(0.05, low=-0.02, high=0.2) * height
     knots = [
         (top_root, high),
         (radius + 0.35 * reach, high + lift),
         (radius + 0.9 * reach, high - 0.1 * (high - low)),
-        (radius + draw(0.95, 0.7, 1.0) * reach, 0.5 * (high + low)),
+        (radius + draw(0.95, low=0.7, high=1.0) * reach, 0.5 * (high + low)),
         (radius + 0.4 * reach, low + 0.08 * (high - low)),
         (low_root, low),
     ]
-    section = shapes.ellipse(draw(0.5, 0.4, 0.7), draw(0.62, 0.45, 0.85), 16)
+    section = shapes.ellipse(
+        draw(0.5, low=0.4, high=0.7), draw(0.62, low=0.45, high=0.85), 16
+    )
     return shapes.sweep(
         "handle",
         shapes.to_xz_plane(shapes.spline(knots, 26)),
@@ -182,11 +190,15 @@ def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
             paint, between(0.77 * height, 0.785 * height, soft=0.1), solid(second)
         )
     elif kind == "dots":
-        paint = dots(glaze, second, draw(2.6, 1.6, 4.0), draw(0.28, 0.18, 0.4))
+        paint = dots(
+            glaze, second, draw(2.6, low=1.6, high=4.0), draw(0.28, low=0.18, high=0.4)
+        )
     elif kind == "stripes":
-        paint = stripes(clay, second, draw(3.0, 1.5, 5.0), draw(0.4, 0.2, 0.6))
+        paint = stripes(
+            clay, second, draw(3.0, low=1.5, high=5.0), draw(0.4, low=0.2, high=0.6)
+        )
     elif kind == "rings":
-        paint = rings(clay, second, draw(2.0, 1.0, 4.0))
+        paint = rings(clay, second, draw(2.0, low=1.0, high=4.0))
     elif kind == "speckle":
         paint = speckled(glaze, second, 0.5, offset)
     else:
@@ -199,17 +211,17 @@ def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
         "lid": draw.pick(paint, trim),
         "spout": draw.pick(glaze, paint),
         "handle": draw.pick(glaze, trim),
-        "knob": solid(second) if draw.chance(0.5, True) else trim,
+        "knob": solid(second) if draw.chance(0.5, canonical=True) else trim,
     }
 
 
 @family(metres=0.01)
 def frying_pan(draw: ParameterSampler) -> Instance:
     """Make a frying pan with a random handle."""
-    base = draw(10.5, 9.0, 11.5)
-    rim = draw(13.0, 12.2, 14.5)
-    depth = draw(4.2, 2.8, 5.5)
-    wall = draw(0.38, 0.3, 0.55)
+    base = draw(10.5, low=9.0, high=11.5)
+    rim = draw(13.0, low=12.2, high=14.5)
+    depth = draw(4.2, low=2.8, high=5.5)
+    wall = draw(0.38, low=0.3, high=0.55)
     side = shapes.spline(
         [
             (base - 0.8, 0.0),
@@ -221,9 +233,9 @@ def frying_pan(draw: ParameterSampler) -> Instance:
     )
     body = shapes.vessel(side, wall, 0.5, columns=64, step=1.6)
 
-    length = draw(18.0, 14.0, 21.0)
+    length = draw(18.0, low=14.0, high=21.0)
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
-    rise = draw(2.6, 0.6, 4.5)
+    rise = draw(2.6, low=0.6, high=4.5)
     grip = _pan_handle(draw, root, length, rise)
     rivets = _wall_rivets(side, depth, wall)
     bracket = _pan_bracket(rim, depth, length, rise)
@@ -264,21 +276,21 @@ def _pan_handle(
         (0.0, 0.0),
         (0.22 * length, 0.55 * rise),
         (0.6 * length, rise),
-        (length, rise * draw(1.05, 0.8, 1.2)),
+        (length, rise * draw(1.05, low=0.8, high=1.2)),
     ]
     path = shapes.spline(root + shapes.to_xz_plane(np.array(knots)), 26)
     t = np.linspace(0.0, 1.0, 26)
-    width = draw(1.15, 0.85, 1.5)
-    thick = draw(0.62, 0.45, 0.9)
+    width = draw(1.15, low=0.85, high=1.5)
+    thick = draw(0.62, low=0.45, high=0.9)
     shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (
-        1.0 + draw(0.12, 0.0, 0.25) * np.sin(np.pi * t)
+        1.0 + draw(0.12, low=0.0, high=0.25) * np.sin(np.pi * t)
     )
     round_end = np.sqrt(
         np.clip(1.0 - ((t - 0.94) / 0.06).clip(0.0, 1.0) ** 2, 0.0, 1.0)
     )
     thickness = thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0))
     scale = np.stack([thickness, width * shape], axis=1) * round_end[:, None]
-    if draw.chance(0.5, True):
+    if draw.chance(0.5, canonical=True):
         section = shapes.ellipse(1.0, 1.0, 20)
     else:
         section = shapes.rectangle(2.0, 2.0, 0.7)
@@ -309,7 +321,7 @@ def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, P
     inside = speckled(
         clouded(coat, 1.2, 5.0, offset), shade(coat, 1.7), 0.5, offset, 0.06
     )
-    if draw.chance(0.4, True):
+    if draw.chance(0.4, canonical=True):
         inside = over(inside, turned, solid(shade(coat, 1.6)))
     outer = draw.sample_color(
         "a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b"

@@ -68,13 +68,13 @@ def _patches(person: Any) -> list[Patch]:
         chart_faces = faces[first_face[number] : first_face[number + 1]]
         patches.append(
             Patch(
-                str(tag),
-                vertices[chart_vertices],
-                normals[chart_vertices],
-                charts[chart_vertices],
-                chart_faces,
-                _chart_size(data["sizes"][number]),
-                _rest(charts[chart_vertices], reference[chart_vertices]),
+                tag=str(tag),
+                vertices=vertices[chart_vertices],
+                normals=normals[chart_vertices],
+                uvs=charts[chart_vertices],
+                faces=chart_faces,
+                size=_chart_size(data["sizes"][number]),
+                rest=_rest(charts[chart_vertices], reference[chart_vertices]),
             )
         )
     return patches
@@ -191,11 +191,11 @@ def person(draw: ParameterSampler) -> Instance:
     height_reduction = 0.08 if is_woman else 0.0
     phenotype = {
         "gender": gender,
-        "height": draw(1.7, 1.52, 1.9) - height_reduction,
-        "weight": draw(0.5, 0.25, 0.8),
-        "age": draw(35.0, 16.0, 75.0),
-        "stride": draw(0.0, 0.0, 1.2),
-        "walk": draw(0.0, 0.0, 360.0),
+        "height": draw(1.7, low=1.52, high=1.9) - height_reduction,
+        "weight": draw(0.5, low=0.25, high=0.8),
+        "age": draw(35.0, low=16.0, high=75.0),
+        "stride": draw(0.0, low=0.0, high=1.2),
+        "walk": draw(0.0, low=0.0, high=360.0),
     }
     body = workbench.library.make_person(phenotype)
     skin = parse_hex_color(
@@ -223,5 +223,10 @@ def person(draw: ParameterSampler) -> Instance:
     }
     detail = {"skin": 0.8, "shoes": 0.8, "shirt": 1.15}
     return Instance(
-        _patches(body), paints, FINISHES["shirt"], detail, FINISHES, rig=body
+        _patches(body),
+        paints,
+        material=FINISHES["shirt"],
+        detail=detail,
+        finishes=FINISHES,
+        rig=body,
     )

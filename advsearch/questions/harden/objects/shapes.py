@@ -173,12 +173,12 @@ def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Arra
     return round_corners(corners, bevel, steps)[1:-1]
 
 
-def ellipse(width: float, height: float, count: int = 20) -> Array:
+def ellipse(half_width: float, half_height: float, count: int = 20) -> Array:
     """Return an ellipse with two half-axes as a closed counter-clockwise section
     (count, 2).
     """
     angle = 2 * np.pi * np.arange(count) / count
-    return np.stack([width * np.cos(angle), height * np.sin(angle)], axis=1)
+    return np.stack([half_width * np.cos(angle), half_height * np.sin(angle)], axis=1)
 
 
 ChartToPoints = Callable[[Array, Array], Array]
@@ -267,29 +267,36 @@ def grid(
     u = np.broadcast_to(across, (rows, columns))
     v = np.broadcast_to(down[:, None], (rows, columns))
 
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(
-        -1
-    )
+    # index of the first vertex of each cell, and two triangles of its vertices
+    corner = np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)
+    two_triangles = [[0, 1, columns + 1, 0, columns + 1, columns]]
     faces = (
-        (corner[:, None] + [[0, 1, columns + 1, 0, columns + 1, columns]])
-        .reshape(-1, 3)
-        .astype(np.int64)
+        (corner.reshape(-1)[:, None] + two_triangles).reshape(-1, 3).astype(np.int64)
     )
     area = np.linalg.norm(
         assets.compute_area_vectors(points.reshape(-1, 3)[faces]), axis=1
     )
-    # none where a row shrinks to a point
-    faces = faces[area > 1e-6 * float(np.median(area[area > 0.0]))]
+    # A triangle has no area where a row shrinks to a point.
+    has_area = area > 0.0
+    is_used = area > 1e-6 * float(np.median(area[has_area]))
+    faces = faces[is_used]
     interpolate = RegularGridInterpolator(
         (down, across), points, bounds_error=False, fill_value=None
     )
 
     def rest(at_u: Array, at_v: Array) -> Array:
+        """Return the points (N, 3) at chart coordinates (N,)."""
         return np.asarray(interpolate(np.stack([at_v, at_u], axis=-1)))
 
     uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
     return Patch(
-        tag, points.reshape(-1, 3), normals.reshape(-1, 3), uvs, faces, size, rest
+        tag=tag,
+        vertices=points.reshape(-1, 3),
+        normals=normals.reshape(-1, 3),
+        uvs=uvs,
+        faces=faces,
+        size=size,
+        rest=rest,
     )
 
 
@@ -312,23 +319,34 @@ def _fan(count: int) -> assets.IntArray:
 def _profile_normals(parts: Sequence[Array]) -> list[Array]:
     """Return the unit normals (dz, -dr) of consecutive polylines (r, z).
 
-    They are shared where the polylines meet smoothly or on the axis.
+    Where a polyline ends on the axis, its normal there is along the axis. Where two
+    meet at less than `HARD_ANGLE` degrees, they share the mean of their normals.
     """
-    directions = []
+    all_directions = []
     for polyline in parts:
-        step = np.diff(polyline, axis=0)
-        direction = np.concatenate([step[:1], polyline[2:] - polyline[:-2], step[-1:]])
-        for end, row in ((0, 0), (-1, -1)):
+        segments = np.diff(polyline, axis=0)
+        # central differences, one-sided at the ends
+        directions = np.concatenate(
+            [segments[:1], polyline[2:] - polyline[:-2], segments[-1:]]
+        )
+        for end in (0, -1):
             if polyline[end, 0] < 1e-9:
-                direction[row] = (step[row][0], 0.0)
-        directions.append(normalize(direction))
-    for before, after, p, q in zip(
-        directions, directions[1:], parts, parts[1:], strict=False
-    ):
-        is_joined = float(np.linalg.norm(p[-1] - q[0])) < 1e-9
-        if is_joined and float(before[-1] @ after[0]) > np.cos(np.radians(HARD_ANGLE)):
-            before[-1] = after[0] = normalize(before[-1] + after[0])
-    return [np.stack([d[:, 1], -d[:, 0]], axis=1) for d in directions]
+                directions[end] = (segments[end][0], 0.0)
+        all_directions.append(normalize(directions))
+    for number in range(len(parts) - 1):
+        before = all_directions[number]
+        after = all_directions[number + 1]
+        gap = parts[number][-1] - parts[number + 1][0]
+        is_joined = float(np.linalg.norm(gap)) < 1e-9
+        cosine = float(before[-1] @ after[0])
+        if is_joined and cosine > np.cos(np.radians(HARD_ANGLE)):
+            shared = normalize(before[-1] + after[0])
+            before[-1] = shared
+            after[0] = shared
+    return [
+        np.stack([directions[:, 1], -directions[:, 0]], axis=1)
+        for directions in all_directions
+    ]
 
 
 def _around(curve: Array, theta: Array) -> Array:
@@ -345,21 +363,23 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     """Create a piece of a surface of revolution that starts or ends on the axis.
 
     Its chart is a disc with the distance from the pole as radius.
+
+    Args:
+        tag: of the paint.
+        profile: (K, 2) points (r, z).
+        normals: (K, 2) of these.
+        columns: faces around.
     """
     ends_on_axis = profile[-1, 0] < 1e-9
-    curve, normal = (
-        (profile[::-1], normals[::-1]) if ends_on_axis else (profile, normals)
-    )
+    # both from the axis outwards
+    curve = profile[::-1] if ends_on_axis else profile
+    normal = normals[::-1] if ends_on_axis else normals
     radial_fraction, length = _along(curve)
     theta = 2 * np.pi * np.arange(columns) / columns
     # a profile that ends on the axis faces up: seen from above it is not mirrored
     mirror = 1.0 if ends_on_axis else -1.0
-    vertices, vertex_normals = (
-        np.concatenate(
-            [[[0.0, 0.0, rows[0, 1]]], _around(rows[1:], theta).reshape(-1, 3)]
-        )
-        for rows in (curve, normal)
-    )
+    vertices = _revolve_from_pole(curve, theta)
+    vertex_normals = _revolve_from_pole(normal, theta)
     disc_uvs = [
         0.5 + 0.5 * mirror * radial_fraction[1:, None] * np.cos(theta),
         0.5 + 0.5 * radial_fraction[1:, None] * np.sin(theta),
@@ -367,8 +387,11 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     uvs = np.concatenate([[[0.5, 0.5]], np.stack(disc_uvs, axis=-1).reshape(-1, 2)])
 
     triangles = _disc_triangles(columns, curve)
+    if not ends_on_axis:
+        triangles = triangles[:, ::-1]  # it faces down
 
     def rest(u: Array, v: Array) -> Array:
+        """Return the points (N, 3) at chart coordinates (N,)."""
         x = (2 * u - 1) * mirror
         y = 2 * v - 1
         pole_distance = np.minimum(np.hypot(x, y), 1.0)
@@ -385,14 +408,24 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
 
     size = (2 * length, 2 * length)
     return Patch(
-        tag,
-        vertices,
-        vertex_normals,
-        uvs,
-        triangles if ends_on_axis else triangles[:, ::-1],
-        size,
-        rest,
+        tag=tag,
+        vertices=vertices,
+        normals=vertex_normals,
+        uvs=uvs,
+        faces=triangles,
+        size=size,
+        rest=rest,
     )
+
+
+def _revolve_from_pole(curve: Array, theta: Array) -> Array:
+    """Rotate a curve (K, 2) whose first point is on the axis to angles (M,).
+
+    Returns:
+        (1 + (K - 1) * M, 3): the pole, then ring by ring.
+    """
+    pole = [[0.0, 0.0, curve[0, 1]]]
+    return np.concatenate([pole, _around(curve[1:], theta).reshape(-1, 3)])
 
 
 def _disc_triangles(columns: int, curve: Array) -> assets.IntArray:
@@ -481,32 +514,20 @@ def vessel(
     """
     normal, inner = _inner_profile(outside, wall)
     lip = _round_lip(outside, wall, normal)
-    fillet = min(1.5 * wall, 0.3 * float(outside[:, 0].max()))
+    max_radius = float(outside[:, 0].max())
+    fillet = min(1.5 * wall, 0.3 * max_radius)  # radius between wall and floor
     floor_radius = radius_at_height(inner[::-1], floor)
-    inner = inner[
-        (inner[:, 1] > floor + fillet)
-        & (inner[:, 0] > 0.05 * float(outside[:, 0].max()))
-    ]
-    t = np.linspace(0.0, 1.0, 5)[1:, None]
+    is_wall = (inner[:, 1] > floor + fillet) & (inner[:, 0] > 0.05 * max_radius)
+    inner = inner[is_wall]
+    corner = np.array([floor_radius, floor])
     fillet_end = np.array([max(floor_radius - fillet, 0.4 * floor_radius), floor])
-    inside = np.concatenate(
-        [
-            inner,
-            (1 - t) ** 2 * inner[-1]
-            + 2 * t * (1 - t) * np.array([floor_radius, floor])
-            + t**2 * fillet_end,
-        ]
-    )
+    inside = np.concatenate([inner, _bezier(inner[-1], corner, fillet_end)])
+    # The base is hollow inside a foot ring.
     foot = outside[0]
     inset = min(0.35 * wall, 0.3 * floor)
+    base = [(0.0, inset), (0.86 * foot[0], inset), (0.9 * foot[0], foot[1]), foot]
     pieces = [
-        (
-            "base",
-            subdivide(
-                [(0.0, inset), (0.86 * foot[0], inset), (0.9 * foot[0], foot[1]), foot],
-                3 * step,
-            ),
-        ),
+        ("base", subdivide(base, 3 * step)),
         ("outside", subdivide(np.concatenate([outside, lip, inner[:1]]), step)),
         ("inside", subdivide(inside, step)),
         ("inside", subdivide([fillet_end, (0.0, floor)], 3 * step)),
@@ -514,16 +535,25 @@ def vessel(
     return lathe(pieces, columns)
 
 
+def _bezier(start: Array, control: Array, end: Array) -> Array:
+    """Return four points (4, 2) of a quadratic Bezier curve, without its start."""
+    t = np.linspace(0.0, 1.0, 5)[1:, None]
+    return np.asarray((1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end)
+
+
 def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
-    """Return the normals of a profile, and the inside of its wall from the lip down."""
+    """Return the normals of a profile, and the inside of its wall from the lip down.
+
+    In tight bends the offset curve runs backwards; such points are removed, again and
+    again, but never the last one.
+    """
     normal = _profile_normals([outside])[0]
     inner = outside - wall * normal
     remaining = np.arange(len(outside))
-    # points at which it runs backwards, as in tight bends, go; the last one stays
     while len(remaining) > 2:
-        is_backward = (
-            np.diff(inner[remaining], axis=0) * np.diff(outside[remaining], axis=0)
-        ).sum(axis=1) <= 0.0
+        inner_steps = np.diff(inner[remaining], axis=0)
+        outer_steps = np.diff(outside[remaining], axis=0)
+        is_backward = (inner_steps * outer_steps).sum(axis=1) <= 0.0
         if not is_backward.any():
             break
         remaining = np.append(remaining[:-1][~is_backward], remaining[-1])
@@ -613,9 +643,9 @@ def sweep(
         compute_frames(centres, first) if frame is None else frame
     )
     scales = np.asarray(scale, dtype=np.float64)
-    scales = np.broadcast_to(
-        scales.reshape(-1, 1) if scales.ndim < 2 else scales, (len(centres), 2)
-    )
+    if scales.ndim < 2:
+        scales = scales.reshape(-1, 1)
+    scales = np.broadcast_to(scales, (len(centres), 2))
     points = _sweep_points(section, scales, centres, first_normal, second_normal)
     normals = _sweep_normals(points, tangent)
     ring_fraction, ring_length = _along(np.concatenate([section, section[:1]]))
@@ -628,9 +658,9 @@ def sweep(
             tag,
             closed,
             closed_normals,
-            (width, float(down[-1])),
-            down / down[-1],
-            ring_fraction,
+            size=(width, float(down[-1])),
+            down=down / down[-1],
+            across=ring_fraction,
         )
     ]
     if caps:
@@ -660,19 +690,17 @@ def _sweep_points(
 
 
 def _sweep_normals(points: Array, tangent: Array) -> Array:
-    """Return the normals (N, M, 3) of a swept surface; along the path where it is a
-    point.
+    """Return the normals (N, M, 3) of a swept surface.
+
+    Where its first or last ring is a point, they are along the path, outwards.
     """
-    normals = np.cross(
-        np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1),
-        np.gradient(points, axis=0),
-    )
+    ring_tangent = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
+    normals = np.cross(ring_tangent, np.gradient(points, axis=0))
     normal_length = np.linalg.norm(normals, axis=-1)
     normals = normalize(normals)
-    for row, direction in ((0, -1.0), (-1, 1.0)):  # where a row is a point
-        normals[row][normal_length[row] < 1e-7 * float(normal_length.max())] = (
-            direction * tangent[row]
-        )
+    for row, direction in ((0, -1.0), (-1, 1.0)):
+        is_point = normal_length[row] < 1e-7 * float(normal_length.max())
+        normals[row][is_point] = direction * tangent[row]
     return normals
 
 
@@ -685,7 +713,8 @@ def mean_lengths(points: Array, axis: int = 0) -> Array:
 def cap(tag: str, ring: Array, normal: Array) -> Patch:
     """Create a flat face that is bounded by a convex ring (M, 3).
 
-    The ring is counter-clockwise seen from outside; `normal` is the unit normal.
+    The ring is counter-clockwise seen from outside; `normal` is the unit normal. The
+    chart is the face's bounding rectangle, with u from the center to the first point.
     """
     centre = ring.mean(axis=0)
     x = normalize(ring[0] - centre)
@@ -698,6 +727,7 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
     vertices = np.concatenate([centre[None], ring])
 
     def rest(u: Array, v: Array) -> Array:
+        """Return the points (N, 3) at chart coordinates (N,)."""
         return np.asarray(
             centre
             + (u * extent[0] + lower[0])[:, None] * x
@@ -706,13 +736,13 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
 
     size = (float(extent[0]), float(extent[1]))
     return Patch(
-        tag,
-        vertices,
-        np.tile(normal, (len(vertices), 1)),
-        uvs,
-        _fan(len(ring)),
-        size,
-        rest,
+        tag=tag,
+        vertices=vertices,
+        normals=np.tile(normal, (len(vertices), 1)),
+        uvs=uvs,
+        faces=_fan(len(ring)),
+        size=size,
+        rest=rest,
     )
 
 
@@ -742,58 +772,61 @@ def box(
         i = (axis + 1) % 3
         j = (axis + 2) % 3
         for side in (1.0, -1.0):
-            u, v = _face_coordinates(bevel, steps, cells, core, i, j)
-            normal, points = _rounded_face(bevel, v, u, half, axis, i, j, core, side)
+            u = _edge_coordinates(float(core[i]), bevel, steps, cells)
+            v = _edge_coordinates(float(core[j]), bevel, steps, cells)
+            normal, points = _rounded_face(axis, side, u, v, half, bevel)
             down = (v + half[j]) / (2 * half[j])
             across = (u + half[i]) / (2 * half[i])
-            across = across if side > 0 else 1.0 - across[::-1]
+            if side < 0:
+                across = 1.0 - across[::-1]
             patches.append(
                 grid(
                     tag,
                     points + np.asarray(centre, dtype=np.float64),
                     normal,
-                    (2 * float(half[i]), 2 * float(half[j])),
-                    down,
-                    across,
+                    size=(2 * float(half[i]), 2 * float(half[j])),
+                    down=down,
+                    across=across,
                 )
             )
     return patches
 
 
-def _face_coordinates(
-    bevel: float, steps: int, cells: int, core: Array, i: int, j: int
-) -> tuple[Array, Array]:
-    """Return coordinates along both axes of a box's face, denser in the rounded
-    edges.
+def _edge_coordinates(flat: float, bevel: float, steps: int, cells: int) -> Array:
+    """Return ascending coordinates along an axis of a box's face.
+
+    They are denser in the rounded edges, where they are at equal angles.
+
+    Args:
+        flat: half the length of the flat part.
+        bevel: radius of the edges.
+        steps: cells across half of an edge's rounding.
+        cells: cells across the flat part.
     """
-    # equal angles
-    edges = [
-        core[k] + bevel * np.tan(np.linspace(0.0, np.pi / 4, steps + 1)) for k in (i, j)
-    ]
-    flats = [np.linspace(-core[k], core[k], cells + 1) for k in (i, j)]
-    u, v = (
-        np.concatenate([-edge[:0:-1], flat, edge[1:]])
-        for edge, flat in zip(edges, flats, strict=True)
-    )
-    return u, v
+    edge = flat + bevel * np.tan(np.linspace(0.0, np.pi / 4, steps + 1))
+    return np.concatenate([-edge[:0:-1], np.linspace(-flat, flat, cells + 1), edge[1:]])
 
 
 def _rounded_face(
-    bevel: float,
-    v: Array,
-    u: Array,
-    half: Array,
-    axis: int,
-    i: int,
-    j: int,
-    core: Array,
-    side: float,
+    axis: int, side: float, u: Array, v: Array, half: Array, bevel: float
 ) -> tuple[Array, Array]:
-    """Return points and normals (V, U, 3) of a face of a box with rounded edges."""
+    """Return normals and points (V, U, 3) of a face of a box with rounded edges.
+
+    Points of the face of the cube are moved towards the nearest point of the box less
+    its bevel, until they are `bevel` away from it.
+
+    Args:
+        axis: that the face is across.
+        side: 1 of the upper face, -1 of the lower one.
+        u, v: coordinates (U,) and (V,) along the next two axes.
+        half: half the size of the box (3,).
+        bevel: radius of the edges.
+    """
+    core = half - bevel
     cube = np.empty((len(v), len(u), 3))
     cube[..., axis] = half[axis]
-    cube[..., i] = u[None]
-    cube[..., j] = v[:, None]
+    cube[..., (axis + 1) % 3] = u[None]
+    cube[..., (axis + 2) % 3] = v[:, None]
     inner = np.clip(cube, -core, core)
     normal = normalize(cube - inner)
     points = inner + bevel * normal
@@ -838,14 +871,16 @@ def carve_patches(
     """
     carved_patches = []
     for patch in patches:
-        edges = _edges(patch)
-        value = np.array(inside(patch.vertices))
+        edges = _edges(patch)  # (E, 2)
+        value = np.array(inside(patch.vertices))  # (V,)
         end_values = value[edges]
-        crossed = end_values[:, 0] * end_values[:, 1] < 0.0
-        fraction = np.abs(end_values[crossed]) / np.abs(end_values[crossed]).sum(
-            axis=1, keepdims=True
-        )
-        value[edges[crossed][fraction < SNAP]] = 0.0
+        is_crossed = end_values[:, 0] * end_values[:, 1] < 0.0
+        crossed_edges = edges[is_crossed]
+        # how far the cut is from each end, as a fraction of the edge
+        distance = np.abs(end_values[is_crossed])
+        fraction = distance / distance.sum(axis=1, keepdims=True)
+        is_near = fraction < SNAP
+        value[crossed_edges[is_near]] = 0.0
         if value.max() <= 0.0:
             carved_patches.append(patch)
             continue
@@ -893,11 +928,14 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
         The patch, and whether each of its faces is inside (F,).
     """
     edges = _edges(patch)
-    crossed = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]
+    is_crossed = value[edges[:, 0]] * value[edges[:, 1]] < 0.0
+    crossed = edges[is_crossed]
     first, second = crossed.T
+    # where the value is 0, from the first vertex to the second
     fraction = (value[first] / (value[first] - value[second]))[:, None]
 
     def interpolate(attribute: Array) -> Array:
+        """Return an attribute (V, k) of the vertices at the cuts."""
         difference = attribute[second] - attribute[first]
         return np.asarray(attribute[first] + fraction * difference)
 

@@ -33,7 +33,10 @@ def parse_hex_color(code: str) -> Color:
 
 @dataclass(frozen=True)
 class ParameterSampler:
-    """Samples the parameters of an instance, or returns the canonical ones."""
+    """Samples the parameters of an instance, or returns the canonical ones.
+
+    ``draw(9.4, low=7.6, high=12.0)`` is 9.4 without a generator, else uniform.
+    """
 
     # the source of randomness, or None for the canonical instance
     rng: np.random.Generator | None
@@ -43,13 +46,14 @@ class ParameterSampler:
         return canonical if self.rng is None else float(self.rng.uniform(low, high))
 
     def pick(self, canonical: T, *others: T) -> T:
-        """Return one of the choices, all equally likely, or the canonical one."""
+        """Return one of the choices, all equally likely, or the canonical one.
+
+        A choice that is named twice is twice as likely.
+        """
+        if self.rng is None:
+            return canonical
         choices = (canonical, *others)
-        return (
-            canonical
-            if self.rng is None
-            else choices[int(self.rng.integers(len(choices)))]
-        )
+        return choices[int(self.rng.integers(len(choices)))]
 
     def chance(self, probability: float, canonical: bool = False) -> bool:
         """Return True with a probability, or the canonical one."""
@@ -59,11 +63,9 @@ class ParameterSampler:
         """Return an offset (3,) into the noise, so that no two instances have the same
         clouds.
         """
-        return (
-            np.array([1.7, 9.2, 5.5])
-            if self.rng is None
-            else self.rng.uniform(0.0, 16.0, 3)
-        )
+        if self.rng is None:
+            return np.array([1.7, 9.2, 5.5])
+        return self.rng.uniform(0.0, 16.0, 3)
 
     def sample_color(self, canonical: str, *others: str, wild: float = 0.4) -> Color:
         """Return a color near one of those named, or with probability `wild` any color.
@@ -269,6 +271,7 @@ def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
     """Paint round dots in staggered rows over another paint; the radius is in cells."""
 
     def staggered(t: Texels) -> Array:
+        """Return the mask of the dots; every other row is shifted by half a cell."""
         across, up = _cells(t, cell)
         across = across + 0.5 * (np.floor(up) % 2.0)
         return step(radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, 0.1)
@@ -340,7 +343,7 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
     """
     first_color = draw.sample_color("808080", wild=1.0)
     second_color = draw.sample_color("808080", wild=1.0)
-    cell = size * draw(0.1, 0.05, 0.2)
+    cell = size * draw(0.1, low=0.05, high=0.2)
     noise_offset = draw.offset()
     kind = draw.pick(
         "solid",
@@ -359,7 +362,7 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
             first_color,
             second_color,
             cell,
-            draw(0.5, 0.2, 0.8),
+            draw(0.5, low=0.2, high=0.8),
             axis=int(draw.pick(0, 1, 2)),
         )
     if kind == "stripes":
@@ -367,18 +370,24 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
             first_color,
             second_color,
             cell,
-            draw(0.5, 0.2, 0.8),
+            draw(0.5, low=0.2, high=0.8),
             int(draw.pick(0, 1, 3)),
         )
     if kind == "checks":
         return checks(first_color, second_color, cell)
     if kind == "dots":
-        return dots(solid(first_color), second_color, cell, draw(0.3, 0.18, 0.42))
+        return dots(
+            solid(first_color), second_color, cell, draw(0.3, low=0.18, high=0.42)
+        )
     if kind == "zigzag":
         return zigzag(first_color, second_color, cell)
     if kind == "mottled":
         return mottled(
-            first_color, second_color, 1.5 * cell, noise_offset, draw(2.0, 1.0, 4.0)
+            first_color,
+            second_color,
+            1.5 * cell,
+            noise_offset,
+            draw(2.0, low=1.0, high=4.0),
         )
     if kind == "speckled":
         return speckled(
@@ -386,7 +395,7 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
             second_color,
             0.4 * cell,
             noise_offset,
-            draw(0.2, 0.1, 0.4),
+            draw(0.2, low=0.1, high=0.4),
         )
     if kind == "gradient":
         return gradient(

@@ -56,10 +56,14 @@ HEXAGONS = shapes.normalize(
 
 
 def football_seams(direction: Array) -> tuple[Array, Array]:
-    """Return the distance (N,) to the nearest seam of a football, and the pentagons'
-    mask.
+    """Return the distances of unit directions (N, 3) to the seams of a football.
 
-    The panels are those of a truncated icosahedron.
+    The panels are those of a truncated icosahedron: the one that a direction crosses
+    has the largest projection on its normal over its offset from the centre.
+
+    Returns:
+        About the distance to the nearest seam (N,), and whether the panel is a pentagon
+        (N,).
     """
     # offsets of the two kinds of faces from the centre
     pentagon = direction @ PENTAGONS.T / 0.9393
@@ -68,46 +72,52 @@ def football_seams(direction: Array) -> tuple[Array, Array]:
     return both[:, -1] - both[:, -2], pentagon.max(axis=1) > hexagon.max(axis=1)
 
 
-def basketball_seams(d: Array) -> Array:
-    """Return (N,) a distance to the nearest groove of a basketball."""
-    curve = np.abs(np.abs(d[:, 1]) - (0.42 + 0.38 * d[:, 2] ** 2))
-    return np.asarray(
-        np.min(
-            [np.abs(d[:, 0]), np.abs(d[:, 2]), np.where(d[:, 1] != 0.0, curve, 1.0)],
-            axis=0,
-        )
-    )
+def basketball_seams(directions: Array) -> Array:
+    """Return about the distance (N,) of unit directions (N, 3) to the nearest seam.
+
+    A basketball has two great circles as seams, and a curve on either side of y = 0
+    that comes closest to it, 0.42, where z is 0.
+    """
+    x, y, z = np.abs(directions).T
+    curved_seam = np.abs(y - (0.42 + 0.38 * z**2))
+    return np.asarray(np.minimum(np.minimum(x, z), curved_seam))
 
 
-def tennis_seam(d: Array) -> Array:
-    """Return (N,) a distance to the seam of a tennis ball."""
-    return (
-        np.abs(
-            d[:, 0] ** 2 - d[:, 1] ** 2 - 0.75 * d[:, 2] * (1.2 - 0.2 * d[:, 2] ** 2)
-        )
-        * 0.5
-    )
+def tennis_seam(directions: Array) -> Array:
+    """Return about the distance (N,) of unit directions (N, 3) to the seam.
+
+    The seam of a tennis ball is where a polynomial is 0; half its value is about the
+    distance.
+    """
+    x, y, z = directions.T
+    return np.asarray(np.abs(x**2 - y**2 - 0.75 * z * (1.2 - 0.2 * z**2)) * 0.5)
 
 
-def _grooved(
+def _press_seams(
     patches: list[Patch], radius: float, depth: float, seam: Callable[[Array], Array]
 ) -> list[Patch]:
-    """Press the seams into the sphere.
+    """Press grooves along seams into a sphere.
 
     Normals stay those of the sphere: the groove is a shade, not an edge.
+
+    Args:
+        patches: of the sphere, around the origin.
+        radius: of the sphere.
+        depth: of the groove, as a fraction of the radius; it falls as a Gaussian.
+        seam: returns the distance (N,) of unit directions (N, 3) to the seam.
     """
-    depths = (
-        depth * np.exp(-((seam(patch.vertices / radius) / 0.03) ** 2))
-        for patch in patches
-    )
-    return [
-        replace(p, vertices=p.vertices * (1.0 - by)[:, None])
-        for p, by in zip(patches, depths, strict=True)
-    ]
+    pressed = []
+    for patch in patches:
+        seam_distance = seam(patch.vertices / radius)
+        fraction = depth * np.exp(-((seam_distance / 0.03) ** 2))
+        vertices = patch.vertices * (1.0 - fraction)[:, None]
+        pressed.append(replace(patch, vertices=vertices))
+    return pressed
 
 
 @painter
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
+    """Paint dark pentagons, light hexagons and gray seams."""
     seam_distance, pentagon = football_seams(shapes.normalize(t.xyz))
     base = (
         mix(light, dark, pentagon.astype(np.float64))
@@ -118,22 +128,22 @@ def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
 
 @painter
 def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array:
-    angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
-    pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
-    return np.where(
-        pole[:, None],
-        light,
-        np.array(colors)[np.minimum((angle * 6).astype(np.int64), 5)],
-    )
+    """Paint six segments in colors, and light caps at both poles."""
+    turn = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
+    segment = np.minimum((turn * 6).astype(np.int64), 5)  # a turn may round to 1
+    is_pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
+    return np.where(is_pole[:, None], light, np.array(colors)[segment])
 
 
 @painter
 def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
+    """Return the mask of texels of a sphere that are within `reach` of a seam."""
     return step(-seam(shapes.normalize(t.xyz)), -reach, 0.02)
 
 
 @painter
 def _star(t: Texels, radius: float) -> Array:
+    """Return the mask of a star with five points on a sphere, seen along z."""
     x = t.xyz[:, 0]
     y = t.xyz[:, 1]
     return step(
@@ -148,10 +158,10 @@ def ball(draw: ParameterSampler) -> Instance:
     style = draw.pick(
         "football", "beach", "basket", "tennis", "star", "plain", "wild", "wild"
     )
-    squash = draw(1.0, 0.95, 1.03)
+    squash = draw(1.0, low=0.95, high=1.03)
     patches = shapes.sphere("ball", radius, rows=28, columns=48)
-    turn = shapes.rotation("z", draw(12.0, 0.0, 360.0)) @ shapes.rotation(
-        "x", draw(24.0, 0.0, 180.0)
+    turn = shapes.rotation("z", draw(12.0, low=0.0, high=360.0)) @ shapes.rotation(
+        "x", draw(24.0, low=0.0, high=180.0)
     )
     offset = draw.offset()
     light = draw.sample_color("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
@@ -189,7 +199,7 @@ def _ball_surface(
             _near_to(basketball_seams, 0.03),
             solid("1b1715"),
         )
-        patches = _grooved(patches, radius, 0.015, basketball_seams)
+        patches = _press_seams(patches, radius, 0.015, basketball_seams)
     elif style == "tennis":
         felt = draw.sample_color("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
         paint = over(
@@ -205,7 +215,7 @@ def _ball_surface(
         paint = sample_paint(draw, 2 * radius)
     else:
         paint = _football(light, dark, offset)
-        patches = _grooved(
+        patches = _press_seams(
             patches,
             radius,
             0.008,
@@ -217,20 +227,20 @@ def _ball_surface(
 @family(metres=0.01)
 def banana(draw: ParameterSampler) -> Instance:
     """Make a banana of random bend and ripeness."""
-    length = draw(19.0, 15.0, 22.0)
-    bend = draw(105.0, 65.0, 130.0)
-    thick = draw(1.65, 1.45, 2.1)
-    stem = draw(2.4, 1.6, 3.6)
+    length = draw(19.0, low=15.0, high=22.0)
+    bend = draw(105.0, low=65.0, high=130.0)
+    thick = draw(1.65, low=1.45, high=2.1)
+    stem = draw(2.4, low=1.6, high=3.6)
     path, radius = _banana_shape(draw, bend, length, stem, thick)
     section = _banana_section(draw)
     patches = shapes.sweep(
         "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
     )
     patches = shapes.transform_patches(
-        patches, shapes.rotation("y", draw(9.0, 0.0, 14.0))
+        patches, shapes.rotation("y", draw(9.0, low=0.0, high=14.0))
     )
     patches = shapes.transform_patches(
-        patches, shapes.rotation("z", draw(78.0, 45.0, 120.0))
+        patches, shapes.rotation("z", draw(78.0, low=45.0, high=120.0))
     )
 
     paint = _banana_paint(draw, path, stem)
@@ -245,27 +255,39 @@ def banana(draw: ParameterSampler) -> Instance:
 def _banana_shape(
     draw: ParameterSampler, bend: float, length: float, stem: float, thick: float
 ) -> tuple[Array, Array]:
-    """Return the path (N, 3) of a banana, and its radius (N,) along it."""
+    """Return the path (N, 3) of a banana from its stem, and its radius (N,) along it.
+
+    Args:
+        draw: samples the thickness of the stem.
+        bend: by how many degrees the path turns, a little more at both ends.
+        length: of the path.
+        stem: length of the stem.
+        thick: the largest radius.
+    """
     count = 44
     t = np.linspace(0.0, 1.0, count)
     angle = np.radians(bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2)[:-1]
     path = np.zeros((count, 3))
-    path[1:, 0], path[1:, 1] = (
-        np.cumsum(turn(angle)) * (length / (count - 1)) for turn in (np.sin, np.cos)
-    )
-    at = t * length
-    body = np.clip((at - stem) / (0.26 * length), 0.0, 1.0) ** 0.75
-    taper = np.clip((length - at) / (0.24 * length), 0.0, 1.0) ** 0.62
-    neck = draw(0.3, 0.24, 0.4)
-    full = np.sin(0.5 * np.pi * body) * np.maximum(np.sin(0.5 * np.pi * taper), 0.26)
-    radius = thick * np.maximum(neck * (1.0 + 0.25 * np.exp(-at / 0.5)), full)
+    path[1:, 0] = np.cumsum(np.sin(angle)) * (length / (count - 1))
+    path[1:, 1] = np.cumsum(np.cos(angle)) * (length / (count - 1))
+
+    position = t * length
+    # rises from the stem, and falls to a blunt tip
+    rise = np.clip((position - stem) / (0.26 * length), 0.0, 1.0) ** 0.75
+    fall = np.clip((length - position) / (0.24 * length), 0.0, 1.0) ** 0.62
+    body = np.sin(0.5 * np.pi * rise) * np.maximum(np.sin(0.5 * np.pi * fall), 0.26)
+    # the stem is thicker where it was cut
+    neck = draw(0.3, low=0.24, high=0.4)
+    stem_radius = neck * (1.0 + 0.25 * np.exp(-position / 0.5))
+    radius = thick * np.maximum(stem_radius, body)
+    # smoothed by a mean of five
     radius = np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
     return path, radius
 
 
 def _banana_section(draw: ParameterSampler) -> Array:
     """Sample the section (M, 2) of a banana, with five ridges."""
-    ridge = draw(0.06, 0.02, 0.1)
+    ridge = draw(0.06, low=0.02, high=0.1)
     phi = 2 * np.pi * np.arange(30) / 30
     lumps = 1.0 + ridge * (np.abs(np.cos(2.5 * phi)) - 0.6)
     return np.stack([np.cos(phi), np.sin(phi)], axis=1) * lumps[:, None]
@@ -276,25 +298,25 @@ def _banana_paint(draw: ParameterSampler, path: Array, stem: float) -> Paint:
     offset = draw.offset()
     skin = draw.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
     tip, brown, green = map(parse_hex_color, ("3a2a18", "6b4520", "a9b13c"))
-    amount = draw(0.1, 0.0, 0.22)
-    heads = path[[0, -1]]
+    amount = draw(0.1, low=0.0, high=0.22)
 
     def paint(t: Texels) -> Array:
+        """Paint the skin, then green, flecks, the brown stem and both dark ends."""
         xyz = t.xyz
-        start, end = (np.linalg.norm(xyz - head, axis=1) for head in heads)
-        base = mix(skin, shade(skin, 0.86), noise(xyz / 2.2 + offset))
-        base = mix(
-            base, green, np.clip(1.0 - (start - 0.9 * stem) / 2.6, 0.0, 1.0) * 0.75
-        )
-        base = mix(base, green, np.clip(1.0 - end / 2.2, 0.0, 1.0) * 0.5)
+        stem_distance = np.linalg.norm(xyz - path[0], axis=1)
+        tip_distance = np.linalg.norm(xyz - path[-1], axis=1)
+        color = mix(skin, shade(skin, 0.86), noise(xyz / 2.2 + offset))
+        stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem) / 2.6, 0.0, 1.0)
+        color = mix(color, green, stem_green * 0.75)
+        color = mix(color, green, np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0) * 0.5)
         fleck = step(
             noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, 0.08
         )
         fleck = np.maximum(fleck, step(noise(xyz * 3.7 + offset), 1.02 - amount, 0.08))
-        base = mix(base, brown, fleck * 0.85)
-        base = mix(base, brown, step(-start, -0.5 * stem, 1.3) * 0.5)
-        base = mix(base, tip, step(-start, -0.45, 0.5))
-        return mix(base, tip, step(-end, -0.75, 0.5))
+        color = mix(color, brown, fleck * 0.85)
+        color = mix(color, brown, step(-stem_distance, -0.5 * stem, 1.3) * 0.5)
+        color = mix(color, tip, step(-stem_distance, -0.45, 0.5))
+        return mix(color, tip, step(-tip_distance, -0.75, 0.5))
 
     return paint
 
@@ -305,12 +327,12 @@ def book(draw: ParameterSampler) -> Instance:
 
     The spine runs along y at -x; the pages show at the other three sides.
     """
-    width = draw(15.5, 12.0, 18.0)
+    width = draw(15.5, low=12.0, high=18.0)
     height = 22.5
-    thick = draw(4.2, 2.2, 6.0)
-    board = draw(0.34, 0.2, 0.45)
-    lip = draw(0.4, 0.2, 0.6)
-    bulge = draw(0.35, 0.0, 0.7)
+    thick = draw(4.2, low=2.2, high=6.0)
+    board = draw(0.34, low=0.2, high=0.45)
+    lip = draw(0.4, low=0.2, high=0.6)
+    bulge = draw(0.35, low=0.0, high=0.7)
     patches: list[Patch] = []
     for z in (board / 2, thick - board / 2):
         patches += shapes.box("cover", (0.25, 0.0, z), (width, height, board), 0.12)
@@ -318,7 +340,7 @@ def book(draw: ParameterSampler) -> Instance:
     patches += shapes.box("pages", (0.3 - lip / 2, 0.0, thick / 2), size, 0.05, steps=1)
     patches += _round_spine(thick, width, bulge, board, height)
     turned = shapes.transform_patches(
-        patches, shapes.rotation("z", draw(-122.0, -150.0, -100.0))
+        patches, shapes.rotation("z", draw(-122.0, low=-150.0, high=-100.0))
     )
 
     front, pages_paint, spine = _book_paints(draw, height, width, thick)
@@ -360,13 +382,12 @@ def _book_paints(
     base = paint_or_random(draw, height, clouded(cloth, 0.85, 0.6, offset, 1.2), 0.3)
     title = draw.pick("frame", "blocks", "picture", "plain")
     front = _front(draw, base, gold, title, width, height, thick)
-    paper = (
-        parse_hex_color("ece2c8")
-        if draw.chance(0.7, True)
-        else parse_hex_color("f4f2ea")
-    )
+    paper = parse_hex_color("f4f2ea")
+    if draw.chance(0.7, canonical=True):
+        paper = parse_hex_color("ece2c8")
 
     def pages_paint(t: Texels) -> Array:
+        """Paint the edges of pages: fine lines along them."""
         lines = noise(
             np.stack(
                 [t.xyz[:, 2] * 9.0, 0.08 * t.xyz[:, 0], 0.08 * t.xyz[:, 1]], axis=1
@@ -376,6 +397,7 @@ def _book_paints(
         return np.asarray(paper * (0.72 + 0.28 * lines)[:, None])
 
     def spine(t: Texels) -> Array:
+        """Paint two bands at each end, and words in a block in the middle."""
         y = np.abs(t.xyz[:, 1]) / height
         band = np.maximum(
             step(0.008 - np.abs(y - 0.36), 0.0, 0.006),
@@ -443,13 +465,21 @@ def _front(
     height: float,
     thick: float,
 ) -> Paint:
-    """Paint the front cover with a title and decoration."""
+    """Paint the front cover with a title and decoration.
+
+    A title "plain" has none; "picture" has a picture with a round spot, "frame" a frame
+    around the cover; "blocks" and "frame" have a ring as a seal. All but plain ones
+    have lines of words.
+    """
     accent = draw.sample_color("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
-    def inside(x: Array, y: Array, w: float, h: float) -> Array:
-        return step(w - np.abs(x), 0.0, 0.12) * step(h - np.abs(y), 0.0, 0.12)
+    def inside(x: Array, y: Array, half_width: float, half_height: float) -> Array:
+        """Return the mask of a rectangle around the origin."""
+        in_width = step(half_width - np.abs(x), 0.0, 0.12)
+        return in_width * step(half_height - np.abs(y), 0.0, 0.12)
 
     def paint(t: Texels) -> Array:
+        """Paint the base, and on the upper side the decoration and the words."""
         x = t.xyz[:, 0] - 0.25
         y = -t.xyz[:, 1]
         top = (t.xyz[:, 2] > thick - 0.1).astype(np.float64)
@@ -548,34 +578,41 @@ FINISHES = {
 }
 
 
+def _word_strokes(letters: str, height: float) -> list[Array]:
+    """Return the polylines (K, 2) of a word around the origin, letters `height` high."""
+    strokes = []
+    for k, letter in enumerate(letters):
+        left = ((k - len(letters) / 2) * 0.74 + 0.07) * height
+        corner = np.array([left, -height / 2])
+        strokes += [np.array(path) * height + corner for path in _STROKES[letter]]
+    return strokes
+
+
 @painter
 def _face(t: Texels, red: Array, radius: float) -> Array:
     """Paint the word in white on red, with a white rim, on an octagon before it is
     raised.
     """
-    inner = radius * np.cos(np.pi / 8)
-    turns = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
+    apothem = radius * np.cos(np.pi / 8)
+    side_angles = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
     y = t.xyz[:, 1]
     z = t.xyz[:, 2]
-    out = np.max([y * np.cos(a) + z * np.sin(a) for a in turns], axis=0)
-    rim = step(out - 0.915 * inner, 0.0, 0.006) * step(0.985 * inner - out, 0.0, 0.006)
-    high = 0.52 * inner
-    letters = "STOP"
-    strokes = [
-        np.array(path) * high
-        + np.array([((k - len(letters) / 2) * 0.74 + 0.07) * high, -high / 2])
-        for k, letter in enumerate(letters)
-        for path in _STROKES[letter]
-    ]
-    word = step(0.05 * inner - shapes.distance_to_polylines(y, z, *strokes), 0.0, 0.006)
+    # of the octagon through each texel, the apothem
+    out = np.max([y * np.cos(a) + z * np.sin(a) for a in side_angles], axis=0)
+    rim = step(out - 0.915 * apothem, 0.0, 0.006)
+    rim = rim * step(0.985 * apothem - out, 0.0, 0.006)
+
+    strokes = _word_strokes("STOP", 0.52 * apothem)
+    stroke_distance = shapes.distance_to_polylines(y, z, *strokes)
+    word = step(0.05 * apothem - stroke_distance, 0.0, 0.006)
     return mix(red, parse_hex_color("f3f2ee"), np.maximum(rim, word))
 
 
 @family(metres=1.0, texels=192)
 def stop_sign(draw: ParameterSampler) -> Instance:
     """Make a stop sign on a post."""
-    radius = draw(0.45, 0.4, 0.5)
-    height = draw(0.74, 0.66, 0.84)
+    radius = draw(0.45, low=0.4, high=0.5)
+    height = draw(0.74, low=0.66, high=0.84)
     red = draw.sample_color("b3121d", "a8161f", "c0202a", wild=0.0)
     plate = _sign_plate(radius, height)
     post = _sign_post(height, radius)
@@ -595,7 +632,8 @@ def stop_sign(draw: ParameterSampler) -> Instance:
         "rubber": solid("1d1d1f"),
     }
     turned = shapes.transform_patches(
-        [*plate, *post, *foot, *clamps], shapes.rotation("z", draw(0.0, -25.0, 25.0))
+        [*plate, *post, *foot, *clamps],
+        shapes.rotation("z", draw(0.0, low=-25.0, high=25.0)),
     )
     return Instance(
         turned,

@@ -28,25 +28,34 @@ from advsearch.questions.harden.objects.textures import (
 def _claw(
     draw: ParameterSampler, half: float, start: float, length: float, drop: float
 ) -> list[Patch]:
-    """Two tapering prongs that curve downwards (towards -x) from the head, along +y."""
-    spread = draw(0.34, 0.2, 0.5)
-    t = np.linspace(0.0, 1.0, 14)
-    thick = half * (0.72 * (1 - t) + 0.1)
-    broad = half * 0.47 * (1.0 - 0.25 * t)
-    scale = np.stack([thick, broad], axis=1)
+    """Create two tapering prongs that curve downwards (towards -x) from the head.
+
+    Args:
+        draw: samples how far they spread.
+        half: half the width of the head.
+        start: y of their roots.
+        length: along +y.
+        drop: by how much their tips are lower than their roots.
+    """
+    spread = draw(0.34, low=0.2, high=0.5)
+    t = np.linspace(0.0, 1.0, 14)  # from the root to the tip
+    half_thickness = half * (0.72 * (1 - t) + 0.1)
+    half_width = half * 0.47 * (1.0 - 0.25 * t)
+    scale = np.stack([half_thickness, half_width], axis=1)
     section = shapes.rectangle(2.0, 2.0, 0.5, 2)
     patches = []
     for side in (-1.0, 1.0):
-        down = 0.25 * half - drop * t**1.8
-        along = start + length * (t - 0.1 * t**2)
-        curve = np.stack([down, along, side * half * (0.5 + spread * t)], axis=1)
+        x = 0.25 * half - drop * t**1.8
+        y = start + length * (t - 0.1 * t**2)
+        z = side * half * (0.5 + spread * t)
+        curve = np.stack([x, y, z], axis=1)
         patches += shapes.sweep(
             "head", curve, section, scale, first=(1.0, 0.0, 0.0), caps=True
         )
     return patches
 
 
-def _along_y(*positions: float) -> Array:
+def _points_on_y(*positions: float) -> Array:
     """Return points (K, 3) on the y axis."""
     return np.array([(0.0, y, 0.0) for y in positions])
 
@@ -54,15 +63,24 @@ def _along_y(*positions: float) -> Array:
 def _peen(
     draw: ParameterSampler, half: float, start: float, length: float
 ) -> list[Patch]:
-    """A wedge (cross peen) or a ball at the back of the head, along +y."""
+    """Create a wedge (cross peen) or a ball at the back of the head, along +y.
+
+    Args:
+        draw: chooses between both.
+        half: half the width of the head.
+        start: y of its root.
+        length: along +y.
+    """
     if draw.chance(0.5):
-        neck = _along_y(start - 0.3, start + 0.5 * length)
-        middle = (0.0, start + 0.75 * length, 0.0)
+        neck = _points_on_y(start - 0.3, start + 0.5 * length)
+        center = (0.0, start + 0.75 * length, 0.0)
         stem = shapes.sweep(
             "head", neck, shapes.ellipse(1, 1, 20), np.array([0.75, 0.6]) * half
         )
-        return stem + shapes.sphere("head", 0.95 * half, middle, 16, 24)
-    path = _along_y(start, start + 0.3 * length, start + 0.9 * length, start + length)
+        return stem + shapes.sphere("head", 0.95 * half, center, rows=16, columns=24)
+    path = _points_on_y(
+        start, start + 0.3 * length, start + 0.9 * length, start + length
+    )
     scale = np.array([[0.95, 0.95], [0.85, 0.95], [0.22, 0.9], [0.12, 0.85]]) * half
     return shapes.sweep(
         "head",
@@ -80,23 +98,26 @@ def hammer(draw: ParameterSampler) -> Instance:
 
     The head is at the origin, and its striking face at -y.
     """
-    half = draw(1.35, 1.15, 1.7)
-    length = draw(27.0, 20.0, 31.0)
-    front = draw(5.0, 3.8, 6.0)
-    face = half * draw(1.1, 1.0, 1.35)
+    half = draw(1.35, low=1.15, high=1.7)
+    length = draw(27.0, low=20.0, high=31.0)
+    front = draw(5.0, low=3.8, high=6.0)
+    face = half * draw(1.1, low=1.0, high=1.35)
     style = draw.pick("claw", "claw", "peen", "sledge")
-    eye = half * draw(1.25, 1.1, 1.5)
+    eye = half * draw(1.25, low=1.1, high=1.5)
     front = max(front, 2.2 * eye)
 
     head = _hammer_head(draw, half, eye, style, front, face)
 
-    belly, thick, stick = _hammer_stick(draw, half, length)
+    swelling, half_thickness, handle = _hammer_handle(draw, half, length)
 
-    top = max(half * 1.05, face if style != "sledge" else face * 1.2)
-    tilt = np.degrees(np.arctan2(top - thick * (1.0 + belly), 0.8 * length))
+    # It lies on the head and on the swelling of the handle.
+    head_height = max(half * 1.05, face * 1.2 if style == "sledge" else face)
+    tilt = np.degrees(
+        np.arctan2(head_height - half_thickness * (1.0 + swelling), 0.8 * length)
+    )
     patches = shapes.transform_patches(
-        shapes.transform_patches([*head, *stick], shapes.rotation("y", -float(tilt))),
-        shapes.rotation("z", draw(58.0, 20.0, 90.0)),
+        shapes.transform_patches([*head, *handle], shapes.rotation("y", -float(tilt))),
+        shapes.rotation("z", draw(58.0, low=20.0, high=90.0)),
     )
 
     paints = _hammer_paints(draw, front, length)
@@ -111,9 +132,22 @@ def _hammer_head(
     front: float,
     face: float,
 ) -> list[Patch]:
-    """Create the head of a hammer of a style."""
+    """Create the head of a hammer of a style.
+
+    Around the eye, through which the handle goes, is a block. A sledge's head is one
+    block instead; other heads have a neck and a face in front, and a claw or a peen
+    behind.
+
+    Args:
+        draw: samples the shape of the block, the claw or the peen.
+        half: half the width of the block around the eye.
+        eye: half its length, about.
+        style: "claw", "peen" or "sledge".
+        front: length from the eye to the striking face.
+        face: radius of the face.
+    """
     scale = np.array([[0.82, 0.82], [1, 1], [1, 1], [0.86, 0.86]]) * half * 1.05
-    path = _along_y(-eye * 1.1, -eye * 0.9, eye * 0.9, eye * 1.15)
+    path = _points_on_y(-eye * 1.1, -eye * 0.9, eye * 0.9, eye * 1.15)
     head = shapes.sweep(
         "head",
         path,
@@ -123,7 +157,7 @@ def _hammer_head(
         caps=True,
     )
     if style == "sledge":
-        path = _along_y(-front, -front + 0.3, front - 0.3, front)
+        path = _points_on_y(-front, -front + 0.3, front - 0.3, front)
         section = (
             shapes.polygon(8, 0.1)
             if draw.chance(0.5)
@@ -134,7 +168,7 @@ def _hammer_head(
             "head", path, section, scale, first=(1.0, 0.0, 0.0), caps=True
         )
     else:
-        path = _along_y(
+        path = _points_on_y(
             -eye * 0.9,
             -eye * 1.2,
             -0.62 * front,
@@ -156,41 +190,59 @@ def _hammer_head(
         )
         if style == "claw":
             head += _claw(
-                draw, half, eye * 0.95, draw(6.4, 5.0, 7.5), draw(2.6, 1.2, 3.6)
+                draw,
+                half,
+                eye * 0.95,
+                draw(6.4, low=5.0, high=7.5),
+                draw(2.6, low=1.2, high=3.6),
             )
         else:
-            head += _peen(draw, half, eye, draw(4.0, 3.0, 5.0))
+            head += _peen(draw, half, eye, draw(4.0, low=3.0, high=5.0))
     return head
 
 
-def _hammer_stick(
+def _hammer_handle(
     draw: ParameterSampler, half: float, length: float
 ) -> tuple[float, float, list[Patch]]:
-    """Create the handle of a hammer; also return its swelling and its thickness."""
-    t = np.linspace(0.0, 1.0, 30)
-    belly = draw(0.16, 0.0, 0.3)
-    grip = (
+    """Create the handle of a hammer, from the head along -x.
+
+    It swells near its end, where it is held, is thinner in the middle, and its end is
+    rounded.
+
+    Args:
+        draw: samples its thickness and its section, an ellipse or a rounded square.
+        half: half the width of the head.
+        length: from the head to the end.
+
+    Returns:
+        By what fraction it swells, half its thickness, and its patches.
+    """
+    t = np.linspace(0.0, 1.0, 30)  # from the head to the end
+    swelling = draw(0.16, low=0.0, high=0.3)
+    swell = (
         1.0
-        + belly * np.exp(-(((t - 0.78) / 0.14) ** 2))
-        - 0.5 * belly * np.exp(-(((t - 0.45) / 0.2) ** 2))
+        + swelling * np.exp(-(((t - 0.78) / 0.14) ** 2))
+        - 0.5 * swelling * np.exp(-(((t - 0.45) / 0.2) ** 2))
     )
-    ends = np.sqrt(
-        np.clip(1.0 - ((t - 0.95) / 0.05).clip(0.0, 1.0) ** 2 * 0.999, 0.0, 1.0)
+    # A quarter of an ellipse over the last twentieth. With 0.999 it does not close by
+    # itself; the last scale, which is set to 0, closes the surface.
+    end_fraction = ((t - 0.95) / 0.05).clip(0.0, 1.0)
+    round_end = np.sqrt(np.clip(1.0 - end_fraction**2 * 0.999, 0.0, 1.0))
+    round_end[-1] = 0.0
+    half_thickness = half * draw(0.72, low=0.6, high=0.9)
+    half_width = half * draw(0.92, low=0.75, high=1.1)
+    top = half * 1.18  # x of the end that sticks out of the head
+    path = np.stack([top - (length + top) * t, 0 * t, 0 * t], axis=1)
+    scale = np.stack(
+        [half_width * swell * round_end, half_thickness * swell * round_end], axis=1
     )
-    ends[-1] = 0.0
-    thick = half * draw(0.72, 0.6, 0.9)
-    broad = half * draw(0.92, 0.75, 1.1)
-    reach = half * 1.18
-    path = np.stack([reach - (length + reach) * t, 0 * t, 0 * t], axis=1)
-    scale = np.stack([broad * grip * ends, thick * grip * ends], axis=1)
-    scale[0] *= 0.9
-    section = (
-        shapes.ellipse(1.0, 1.0, 24)
-        if draw.chance(0.6, True)
-        else shapes.rectangle(2.0, 2.0, 0.7)
-    )
-    stick = shapes.sweep("handle", path, section, scale, first=(0.0, 1.0, 0.0))
-    return belly, thick, stick
+    scale[0] *= 0.9  # a bevel at the head
+    if draw.chance(0.6, canonical=True):
+        section = shapes.ellipse(1.0, 1.0, 24)
+    else:
+        section = shapes.rectangle(2.0, 2.0, 0.7)
+    handle = shapes.sweep("handle", path, section, scale, first=(0.0, 1.0, 0.0))
+    return swelling, half_thickness, handle
 
 
 def _hammer_paints(
@@ -216,7 +268,9 @@ def _hammer_paints(
     if kind == "dipped":
         hold = over(
             timber,
-            between(-2 * length, -draw(0.5, 0.4, 0.7) * length, axis=0, soft=0.05),
+            between(
+                -2 * length, -draw(0.5, low=0.4, high=0.7) * length, axis=0, soft=0.05
+            ),
             solid(stain),
         )
     elif kind == "rubber":
@@ -235,8 +289,14 @@ def _hammer_paints(
 def _weights(
     draw: ParameterSampler, style: str, at: float, length: float, radius: float
 ) -> list[Patch]:
-    """Create the weight on the +x end of the bar, built along z and rotated
-    afterwards.
+    """Create the weight on one end of the bar, built along z and rotated afterwards.
+
+    Args:
+        draw: chooses the nut of plates.
+        style: "hex", "globe", "plates" (three, each smaller, and a nut) or "round".
+        at: z of its inner side.
+        length: along z.
+        radius: of the weight.
     """
     if style == "hex":
         path = [
@@ -256,20 +316,26 @@ def _weights(
         )
     if style == "globe":
         return shapes.sphere("weight", radius * 0.95, (0.0, 0.0, at + 0.8 * radius))
-    plates = 3 if style == "plates" else 1
+    n_plates = 3 if style == "plates" else 1
     patches = []
     z = at
-    for i in range(plates):
-        thick = length / plates * 0.94
-        size = radius * (1.0 - 0.17 * i)
-        bevel = min(0.25 * thick, 0.6)
+    for i in range(n_plates):
+        thickness = length / n_plates * 0.94  # the rest is a gap
+        plate_radius = radius * (1.0 - 0.17 * i)
+        hub_radius = 0.55 * plate_radius
+        bevel = min(0.25 * thickness, 0.6)
         side = shapes.round_corners(
-            [(0.55 * size, z), (size, z), (size, z + thick), (0.55 * size, z + thick)],
+            [
+                (hub_radius, z),
+                (plate_radius, z),
+                (plate_radius, z + thickness),
+                (hub_radius, z + thickness),
+            ],
             bevel,
             4,
         )
-        under = [(0.0, z), (0.55 * size, z)]
-        top = [(0.55 * size, z + thick), (0.0, z + thick)]
+        under = [(0.0, z), (hub_radius, z)]
+        top = [(hub_radius, z + thickness), (0.0, z + thickness)]
         patches += shapes.lathe(
             [
                 ("weight", under),
@@ -278,11 +344,11 @@ def _weights(
             ],
             44,
         )
-        z += length / plates
+        z += length / n_plates
     if style == "plates":
-        nut = (
-            shapes.polygon(6, 0.1) if draw.chance(0.5) else shapes.ellipse(1.0, 1.0, 24)
-        )
+        nut = shapes.ellipse(1.0, 1.0, 24)
+        if draw.chance(0.5):
+            nut = shapes.polygon(6, 0.1)
         path = [(0, 0, z - 0.1), (0, 0, z + 0.6), (0, 0, z + 0.75)]
         scale = np.array([1.0, 1.0, 0.85]) * 0.42 * radius
         patches += shapes.sweep(
@@ -295,11 +361,11 @@ def _weights(
 def dumbbell(draw: ParameterSampler) -> Instance:
     """Make a dumbbell with weights of random shape."""
     style = draw.pick("hex", "plates", "hex", "round", "globe")
-    radius = draw(4.6, 3.6, 6.2)
-    grip = draw(5.6, 5.0, 7.0)
-    length = draw(5.6, 3.8, 7.0)
-    bar = draw(1.45, 1.2, 1.9)
-    swell = draw(0.16, 0.0, 0.3)
+    radius = draw(4.6, low=3.6, high=6.2)
+    grip = draw(5.6, low=5.0, high=7.0)
+    length = draw(5.6, low=3.8, high=7.0)
+    bar = draw(1.45, low=1.2, high=1.9)
+    swell = draw(0.16, low=0.0, high=0.3)
     z = np.linspace(-grip - 0.6, grip + 0.6, 25)
     profile = np.stack(
         [bar * (1.0 + swell * np.cos(np.pi * z / (2 * grip + 1.2)) ** 2), z], axis=1
@@ -312,7 +378,7 @@ def dumbbell(draw: ParameterSampler) -> Instance:
     )
     laid = shapes.transform_patches(
         shapes.transform_patches(patches, shapes.rotation("y", 90.0)),
-        shapes.rotation("z", draw(118.0, 90.0, 150.0)),
+        shapes.rotation("z", draw(118.0, low=90.0, high=150.0)),
     )
     paints = _dumbbell_paints(draw, grip, style, length, radius)
     return Instance(laid, paints, sample_material(draw, 0.42, 0.2))
@@ -331,11 +397,11 @@ def _dumbbell_paints(
         shade(iron, 1.9),
         0.35,
         offset,
-        draw(0.08, 0.0, 0.2),
+        draw(0.08, low=0.0, high=0.2),
     )
     tip = grip + (length if style != "globe" else 1.75 * radius)
     accent = draw.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
-    if draw.chance(0.5, True):
+    if draw.chance(0.5, canonical=True):
 
         def on_both_ends(t: Texels) -> Array:
             ring = band_mask(

@@ -1,5 +1,8 @@
-"""Open containers of revolution: mug, bowl, bottle, vase, wine glass; in
-centimeters.
+"""Open containers of revolution: mug, bowl, bottle, vase, wine glass.
+
+Lengths are in centimeters, and z is up. A number `draw(9.4, low=7.6, high=12.0)` is 9.4
+of the canonical instance, and uniform between the bounds of others. Profiles are points
+(r, z).
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ from advsearch.questions.harden.objects.textures import (
 
 # turns the seam of a lathe away from the default camera, at azimuth 40
 SEAM_ROTATION = shapes.rotation("z", 220.0)
+HANDLE_POINTS = 26  # points of the curve of a handle
 
 
 def make_handle(
@@ -48,6 +52,8 @@ def make_handle(
 ) -> list[Patch]:
     """Create a handle in the x-z plane, on the +x side of a wall.
 
+    It is thicker at both roots. Its section is an ellipse or a rounded rectangle.
+
     Args:
         draw: samples its thickness.
         style: "round", "ear" (widest at the top), "square" or "loop" (small).
@@ -56,48 +62,73 @@ def make_handle(
         profile: of the wall (K, 2).
         inset: depth of the roots inside the wall.
     """
-    at_low, at_high = (shapes.radius_at_height(profile, z) - inset for z in (low, high))
-    edge = max(at_low, at_high)
-    if style == "square":
-        corners = [
-            (at_high, high),
-            (edge + reach, high),
-            (edge + reach, low),
-            (at_low, low),
-        ]
-        curve = shapes.spline(
-            shapes.subdivide(shapes.round_corners(corners, 0.45 * reach, 6), 0.8), 26
-        )
+    low_root = shapes.radius_at_height(profile, low) - inset
+    high_root = shapes.radius_at_height(profile, high) - inset
+    curve = _handle_curve(style, (low_root, low), (high_root, high), reach)
+    half_thickness = draw(0.42, low=0.32, high=0.6)
+    half_width = draw(0.62, low=0.4, high=0.95)
+    if draw.chance(0.7, canonical=True):
+        section = shapes.ellipse(half_thickness, half_width, 16)
     else:
-        tops = {
-            "round": (0.82, 0.98, 0.82),
-            "ear": (0.98, 0.9, 0.5),
-            "loop": (0.85, 1.0, 0.85),
-        }[style]
-        span = high - low
-        knots = [
-            (at_high, high),
-            (edge + 0.45 * reach, high + 0.04 * span),
-            (edge + tops[0] * reach, high - 0.16 * span),
-            (edge + tops[1] * reach, (low + high) / 2),
-            (edge + tops[2] * reach, low + 0.18 * span),
-            (edge + 0.3 * reach, low + 0.03 * span),
-            (at_low, low),
-        ]
-        curve = shapes.spline(knots, 26)
-    thick = draw(0.42, 0.32, 0.6)
-    broad = draw(0.62, 0.4, 0.95)
-    flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
-    section = shapes.ellipse(thick, broad, 16)
-    if not draw.chance(0.7, True):
-        section = shapes.rectangle(2 * thick, 2 * broad, 0.6 * thick)
-    return shapes.sweep("handle", shapes.to_xz_plane(curve), section, flare)
+        section = shapes.rectangle(
+            2 * half_thickness, 2 * half_width, bevel=0.6 * half_thickness
+        )
+    root_flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
+    return shapes.sweep("handle", shapes.to_xz_plane(curve), section, root_flare)
+
+
+def _handle_curve(
+    style: str,
+    low_root: tuple[float, float],
+    high_root: tuple[float, float],
+    reach: float,
+) -> Array:
+    """Return the curve (K, 2) of a handle from its upper to its lower root.
+
+    A square handle has two rounded bends; the others go through knots at three heights.
+
+    Args:
+        style: as for `make_handle`.
+        low_root, high_root: (r, z).
+        reach: its extent from the wall.
+    """
+    low = low_root[1]
+    high = high_root[1]
+    edge = max(low_root[0], high_root[0])
+    if style == "square":
+        corners = [high_root, (edge + reach, high), (edge + reach, low), low_root]
+        rounded = shapes.round_corners(corners, 0.45 * reach, 6)
+        return shapes.spline(shapes.subdivide(rounded, 0.8), HANDLE_POINTS)
+    # how far it extends at the top, the middle and the bottom, in units of `reach`
+    top, middle, bottom = {
+        "round": (0.82, 0.98, 0.82),
+        "ear": (0.98, 0.9, 0.5),
+        "loop": (0.85, 1.0, 0.85),
+    }[style]
+    height = high - low
+    knots = [
+        high_root,
+        (edge + 0.45 * reach, high + 0.04 * height),
+        (edge + top * reach, high - 0.16 * height),
+        (edge + middle * reach, (low + high) / 2),
+        (edge + bottom * reach, low + 0.18 * height),
+        (edge + 0.3 * reach, low + 0.03 * height),
+        low_root,
+    ]
+    return shapes.spline(knots, HANDLE_POINTS)
 
 
 def _ceramic(
     draw: ParameterSampler, height: float, glaze: Paint, accent: Paint
 ) -> Paint:
-    """Decorations a potter or a printer might put around a vessel of that height."""
+    """Sample a decoration as a potter or a printer puts it around a vessel.
+
+    Args:
+        draw: samples its kind, its proportions and the second color.
+        height: of the vessel.
+        glaze: the ground of most decorations, or the plain vessel.
+        accent: the paint of a single band, and of a dip.
+    """
     kind = draw.pick(
         "band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings"
     )
@@ -109,7 +140,9 @@ def _ceramic(
         return over(
             glaze,
             between(
-                draw(0.36, 0.1, 0.5) * height, draw(0.72, 0.55, 0.9) * height, soft=0.12
+                draw(0.36, low=0.1, high=0.5) * height,
+                draw(0.72, low=0.55, high=0.9) * height,
+                soft=0.12,
             ),
             accent,
         )
@@ -120,18 +153,20 @@ def _ceramic(
             rings(parse_hex_color(pale), second, 0.13 * height),
         )
     if kind == "dots":
-        return dots(glaze, second, draw(2.0, 1.2, 3.2), draw(0.3, 0.2, 0.4))
+        return dots(
+            glaze, second, draw(2.0, low=1.2, high=3.2), draw(0.3, low=0.2, high=0.4)
+        )
     if kind == "stripes":
         ground = draw.sample_color(pale, "f4f4f2")
         return stripes(
             ground,
             second,
-            draw(1.8, 1.0, 4.0),
-            draw(0.5, 0.25, 0.6),
+            draw(1.8, low=1.0, high=4.0),
+            draw(0.5, low=0.25, high=0.6),
             int(draw.pick(0, 2)),
         )
     if kind == "checks":
-        board = checks(draw.sample_color(pale), second, draw(1.4, 0.9, 2.2))
+        board = checks(draw.sample_color(pale), second, draw(1.4, low=0.9, high=2.2))
         return over(glaze, between(0.25 * height, 0.75 * height), board)
     if kind == "zigzag":
         return over(
@@ -141,14 +176,16 @@ def _ceramic(
         )
     if kind == "dip":
         return over(
-            glaze, between(draw(0.5, 0.3, 0.7) * height, 2 * height, soft=0.1), accent
+            glaze,
+            between(draw(0.5, low=0.3, high=0.7) * height, 2 * height, soft=0.1),
+            accent,
         )
     if kind == "rings":
         return rings(
             draw.sample_color(pale),
             second,
-            height * draw(0.12, 0.06, 0.25),
-            draw(0.5, 0.2, 0.7),
+            height * draw(0.12, low=0.06, high=0.25),
+            draw(0.5, low=0.2, high=0.7),
         )
     return glaze
 
@@ -156,17 +193,23 @@ def _ceramic(
 @family(metres=0.01)
 def mug(draw: ParameterSampler) -> Instance:
     """Make a mug with a handle."""
-    height = draw(9.4, 7.6, 12.0)
+    height = draw(9.4, low=7.6, high=12.0)
     wall, side, body = _mug_body(draw, height)
 
     style = draw.pick("ear", "round", "square", "loop")
-    grip_high = height * draw(0.85, 0.76, 0.88)
+    grip_high = height * draw(0.85, low=0.76, high=0.88)
     if style == "loop":
-        grip_low = height * draw(0.3, 0.34, 0.42)
+        grip_low = height * draw(0.3, low=0.34, high=0.42)
     else:
-        grip_low = height * draw(0.2, 0.16, 0.3)
+        grip_low = height * draw(0.2, low=0.16, high=0.3)
     grip = make_handle(
-        draw, style, grip_low, grip_high, draw(2.9, 2.3, 3.4), side, 0.55 * wall
+        draw,
+        style,
+        grip_low,
+        grip_high,
+        draw(2.9, low=2.3, high=3.4),
+        side,
+        0.55 * wall,
     )
 
     paints = _mug_paints(draw, height)
@@ -185,11 +228,11 @@ def _mug_body(
     """Create a mug without its handle; also return its wall's thickness and its side's
     profile.
     """
-    top = draw(4.15, 3.6, 5.0)
-    foot = top * draw(0.93, 0.72, 1.02)
-    belly = draw(0.0, -0.06, 0.13) * top
-    wall = draw(0.36, 0.28, 0.5)
-    low = draw(0.7, 0.3, 1.2)
+    top = draw(4.15, low=3.6, high=5.0)
+    foot = top * draw(0.93, low=0.72, high=1.02)
+    belly = draw(0.0, low=-0.06, high=0.13) * top
+    wall = draw(0.36, low=0.28, high=0.5)
+    low = draw(0.7, low=0.3, high=1.2)
     corners = [
         (foot - low, 0.0),
         (foot, low),
@@ -198,7 +241,7 @@ def _mug_body(
     ]
     side = shapes.spline(np.array(corners[1:]), 14)
     outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
-    body = shapes.vessel(outside, wall, draw(0.6, 0.5, 0.9))
+    body = shapes.vessel(outside, wall, draw(0.6, low=0.5, high=0.9))
     return wall, side, body
 
 
@@ -210,7 +253,11 @@ def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
     )
     specks = draw.sample_color("7d6247", wild=0.2)
     glaze = speckled(
-        clouded(clay, 0.93, 3.0, offset), specks, 0.28, offset, draw(0.06, 0.0, 0.14)
+        clouded(clay, 0.93, 3.0, offset),
+        specks,
+        0.28,
+        offset,
+        draw(0.06, low=0.0, high=0.14),
     )
     deep = draw.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
     accent = clouded(deep, 1.35, 2.2, offset)
@@ -218,11 +265,11 @@ def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
     inner = outer
     if not draw.chance(0.15):
         inner = glaze
-        if draw.chance(0.5, True):
+        if draw.chance(0.5, canonical=True):
             inner = solid(draw.sample_color("efe6d4", "f3f1ec", wild=0.3))
     raw_clay = solid("a98663")
     outside = outer
-    if draw.chance(0.4, True):
+    if draw.chance(0.4, canonical=True):
         outside = over(outer, between(-1.0, 0.35, soft=0.1), raw_clay)
     return {
         "outside": outside,
@@ -236,7 +283,7 @@ def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
 def bowl(draw: ParameterSampler) -> Instance:
     """Make a bowl."""
     radius = 8.0
-    height = radius * draw(0.86, 0.6, 1.0)
+    height = radius * draw(0.86, low=0.6, high=1.0)
     body = _bowl_body(draw, radius, height)
     offset = draw.offset()
     clay = draw.sample_color("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
@@ -266,10 +313,11 @@ def bowl(draw: ParameterSampler) -> Instance:
 
 def _bowl_body(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """Create the surface of a bowl."""
-    foot = radius * draw(0.42, 0.34, 0.55)
-    ring = draw(0.7, 0.15, 1.1)
-    full = draw(0.86, 0.72, 0.97)  # how far out the wall already is at half height
-    flare = draw(0.0, -0.03, 0.1) * radius
+    foot = radius * draw(0.42, low=0.34, high=0.55)
+    ring = draw(0.7, low=0.15, high=1.1)
+    # how far out the wall is at half height, in units of the radius
+    full = draw(0.86, low=0.72, high=0.97)
+    flare = draw(0.0, low=-0.03, high=0.1) * radius
     knots = [
         (foot * 1.04, ring),
         (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
@@ -279,7 +327,7 @@ def _bowl_body(draw: ParameterSampler, radius: float, height: float) -> list[Pat
     ]
     return shapes.vessel(
         np.array([(foot, 0.0), *shapes.spline(knots, 22)]),
-        draw(0.45, 0.32, 0.65),
+        draw(0.45, low=0.32, high=0.65),
         ring + 0.55,
         step=0.9,
     )
@@ -288,7 +336,7 @@ def _bowl_body(draw: ParameterSampler, radius: float, height: float) -> list[Pat
 @family(metres=0.01)
 def bottle(draw: ParameterSampler) -> Instance:
     """Make a bottle with a cap and perhaps a label."""
-    height = draw(30.0, 24.0, 32.0)
+    height = draw(30.0, low=24.0, high=32.0)
     shoulder, patches = _bottle_body(draw, height)
     paints = _bottle_paints(draw, height, shoulder)
     return Instance(
@@ -301,12 +349,12 @@ def bottle(draw: ParameterSampler) -> Instance:
 
 def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Patch]]:
     """Create the surface of a bottle; also return the height of its shoulder."""
-    radius = draw(3.75, 3.0, 4.8)
-    neck = draw(1.35, 1.0, 1.7)
-    shoulder = height * draw(0.62, 0.45, 0.68)
-    rise = height * draw(0.15, 0.08, 0.22)
-    slope = draw(0.35, 0.1, 0.8)  # 0: square shoulder, 1: sloping
-    taper = draw(1.0, 0.93, 1.03)
+    radius = draw(3.75, low=3.0, high=4.8)
+    neck = draw(1.35, low=1.0, high=1.7)
+    shoulder = height * draw(0.62, low=0.45, high=0.68)
+    rise = height * draw(0.15, low=0.08, high=0.22)
+    slope = draw(0.35, low=0.1, high=0.8)  # 0: square shoulder, 1: sloping
+    taper = draw(1.0, low=0.93, high=1.03)
     corners = [
         (radius * 0.82, 0.0),
         (radius * taper, 0.02 * height),
@@ -321,7 +369,7 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
     curve = shapes.round_corners(
         corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7
     )
-    wide = neck * 0.95 + draw(0.28, 0.1, 0.4)
+    wide = neck * 0.95 + draw(0.28, low=0.1, high=0.4)
     ring = [
         (wide, height - 1.5),
         (wide, height - 0.6),
@@ -330,7 +378,9 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
     ]
     capped = draw.chance(0.4)
     outside = np.concatenate([shapes.subdivide(curve, 1.6), ring])
-    patches = shapes.vessel(outside, draw(0.35, 0.3, 0.45), 0.8, step=1.6, columns=48)
+    patches = shapes.vessel(
+        outside, draw(0.35, low=0.3, high=0.45), 0.8, step=1.6, columns=48
+    )
     if capped:
         patches += _cap(draw, wide + 0.12, height)
     return shoulder, patches
@@ -348,12 +398,12 @@ def _bottle_paints(
     paper = draw.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
     ink = draw.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
     low = 0.14 * height
-    high = min(draw(0.44, 0.3, 0.5) * height, shoulder - 1.5)
+    high = min(draw(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
     outer = (
         surface if draw.chance(0.2) else _labelled(draw, surface, paper, ink, low, high)
     )
     foil = draw.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
-    if draw.chance(0.5, True):
+    if draw.chance(0.5, canonical=True):
         outer = over(
             outer,
             between(height * 0.8, 2 * height),
@@ -369,7 +419,7 @@ def _bottle_paints(
 
 def _cap(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """Create the cap of a bottle."""
-    low = height - draw(1.5, 0.9, 2.2)
+    low = height - draw(1.5, low=0.9, high=2.2)
     top = height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
     side = shapes.round_corners(
@@ -398,7 +448,7 @@ def _labelled(
     It has a frame, a title bar, lines of text and a round seal.
     """
     at = 180.0
-    half = draw(95.0, 60.0, 180.0)
+    half = draw(95.0, low=60.0, high=180.0)
     span = high - low
     label = over(surface, facing(at, half, low, high, 0.08), solid(paper))
     label = over(
@@ -465,12 +515,12 @@ def _vase_body(
     """Create a vase without handles; also return the heights of belly and neck, and its
     profile.
     """
-    foot = draw(3.6, 2.6, 4.4)
-    belly = draw(7.2, 5.2, 8.6)
-    belly_at = height * draw(0.52, 0.3, 0.68)
-    neck = draw(2.6, 2.2, 3.8)
-    neck_at = height * draw(0.84, 0.78, 0.88)
-    lip = neck + draw(1.5, 0.5, 2.6)
+    foot = draw(3.6, low=2.6, high=4.4)
+    belly = draw(7.2, low=5.2, high=8.6)
+    belly_at = height * draw(0.52, low=0.3, high=0.68)
+    neck = draw(2.6, low=2.2, high=3.8)
+    neck_at = height * draw(0.84, low=0.78, high=0.88)
+    lip = neck + draw(1.5, low=0.5, high=2.6)
     knots = [
         (foot, 0.0),
         (foot * 0.97, 0.5),
@@ -481,7 +531,7 @@ def _vase_body(
         (lip, height),
     ]
     profile = shapes.spline(knots, 34)
-    patches = shapes.vessel(profile, draw(0.4, 0.35, 0.6), 0.8, step=1.2)
+    patches = shapes.vessel(profile, draw(0.4, low=0.35, high=0.6), 0.8, step=1.2)
     return belly_at, neck_at, profile, patches
 
 
@@ -493,7 +543,9 @@ def _vase_handles(
     if draw.chance(0.25):
         low = belly_at + 0.15 * (neck_at - belly_at)
         high = neck_at - 0.2
-        ear = make_handle(draw, "ear", low, high, draw(1.6, 1.2, 2.4), profile, 0.2)
+        ear = make_handle(
+            draw, "ear", low, high, draw(1.6, low=1.2, high=2.4), profile, 0.2
+        )
         patches += [
             *shapes.transform_patches(ear, shapes.rotation("z", 130.0)),
             *shapes.transform_patches(ear, shapes.rotation("z", -50.0)),
@@ -540,9 +592,9 @@ def _vase_paint(
 @family(metres=0.01)
 def wine_glass(draw: ParameterSampler) -> Instance:
     """Make a wine glass, perhaps with wine."""
-    foot = draw(3.5, 2.9, 4.2)
-    stem = draw(0.42, 0.32, 0.6)
-    stem_top = draw(9.5, 6.0, 12.0)
+    foot = draw(3.5, low=2.9, high=4.2)
+    stem = draw(0.42, low=0.32, high=0.6)
+    stem_top = draw(9.5, low=6.0, high=12.0)
     deep, wall, outer = _glass_bowl(draw, stem, stem_top)
     inner, lip = _glass_lip(outer, wall, stem_top, deep)
     profile = _glass_profile(stem_top, deep, inner, foot, stem, outer, lip)
@@ -561,11 +613,11 @@ def _glass_bowl(
     """Return the depth of a glass's bowl, the thickness of its wall, and its outer
     profile.
     """
-    bowl = draw(4.1, 3.2, 5.0)
-    deep = draw(9.8, 6.5, 11.5)
-    mouth = bowl * draw(0.8, 0.7, 1.12)
-    wide_at = draw(0.42, 0.3, 0.55)
-    wall = draw(0.24, 0.2, 0.3)
+    bowl = draw(4.1, low=3.2, high=5.0)
+    deep = draw(9.8, low=6.5, high=11.5)
+    mouth = bowl * draw(0.8, low=0.7, high=1.12)
+    wide_at = draw(0.42, low=0.3, high=0.55)
+    wall = draw(0.24, low=0.2, high=0.3)
     knob = draw.chance(0.25)
     neck = [
         (stem * (2.2 if knob else 1.0), 0.78 * stem_top),
@@ -637,19 +689,19 @@ def _glass_paints(
         "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3
     )
     drink = draw.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
-    level = stem_top + depth * draw(0.48, 0.3, 0.62)
+    level = stem_top + depth * draw(0.48, low=0.3, high=0.62)
     plain = gradient(shade(tint, 0.86), shade(tint, 1.08), 0.0, height)
     outside = inside = plain
-    if draw.chance(0.5, True):
+    if draw.chance(0.5, canonical=True):
         wine = clouded(drink, 0.8, 3.0, draw.offset())
         outside = over(plain, between(stem_top + 0.06 * depth, level, soft=0.1), wine)
         inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
     outside = paint_or_random(draw, height, outside, 0.3)
-    if draw.chance(0.2, True):
+    if draw.chance(0.2, canonical=True):
         outside = over(
             outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b")
         )
-    if draw.chance(0.7, True):
+    if draw.chance(0.7, canonical=True):
         foot_paint = draw.pick(plain, outside, plain)
     else:
         foot_paint = sample_paint(draw, height)

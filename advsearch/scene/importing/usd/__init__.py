@@ -74,7 +74,7 @@ def convert_usd(path: Path, data: bytes) -> bytes:
             env=None,
         )
         if process.returncode or not target.is_file():
-            raise _conversion_error(path, process.stderr, process.returncode)
+            raise _make_conversion_error(path, process.stderr, process.returncode)
         for name in json.loads(process.stdout.splitlines()[-1]):
             stored_files.record_opened(name)
         return stored_files.read_bytes(
@@ -82,21 +82,21 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         )
 
 
-def _conversion_error(
+def _make_conversion_error(
     path: Path, stderr: str, returncode: int
 ) -> errors.FileFormatError:
     """Return the error of a conversion that failed, by the last line of its output."""
     lines = [line for line in stderr.splitlines() if line.strip()]
-    last = lines[-1] if lines else "without a word"
-    if last.startswith(REJECTED_PREFIX):
+    last_line = lines[-1] if lines else "without a word"
+    if last_line.startswith(REJECTED_PREFIX):
         # The process names the file without its folder.
-        message = last.removeprefix(REJECTED_PREFIX)
+        message = last_line.removeprefix(REJECTED_PREFIX)
         if message.startswith(path.name):
             return errors.FileFormatError(f"{path.parent / message}")
         return errors.FileFormatError(f"{path}: {message}")
     reason = f"signal {-returncode}"
     if returncode >= 0:
-        reason = reading.format_name(last.strip(), quoted=False)
+        reason = reading.format_name(last_line.strip(), quoted=False)
     return errors.FileFormatError(
         f"{path}: usd-core could not read it ({reason}); export or download it again"
     )

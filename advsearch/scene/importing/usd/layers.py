@@ -60,16 +60,20 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
         raise errors.FileFormatError(
             f"{name}: expected a .usdz archive, got one that is damaged ({error})"
         ) from None
-    first = find_first_layer(archive)
-    if Path(first).suffix.lower() not in LAYER_SUFFIXES:
+    first_name = find_first_layer(archive)
+    if Path(first_name).suffix.lower() not in LAYER_SUFFIXES:
         raise errors.FileFormatError(
-            f"{name}: expected a USD layer first in it, got {first[:80]!r}"
+            f"{name}: expected a USD layer first in it, got {first_name[:80]!r}"
         )
     return archive
 
 
 def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
-    """Check number, size, names and headers of the entries of a package."""
+    """Check number, size, names and headers of the entries of a package.
+
+    Names stay inside the package and have none of the characters that USD's paths use;
+    entries are stored as they are. Raises FileFormatError, or what zipfile raises.
+    """
     entries = archive.infolist()
     size = sum(entry.file_size for entry in entries)
     got = f"{len(entries):,} of {size:,}"
@@ -153,7 +157,11 @@ def check_layers(file: Path) -> list[str]:
 
 @dataclass
 class _LayerCheck:
-    """Checks the layers and packages that a file is made of."""
+    """Checks the layers and packages that a file is made of.
+
+    Attributes:
+        file: the first layer or package.
+    """
 
     file: Path
     _size: int = 0  # bytes so far
@@ -165,13 +173,13 @@ class _LayerCheck:
 
     def run(self) -> list[Path]:
         """Return the files of all layers and packages, the file itself first."""
-        waiting = [self.file.resolve()]
-        known = dict[Path, None]()
-        while waiting:
-            path = waiting.pop()
-            if path in known:
+        pending = [self.file.resolve()]
+        checked_files = dict[Path, None]()
+        while pending:
+            path = pending.pop()
+            if path in checked_files:
                 continue
-            known[path] = None
+            checked_files[path] = None
             self._count_layer(path.stat().st_size)
             if path.suffix.lower() == PACKAGE_SUFFIX:
                 content = stored_files.read_bytes(
@@ -180,8 +188,8 @@ class _LayerCheck:
                 self._check_package(path.name, str(path), content, depth=1)
                 continue
             for name in self._iterate_named_layers(str(path), path.name):
-                waiting.append(self._find_layer(path, name))
-        return list(known)
+                pending.append(self._find_layer(path, name))
+        return list(checked_files)
 
     def _count_layer(self, size: int) -> None:
         """Count a layer of a size in bytes against the limits."""
@@ -204,30 +212,30 @@ class _LayerCheck:
         suffix = Path(outer).suffix.lower()
         has_odd_name = any(sign in outer for sign in "`[]:\0")
         is_layer = suffix == PACKAGE_SUFFIX or (suffix in LAYER_SUFFIXES and not inner)
-        is_plain = is_layer and not has_odd_name
-        target = self._folder
-        if is_plain:
-            target = Path(os.path.realpath(path.parent / outer))
-        if not is_plain or not reading.is_inside(target, self._folder):
+        is_acceptable = is_layer and not has_odd_name
+        layer_file = self._folder
+        if is_acceptable:
+            layer_file = Path(os.path.realpath(path.parent / outer))
+        if not is_acceptable or not reading.is_inside(layer_file, self._folder):
             raise errors.FileFormatError(
                 f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "
                 "file in its folder and is not "
                 "read; put it there, or make one file of all with usdcat --flatten"
             )
-        if not target.is_file():
+        if not layer_file.is_file():
             raise errors.FileFormatError(
                 f"{self.file.name}: needs {name[:100]!r}, which is missing; put that "
                 "file beside it"
             )
         if inner:
             try:
-                read_packaged(Ar.JoinPackageRelativePath(str(target), inner))
+                read_packaged(Ar.JoinPackageRelativePath(str(layer_file), inner))
             except KeyError:
                 raise errors.FileFormatError(
                     f"{self.file.name}: needs {name[:100]!r}, which is not in "
-                    f"{target.name}; make the package again"
+                    f"{layer_file.name}; make the package again"
                 ) from None
-        return target
+        return layer_file
 
     def _check_package(self, name: str, path: str, content: bytes, depth: int) -> None:
         """Check all layers in a package.
@@ -267,7 +275,11 @@ class _LayerCheck:
     def _check_packaged(
         self, package: str, entry: str, layer: str, entries: set[str]
     ) -> None:
-        """Raise FileFormatError if a layer in a package names one outside of it."""
+        """Raise FileFormatError if a layer in a package names one outside of it.
+
+        `entry` is the layer's path in the package `package`, `layer` the path that it
+        names, and `entries` are all paths in the package.
+        """
         outer, _ = Ar.SplitPackageRelativePathOuter(layer)
         from_entry = os.path.normpath(PurePosixPath(entry).parent / outer)
         # A path that does not begin with a dot may be relative to the package.
@@ -301,6 +313,7 @@ class _LayerCheck:
         yield from filter(None, layer.GetCompositionAssetDependencies())
 
         def check_clips(spec_path: Any) -> None:
+            """Raise FileFormatError if a prim has value clips, which name files too."""
             if not spec_path.IsPrimPath():
                 return
             spec = layer.GetObjectAtPath(spec_path)
@@ -314,7 +327,11 @@ class _LayerCheck:
 
 
 def format_error(error: Exception) -> str:
-    """Return the message of an error of usd-core in one line."""
+    """Return the message of an error of usd-core in one line.
+
+    It is the last line with a position, or the last text in quotation marks, or the
+    last line of any kind.
+    """
     text = str(error)
     lines = (
         re.findall(r":(\d+:\d+: .+)", text)

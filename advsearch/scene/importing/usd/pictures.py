@@ -50,8 +50,8 @@ def is_marked_srgb(data: bytes) -> bool:
     try:
         with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
             gamma = image.info.get("gamma")
-            profile = image.info.get("icc_profile") or b""
-            if "srgb" in image.info or b"sRGB" in profile[:4096]:
+            icc_profile = image.info.get("icc_profile") or b""
+            if "srgb" in image.info or b"sRGB" in icc_profile[:4096]:
                 return True
             if gamma is not None:
                 return abs(float(gamma) - GAMMA_OF_SRGB) < 0.01
@@ -82,18 +82,22 @@ def decode_image(data: bytes, path: str, *, is_srgb: bool) -> Array:
         linear = color.srgb_to_linear(texels[:, :, :3])
         texels = np.concatenate([linear, texels[:, :, 3:]], axis=2)
     height, width = texels.shape[:2]
-    shrink = MAX_SIDE / max(height, width)
-    if shrink >= 1.0:
+    scale = MAX_SIDE / max(height, width)
+    if scale >= 1.0:
         return np.asarray(texels, np.float32)
     return reading.pictures.average_area(
         texels.astype(np.float32),
-        max(1, round(height * shrink)),
-        max(1, round(width * shrink)),
+        max(1, round(height * scale)),
+        max(1, round(width * scale)),
     )
 
 
 def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
-    """Return the stored values (H, W, 4) in [0, 1] of an image file."""
+    """Return the stored values (H, W, 4) in [0, 1] of an image file.
+
+    Greys of integers are divided by the largest of 16 bits, those of floats are taken
+    as they are.
+    """
     with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
         reading.check_decodable(image, path)
         if image.mode == "F" or image.mode.startswith("I"):
@@ -103,12 +107,10 @@ def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
             return np.stack([grey, grey, grey, np.ones_like(grey)], axis=2)
         if _is_png_of_16_bits(data):
             return _decode_png_of_16_bits(data, image.size)
+        # Numbers are averaged down later, as they are.
+        limit = MAX_SIDE if is_srgb else None
         return reading.pictures.load_display_image(
-            image,
-            MAX_SIDE if is_srgb else None,
-            path,
-            keep_alpha=True,
-            is_raw=not is_srgb,
+            image, limit, path, keep_alpha=True, is_raw=not is_srgb
         )
 
 
@@ -128,6 +130,7 @@ def _decode_radiance(data: bytes, path: str) -> Array:
 
 
 def _is_png_of_16_bits(data: bytes) -> bool:
+    """Return whether a file is PNG, and its header states 16 bits a channel."""
     return data.startswith(PNG) and data[24:25] == b"\x10"
 
 
@@ -138,6 +141,7 @@ def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
         ValueError: it is interlaced or corrupt.
     """
     (width, height) = size
+    # of the first chunk, IHDR (PNG specification, section 11.2.2)
     color_type = data[25]
     is_interlaced = data[28]
     channels = CHANNELS_OF_PNG.get(color_type)
@@ -145,14 +149,14 @@ def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
         raise ValueError("an interlaced PNG of 16 bits; save it without interlacing")
     pixel_size = 2 * channels
     row_size = 1 + width * pixel_size
-    content = _png_data(data)
+    compressed = _join_png_data(data)
     try:
-        raw = zlib.decompressobj().decompress(content, height * row_size)
+        row_bytes = zlib.decompressobj().decompress(compressed, height * row_size)
     except zlib.error as error:
         raise ValueError(f"a damaged PNG ({error})") from None
-    if len(raw) != height * row_size:
+    if len(row_bytes) != height * row_size:
         raise ValueError("a PNG that is cut short")
-    rows = np.frombuffer(raw, np.uint8).reshape(height, row_size)
+    rows = np.frombuffer(row_bytes, np.uint8).reshape(height, row_size)
     filtered = rows[:, 1:].reshape(height, width, pixel_size)
     unfiltered = np.ascontiguousarray(_unfilter(rows[:, 0], filtered))
     values = unfiltered.view(">u2").astype(np.float32) / np.float32(65535.0)
@@ -174,7 +178,7 @@ def _expand_to_rgba(values: Array) -> Array:
     return np.concatenate([colors, alpha], axis=2)
 
 
-def _png_data(data: bytes) -> bytes:
+def _join_png_data(data: bytes) -> bytes:
     """Return the concatenated IDAT chunks of a PNG file."""
     content = bytearray()
     position = 8

@@ -56,7 +56,9 @@ def main(source: str, target: str, folder: str) -> None:
     stage = Usd.Stage.Open(str(file))
     conversion = Conversion(stage, file.parent.resolve(), Path(source).name, layers)
     Path(target).write_bytes(conversion.convert())
-    print(json.dumps(conversion.files_read if file == Path(source) else []))
+    # Files of a package are temporary.
+    files_read = conversion.files_read if file == Path(source) else []
+    print(json.dumps(files_read))
 
 
 # ---- The stage ----
@@ -64,7 +66,13 @@ def main(source: str, target: str, folder: str) -> None:
 
 @dataclass
 class Conversion:
-    """Converts a stage to glTF."""
+    """Converts a stage to glTF.
+
+    Attributes beside the fields:
+        header: the JSON part of the file.
+        lights: entries of its lights.
+        unit: of the stage in metres, once `convert` has begun.
+    """
 
     stage: Any
     folder: Path  # where its files are
@@ -77,6 +85,7 @@ class Conversion:
     triangles: int = 0
 
     def __post_init__(self) -> None:
+        """Start an empty document, and find the skeletons of the stage."""
         self.header: dict[str, Any] = {
             name: [] for name in ("nodes", "meshes", "materials", "textures", "images")
         }
@@ -95,7 +104,7 @@ class Conversion:
                 self._skins.Populate(UsdSkel.Root(prim), Usd.TraverseInstanceProxies())
 
     def _iterate_prims(self) -> Iterator[Any]:
-        """Yield the prims of the stage, within limits."""
+        """Yield the prims of the stage, within limits on their number and depth."""
         prims = Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
         for index, prim in enumerate(prims):
             stored_files.check_most(
@@ -116,18 +125,26 @@ class Conversion:
             yield prim
 
     def convert(self) -> bytes:
-        """Return the stage as a binary glTF file."""
+        """Return the stage as a binary glTF file.
+
+        Node 0 turns and scales the stage to glTF's axes and metres; all prims are below
+        it.
+
+        Raises:
+            FileFormatError: there is no mesh, only Gaussian splats, or a prim cannot be
+                converted.
+        """
         self.unit = self._read_unit()
         if self.stage.HasAuthoredTimeCodeRange():
             self._note("is animated; what is there first is read")
-        to_y_up = _TO_Y_UP
+        up_rotation = _TO_Y_UP
         if UsdGeom.GetStageUpAxis(self.stage) == "Y":
-            to_y_up = np.eye(4)
-        matrix = to_y_up @ np.diag([self.unit, self.unit, self.unit, 1.0])
+            up_rotation = np.eye(4)
+        stage_matrix = up_rotation @ np.diag([self.unit, self.unit, self.unit, 1.0])
         header = self.header
         nodes = header["nodes"]
         nodes.append(
-            {"name": "stage", "matrix": matrix.T.ravel().tolist(), "children": []}
+            {"name": "stage", "matrix": stage_matrix.T.ravel().tolist(), "children": []}
         )
         name_counts = Counter(prim.GetName() for prim in self._iterate_prims())
         node_of_path: dict[Any, int] = {}
@@ -187,7 +204,10 @@ class Conversion:
     def _add_node(
         self, prim: Any, is_unique: bool, node_of_path: dict[Any, int]
     ) -> None:
-        """Add a prim as a node.
+        """Add a prim as a node, with its transform and what it draws.
+
+        Its parent is the nearest ancestor that is a node; the stage's own node if the
+        prim resets its transform, or if a skeleton poses it in the world.
 
         Args:
             prim: the prim.
@@ -202,12 +222,12 @@ class Conversion:
         xformable = UsdGeom.Xformable(prim)
         if xformable:
             # USD's rows are glTF's columns.
-            local = np.array(xformable.GetLocalTransformation(FIRST_TIME))
-            if not np.isfinite(local).all():
+            local_matrix = np.array(xformable.GetLocalTransformation(FIRST_TIME))
+            if not np.isfinite(local_matrix).all():
                 raise errors.FileFormatError(
                     f"{self.source}: expected finite transforms, got others at {path}"
                 )
-            node["matrix"] = local.ravel().tolist()
+            node["matrix"] = local_matrix.ravel().tolist()
         if not (xformable and xformable.GetResetXformStack()):
             ancestors = path.GetAncestorsRange()
             parent = next(
@@ -241,7 +261,10 @@ class Conversion:
         self.note_counts[what] += 1
 
     def _add_content(self, prim: Any, node: dict[str, Any]) -> None:
-        """Add the mesh, camera or light of a prim to its node."""
+        """Add the mesh, camera or light of a prim to its node.
+
+        What is invisible, or for guides or proxies, is left out with a note.
+        """
         is_mesh = prim.IsA(UsdGeom.Mesh)
         is_camera = prim.IsA(UsdGeom.Camera)
         if not (is_mesh or is_camera or prim.HasAPI(UsdLux.LightAPI)):
@@ -264,7 +287,11 @@ class Conversion:
     # ---- Cameras and lights ----
 
     def _add_camera(self, camera: Any, node: dict[str, Any]) -> None:
-        """Add a camera to a node; one that is not perspective counts as left out."""
+        """Add a camera to a node; one that is not perspective counts as left out.
+
+        An orthographic entry stands for it, which the reader of glTF notes. A shifted
+        aperture is noted here.
+        """
         width = _get_first(camera, "HorizontalAperture")
         height = _get_first(camera, "VerticalAperture")
         focal_length = _get_first(camera, "FocalLength")
@@ -290,10 +317,16 @@ class Conversion:
         self.header["cameras"].append(entry)
 
     def _add_light(self, prim: Any, node: dict[str, Any]) -> None:
-        """Add a distant or a spherical light to a node."""
+        """Add a distant or a spherical light to a node; others are noted.
+
+        glTF's intensity is candela, or lux of a distant light: USD's radiance is
+        integrated over the sphere's visible disk, or over the sun's solid angle.
+        """
         light = UsdLux.LightAPI(prim)
         kind = prim.GetTypeName()
-        power = _get_first(light, "Intensity") * 2.0 ** _get_first(light, "Exposure")
+        intensity = _get_first(light, "Intensity") * 2.0 ** _get_first(
+            light, "Exposure"
+        )
         is_normalized = _get_first(light, "Normalize")
         color = np.array(_get_first(light, "Color"), np.float64)
         if _get_first(light, "EnableColorTemperature"):
@@ -304,15 +337,17 @@ class Conversion:
             half_angle = math.radians(angle) / 2.0
             entry: dict[str, Any] = {"type": "directional"}
             if not is_normalized and half_angle > 0.0:
-                power *= math.pi * math.sin(half_angle) ** 2
+                intensity *= math.pi * math.sin(half_angle) ** 2
         elif kind == "SphereLight":
-            # Radiance times the visible disk. A normalised light is divided by the area
-            # of the sphere.
+            # Radiance times the visible disk, pi r^2. A normalised light is divided by
+            # the area of the sphere, 4 pi r^2.
             if is_normalized:
-                power *= 0.25
+                intensity *= 0.25
             else:
-                power *= math.pi * _get_first(UsdLux.SphereLight(prim), "Radius") ** 2
-            power *= self.unit**2
+                intensity *= (
+                    math.pi * _get_first(UsdLux.SphereLight(prim), "Radius") ** 2
+                )
+            intensity *= self.unit**2
             entry = _make_point_light(prim)
             self._note("has a SphereLight, which shines from its middle here")
         else:
@@ -321,7 +356,7 @@ class Conversion:
                 "`controls=light` light a scene"
             )
             return
-        has_valid_power = math.isfinite(power) and power >= 0.0
+        has_valid_power = math.isfinite(intensity) and intensity >= 0.0
         has_valid_color = np.isfinite(color).all() and (color >= 0.0).all()
         if not has_valid_power or not has_valid_color:
             raise errors.FileFormatError(
@@ -330,13 +365,21 @@ class Conversion:
             )
         node["extensions"] = {"KHR_lights_punctual": {"light": len(self.lights)}}
         self.lights.append(
-            {**entry, "name": node["name"], "color": color.tolist(), "intensity": power}
+            {
+                **entry,
+                "name": node["name"],
+                "color": color.tolist(),
+                "intensity": intensity,
+            }
         )
 
     # ---- Meshes ----
 
     def _add_mesh(self, prim: Any, node: dict[str, Any]) -> None:
-        """Add a mesh to a node: one primitive for each material and tint."""
+        """Add a mesh to a node: one primitive for each material and tint.
+
+        A mesh that a skeleton poses leaves its matrix in the node's entry "moved".
+        """
         mesh = UsdGeom.Mesh(prim)
         points = _to_array(_get_first(mesh, "Points"), np.float64, 3)
         counts = _to_array(_get_first(mesh, "FaceVertexCounts"), np.int64)
@@ -349,7 +392,13 @@ class Conversion:
             node["moved"] = rest_matrix.ravel().tolist()
         triangles, face = self._triangulate(mesh, points, counts, corners)
         primitives = self._make_primitives(
-            prim, mesh, points, counts, corners, triangles, face
+            prim,
+            mesh,
+            points=points,
+            counts=counts,
+            corners=corners,
+            triangles=triangles,
+            face=face,
         )
         if primitives:
             node["mesh"] = len(self.header["meshes"])
@@ -440,7 +489,11 @@ class Conversion:
     def _read_normals(
         self, mesh: Any, primvars: Any, points: Array, triangles: Array
     ) -> tuple[Array, str] | None:
-        """Return the normals (N, 3) of a mesh and their interpolation, or None."""
+        """Return the normals (N, 3) of a mesh and their interpolation, or None.
+
+        A primvar wins over the attribute. A mesh that is to be subdivided has smooth
+        normals instead, with a note.
+        """
         normals = _flatten_primvar(primvars.GetPrimvar("normals"), 3)
         if normals is None:
             values = _to_array(_get_first(mesh, "Normals"), np.float64, 3)
@@ -463,7 +516,7 @@ class Conversion:
         face: Array,
         attributes: dict[str, tuple[Array, str] | None],
     ) -> dict[str, Any]:
-        """Return a primitive as an entry of the header.
+        """Return a primitive as an entry of the header; its data goes to the buffer.
 
         Args:
             path: path of the prim, for messages.
@@ -471,7 +524,11 @@ class Conversion:
             corners: (C,) the point of each corner of the mesh.
             corner_rows: (3 T,) the corners of the triangles, as rows of `corners`.
             face: (T,) the face of each triangle.
-            attributes: values (N, width) and interpolation, by the names of glTF.
+            attributes: values (N, width) and interpolation, by the names of glTF; None
+                for none.
+
+        Raises:
+            FileFormatError: an attribute has fewer values than the mesh needs.
         """
         index_by_interpolation = {
             "vertex": corners[corner_rows],
@@ -480,6 +537,7 @@ class Conversion:
             "uniform": face.repeat(3),
         }
         constant_index = np.zeros(len(corner_rows), np.int64)
+        # One column for each attribute: which of its values each corner has.
         indices = [corners[corner_rows]]
         for attribute in attributes.values():
             index = constant_index
@@ -493,19 +551,19 @@ class Conversion:
                     )
             indices.append(index)
         # Corners with the same values become one vertex.
-        rows, inverse = np.unique(
+        unique_rows, inverse = np.unique(
             np.stack(indices, axis=1), axis=0, return_inverse=True
         )
         accessors = {
             "POSITION": self.buffer.add_accessor(
-                points[rows[:, 0]].astype(np.float32), "VEC3", bounds=True
+                points[unique_rows[:, 0]].astype(np.float32), "VEC3", bounds=True
             )
         }
         for column, (name, attribute) in enumerate(attributes.items(), 1):
             if attribute is not None:
-                values = attribute[0][rows[:, column]].astype(np.float32)
-                kind = f"VEC{values.shape[1]}"
-                accessors[name] = self.buffer.add_accessor(values, kind)
+                values = attribute[0][unique_rows[:, column]].astype(np.float32)
+                accessor_type = f"VEC{values.shape[1]}"
+                accessors[name] = self.buffer.add_accessor(values, accessor_type)
         index_accessor = self.buffer.add_accessor(
             inverse.reshape(-1).astype(np.uint32), "SCALAR"
         )
@@ -562,8 +620,8 @@ class Conversion:
     ) -> Iterator[tuple[int, tuple[Array, str] | None, Array]]:
         """Split faces with a material by their colors and opacities.
 
-        A material may take both from primvars. A few colors of faces become materials;
-        others are vertex colors.
+        A material may take both from primvars. Up to `MAX_TINTS` colors of faces become
+        materials; others are vertex colors. Opacities always become materials.
 
         Args:
             bound: the material.
@@ -580,11 +638,11 @@ class Conversion:
             return
         if bound.is_default:
             has_color = primvars.FindPrimvarWithInheritance("displayColor").HasValue()
-            color_words = " and displayColor: grey (0.18)"
+            color_text = " and displayColor: grey (0.18)"
             if has_color:
-                color_words = ": of its displayColor"
+                color_text = ": of its displayColor"
             self._note(
-                f"has a mesh without material{color_words}, with roughness 0.5 "
+                f"has a mesh without material{color_text}, with roughness 0.5 "
                 "and no metal, as USD's default"
             )
         colors = _read_primvar(primvars, bound.color)
@@ -597,9 +655,10 @@ class Conversion:
             if len(np.unique(face_colors, axis=0)) <= MAX_TINTS:
                 tints = face_colors
                 vertex_colors = None
-        keys = np.nan_to_num(np.concatenate([tints, opacity], axis=1), nan=-1.0)
-        for key in np.unique(keys, axis=0):
-            is_selected = (keys == key).all(axis=1)
+        # (F, 4) color and opacity of each face; -1 where the material's hold
+        tint_keys = np.nan_to_num(np.concatenate([tints, opacity], axis=1), nan=-1.0)
+        for key in np.unique(tint_keys, axis=0):
+            is_selected = (tint_keys == key).all(axis=1)
             color = None if colors is None else key[:3]
             if vertex_colors is not None:
                 color = np.ones(3)  # it is multiplied by vertex colors
@@ -616,7 +675,8 @@ class Conversion:
     ) -> Array:
         """Return the opacity of each face, (F, 1); NaN where the material's holds.
 
-        Arguments are those of `_compute_face_values`.
+        They are rounded to 1/255; more than `MAX_TINTS` are replaced by their mean,
+        with a note. Arguments are those of `_compute_face_values`.
         """
         if opacities is None:
             return np.full((len(faces), 1), np.nan)
@@ -637,7 +697,11 @@ class Conversion:
     def _iterate_materials(
         self, prim: Any, mesh: Any, faces: int
     ) -> Iterator[tuple[BoundMaterial, Array]]:
-        """Yield the materials of a mesh and their faces."""
+        """Yield the materials of a mesh and their faces.
+
+        A face belongs to the first subset that has it, and to the mesh's own material
+        if none has. `faces` is how many there are.
+        """
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         is_unbound = np.ones(faces, bool)
         for subset in subsets:
@@ -652,30 +716,36 @@ class Conversion:
     def _pose_at_rest(self, prim: Any, points: Array) -> tuple[Array | None, Array]:
         """Pose the points of a mesh by its skeleton at rest.
 
+        A joint moves points by the inverse of its bind transform, then its rest
+        transform.
+
         Returns:
             The matrix (4, 4) of the skeleton, for rows, and the points (P, 3) in it;
-            (None, points) if the mesh has no skeleton.
+            (None, points) if the mesh has no skeleton, or one that cannot be posed.
         """
-        skin = self._skins.GetSkinningQuery(prim)
-        if not skin or not skin.HasJointInfluences():
+        skinning = self._skins.GetSkinningQuery(prim)
+        if not skinning or not skinning.HasJointInfluences():
             return None, points
         skeleton = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
-        query = self._skins.GetSkelQuery(skeleton) if skeleton else None
-        if not query:
+        skeleton_query = self._skins.GetSkelQuery(skeleton) if skeleton else None
+        if not skeleton_query:
             return None, points
-        rest = query.ComputeJointSkelTransforms(FIRST_TIME, atRest=True)
-        binding = query.GetJointWorldBindTransforms()
-        if not rest or len(rest) != len(binding):
+        rest_transforms = skeleton_query.ComputeJointSkelTransforms(
+            FIRST_TIME, atRest=True
+        )
+        bind_transforms = skeleton_query.GetJointWorldBindTransforms()
+        if not rest_transforms or len(rest_transforms) != len(bind_transforms):
             return None, points
         transforms = [
-            bind.GetInverse() * joint for bind, joint in zip(binding, rest, strict=True)
+            bind.GetInverse() * joint
+            for bind, joint in zip(bind_transforms, rest_transforms, strict=True)
         ]
-        mapper = skin.GetJointMapper()
+        mapper = skinning.GetJointMapper()
         if mapper and not mapper.IsNull() and not mapper.IsIdentity():
-            transforms = mapper.RemapTransforms(type(rest)(transforms))
+            transforms = mapper.RemapTransforms(type(rest_transforms)(transforms))
         skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
         matrices = Vt.Matrix4dArray(list(transforms))
-        if not skin.ComputeSkinnedPoints(matrices, skinned, FIRST_TIME):
+        if not skinning.ComputeSkinnedPoints(matrices, skinned, FIRST_TIME):
             return None, points
         xformable = UsdGeom.Xformable(skeleton.GetPrim())
         to_world = xformable.ComputeLocalToWorldTransform(FIRST_TIME)
@@ -683,7 +753,10 @@ class Conversion:
 
 
 def _make_point_light(prim: Any) -> dict[str, Any]:
-    """Return the entry of a point light, or of a spot light if the prim has a cone."""
+    """Return the entry of a point light, or of a spot light if the prim has a cone.
+
+    The softness is the fraction of the cone over which light fades.
+    """
     if not prim.HasAPI(UsdLux.ShapingAPI):
         return {"type": "point"}
     shaping = UsdLux.ShapingAPI(prim)
@@ -701,6 +774,8 @@ def _compute_face_values(
 ) -> Array:
     """Return the values (F, C) of faces; those of corners are averaged.
 
+    Indices beyond the values have the last of them.
+
     Args:
         primvar: values (N, C) and their interpolation.
         faces: (F,) faces.
@@ -709,21 +784,23 @@ def _compute_face_values(
     """
     values, interpolation = primvar
     if interpolation in ("constant", "uniform"):
-        index = np.zeros(len(faces), np.int64)
+        value_index = np.zeros(len(faces), np.int64)
         if interpolation == "uniform":
-            index = faces
-        return np.asarray(values[np.minimum(index, len(values) - 1)])
+            value_index = faces
+        return np.asarray(values[np.minimum(value_index, len(values) - 1)])
     corner_index = np.arange(len(corners))
     if interpolation in ("vertex", "varying"):
         corner_index = corners
     corner_values = values[np.minimum(corner_index, len(values) - 1)]
-    # A row of zeros, since the last faces may have no corners.
-    padded = np.concatenate([corner_values, np.zeros((1, values.shape[1]))])
+    # A row of zeros, since the last faces may have no corners: they begin at the end,
+    # where `reduceat` needs a row.
+    padded_values = np.concatenate([corner_values, np.zeros((1, values.shape[1]))])
     starts = np.cumsum(counts) - counts
-    sums = np.add.reduceat(padded, starts)
+    sums = np.add.reduceat(padded_values, starts)
     return np.asarray((sums / np.maximum(counts, 1)[:, None])[faces])
 
 
+# From a stage whose z is up to glTF, whose y is.
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 
 

@@ -107,7 +107,12 @@ class BoundMaterial:
 
 @dataclass
 class Shader:
-    """A shader, with a record of which inputs are read."""
+    """A shader, with a record of which inputs are read.
+
+    Attributes:
+        prim: its `UsdShade.Shader`.
+        inputs: its inputs by name.
+    """
 
     prim: Any
     inputs: reading.TrackedKeys[Any]
@@ -155,7 +160,11 @@ class Shader:
         )
 
     def get_numbers(self, name: str, default: Sequence[float]) -> tuple[float, ...]:
-        """Return the finite numbers of an input, or `default`, which has as many."""
+        """Return the finite numbers of an input, or `default`, which has as many.
+
+        Further numbers are left out; if there are too few, or others than finite ones,
+        the default holds for all.
+        """
         value = self.get_value(name)
         if value is None:
             return tuple(default)
@@ -173,6 +182,7 @@ class Shader:
 
 
 def _is_output(attribute: Any) -> bool:
+    """Return whether an attribute is an output of a shader, and no input."""
     kind = UsdShade.Utils.GetType(attribute.GetName())
     return bool(kind == UsdShade.AttributeType.Output)
 
@@ -182,13 +192,13 @@ class UsdTextureUse:
     """An image that an input is connected to."""
 
     path: str  # as the file has it
-    data: bytes
-    is_srgb: bool
-    channels: Sequence[int]
-    scale: tuple[float, ...]
-    bias: tuple[float, ...]
-    layout: TextureLayout
-    wraps: tuple[int, int]
+    data: bytes  # the image file
+    is_srgb: bool  # whether its colors are decoded from sRGB
+    channels: Sequence[int]  # of the image, that the input takes
+    scale: tuple[float, ...]  # (4,) factors of the channels
+    bias: tuple[float, ...]  # (4,) what is added after scaling
+    layout: TextureLayout  # of its texture coordinates
+    wraps: tuple[int, int]  # wrap modes along s and t, as in glTF
 
     @property
     def is_plain(self) -> bool:
@@ -197,6 +207,7 @@ class UsdTextureUse:
 
     @property
     def sampler(self) -> dict[str, int]:
+        """The sampler of glTF with its wrap modes."""
         return {"wrapS": self.wraps[0], "wrapT": self.wraps[1]}
 
 
@@ -213,10 +224,14 @@ class UsdSurfaces:
     _texels: dict[tuple[bytes, bool], Array] = field(default_factory=dict)
 
     def note(self, what: str) -> None:
+        """Note something that is left out."""
         self.note_counts[what] += 1
 
     def find_material(self, prim: Any) -> BoundMaterial:
-        """Return the material of a prim, or its display color."""
+        """Return the material of a prim, or its display color.
+
+        A material for previews wins over one for all purposes. Each is converted once.
+        """
         binding = UsdShade.MaterialBindingAPI(prim)
         material = (
             binding.ComputeBoundMaterial(UsdShade.Tokens.preview)[0]
@@ -230,23 +245,25 @@ class UsdSurfaces:
         return self._materials[path]
 
     def _make_default_material(self) -> BoundMaterial:
+        """Add the material of prims without one, whose color is their display color."""
         surface = {
             "baseColorFactor": [*DEFAULT_COLOR, 1.0],
             "metallicFactor": 0.0,
             "roughnessFactor": DEFAULT_ROUGHNESS,
         }
-        number = self._add_material(
+        index = self._add_material(
             {"name": "displayColor", "pbrMetallicRoughness": surface}
         )
         color = PrimvarUse("displayColor", DEFAULT_COLOR)
         return BoundMaterial(
-            number,
+            index,
             color=color,
             opacity=PrimvarUse("displayOpacity", (1.0,)),
             is_default=True,
         )
 
     def _add_material(self, entry: dict[str, Any]) -> int:
+        """Add a two-sided material to the header, and return its index."""
         self.header["materials"].append({**entry, "doubleSided": True})
         return len(self.header["materials"]) - 1
 
@@ -270,12 +287,13 @@ class UsdSurfaces:
         return self._find_or_add("materials", entry)
 
     def _convert(self, material: Any) -> BoundMaterial:
+        """Convert a material; one that is no preview surface becomes grey, with a note."""
         name = str(material.GetPrim().GetName())
         self._texels.clear()  # they take memory
         shader = material.ComputeSurfaceSource()[0]
         if not shader or shader.GetIdAttr().Get() != PREVIEW_SURFACE:
             self.note("has a material that is no UsdPreviewSurface, which is grey here")
-            grey = [0.2140, 0.2140, 0.2140, 1.0]
+            grey = [0.2140, 0.2140, 0.2140, 1.0]  # linear: 0.5 in sRGB; and opaque
             surface = {
                 "baseColorFactor": grey,
                 "metallicFactor": 0.0,
@@ -291,6 +309,9 @@ class UsdSurfaces:
     def load_image(self, asset: Any, name: str) -> bytes | None:
         """Return the bytes of an image in the folder; None, and a note, if it is
         missing.
+
+        Links are followed before a path is tested: an image outside of the folder is
+        not read. It may be inside of a package (`.usdz`) there.
 
         Args:
             asset: the asset path.
@@ -321,7 +342,8 @@ class UsdSurfaces:
     def load_texels(self, use: UsdTextureUse) -> Array | None:
         """Return an image (H, W, 4) in linear values, before scale and bias.
 
-        None, and a note, if it cannot be decoded.
+        None, and a note, if it cannot be decoded. An image is decoded once for each
+        material.
         """
         key = (use.data, use.is_srgb)
         if key not in self._texels:
@@ -391,17 +413,27 @@ def _read_fallback(node: Shader) -> tuple[float, ...] | None:
 
 @dataclass
 class PreviewSurface:
-    """Converts one preview surface to a glTF material."""
+    """Converts one preview surface to a glTF material.
+
+    Attributes:
+        surfaces: writes the material, and counts notes.
+        shader: the preview surface.
+        name: of the material.
+        layouts: its texture coordinates so far, by their index in glTF.
+        nodes: shaders that are read, by path.
+    """
 
     surfaces: UsdSurfaces
     shader: Shader
     name: str
     layouts: list[TextureLayout] = field(default_factory=list)
-    # Shaders that are read, by path.
     nodes: dict[str, Shader] = field(default_factory=dict)
 
     def convert(self) -> BoundMaterial:
-        """Write the material, and note the inputs that are not read."""
+        """Write the material, and note the inputs that are not read.
+
+        A specular workflow is read as if it were metallic, without metal.
+        """
         shader = self.shader
         is_specular = bool(shader.get_number("useSpecularWorkflow", 0.0))
         surface: dict[str, Any] = {}
@@ -425,15 +457,19 @@ class PreviewSurface:
                 "highlights fade with the opacity too"
             )
         self._note_unread(is_specular=is_specular)
-        number = self.surfaces._add_material(entry)
+        index = self.surfaces._add_material(entry)
         return BoundMaterial(
-            number, tuple(self.layouts) or (TextureLayout(),), color, opacity
+            index, tuple(self.layouts) or (TextureLayout(),), color, opacity
         )
 
     def _note_unread(self, *, is_specular: bool) -> None:
-        """Note the inputs that are not read, of the surface and of its shaders."""
+        """Note the inputs that are not read, of the surface and of its shaders.
+
+        Those of the surface with a neutral value need no note.
+        """
 
         def is_quiet(name: str, shader_input: Any) -> bool:
+            """Return whether an input changes nothing: its value is neutral."""
             if name == "specularColor" and not is_specular:
                 return True
             neutral = NEUTRAL_VALUES.get(name)
@@ -534,14 +570,14 @@ class PreviewSurface:
             )
             return None
         return UsdTextureUse(
-            path,
-            data,
-            self._is_srgb(color_space, data),
-            channels,
-            scale,
-            bias,
-            layout,
-            wraps,
+            path=path,
+            data=data,
+            is_srgb=self._is_srgb(color_space, data),
+            channels=channels,
+            scale=scale,
+            bias=bias,
+            layout=layout,
+            wraps=wraps,
         )
 
     def _load_image(self, asset: Any, path: str, name: str) -> bytes | None:
@@ -573,18 +609,23 @@ class PreviewSurface:
         return wraps[0], wraps[1]
 
     def _find_layout(self, node: Shader) -> TextureLayout:
-        """Return the texture coordinates of a texture: a primvar and its transforms."""
+        """Return the texture coordinates of a texture: a primvar and its transforms.
+
+        The shaders are followed from the texture to the primvar; a transform that comes
+        later is applied to texture coordinates earlier. Other shaders are taken for the
+        primvar st, with a note.
+        """
         matrix = np.eye(3)
-        name = "st"
+        input_name = "st"
         for _ in range(MAX_SHADERS):
-            source = node.find_source(name)
+            source = node.find_source(input_name)
             if source is None:
-                return self._make_constant_layout(node, name, matrix)
+                return self._make_constant_layout(node, input_name, matrix)
             node = self._track_shader(source[0])
             rows = tuple(map(float, matrix[:2].ravel()))
             if node.kind == TRANSFORM:
                 matrix = matrix @ _compute_transform(node)
-                name = "in"
+                input_name = "in"
             elif node.kind in READERS_OF_COORDINATES:
                 primvar = str(node.get_value("varname") or "st")
                 fallback = node.get_numbers("fallback", (0.0, 0.0))
@@ -601,17 +642,27 @@ class PreviewSurface:
         )
 
     def _make_constant_layout(
-        self, node: Shader, name: str, matrix: Array
+        self, node: Shader, input_name: str, matrix: Array
     ) -> TextureLayout:
+        """Return the layout of a texture whose coordinates are a value, with a note.
+
+        Args:
+            node: the shader with the value.
+            input_name: its input.
+            matrix: (3, 3) the transforms after it.
+        """
         self.surfaces.note(
             "has a texture without texture coordinates (st), of which "
             "one texel is shown"
         )
-        s, t = node.get_numbers(name, (0.0, 0.0))
+        s, t = node.get_numbers(input_name, (0.0, 0.0))
         u, v, _ = matrix @ np.array([s, t, 1.0])
         return TextureLayout("", (0.0, 0.0), (0.0, 0.0, float(u), 0.0, 0.0, float(v)))
 
     def _make_slot(self, texture: int, layout: TextureLayout) -> dict[str, int]:
+        """Return the entry that refers to a texture, by its index, with some
+        coordinates.
+        """
         if layout not in self.layouts:
             self.layouts.append(layout)
         return {"index": texture, "texCoord": self.layouts.index(layout)}
@@ -622,6 +673,10 @@ class PreviewSurface:
         self, entry: dict[str, Any], surface: dict[str, Any]
     ) -> tuple[PrimvarUse | None, PrimvarUse | None]:
         """Fill in color and opacity.
+
+        Each comes from a primvar, a texture or a value. An opacity texture needs the
+        layout of the color's, and is left out otherwise. With a threshold the opacity
+        is a mask.
 
         Args:
             entry: the glTF material.
@@ -680,6 +735,9 @@ class PreviewSurface:
     ) -> tuple[int | None, list[float]]:
         """Add the texture of color and opacity: the image itself, or a baked one.
 
+        The image itself does if its sRGB texels are only scaled, and the opacity, if
+        there is any, is its alpha.
+
         Returns:
             The index of the texture, or None; and the color that it is multiplied by.
         """
@@ -707,6 +765,7 @@ class PreviewSurface:
         """Return display values (H, W, 3 or 4) of color and opacity.
 
         None if neither image can be read. `factor` is the color if it has no image.
+        Images of two sizes are both resized to the larger width and the larger height.
         """
         colors = None if color_use is None else self.surfaces.compute_values(color_use)
         opacities = (
@@ -718,32 +777,37 @@ class PreviewSurface:
             colors = np.broadcast_to(
                 np.array(factor, np.float32), (*opacities.shape[:2], 3)
             )
-        levels = color.linear_to_srgb(
+        display_colors = color.linear_to_srgb(
             np.broadcast_to(colors, (*colors.shape[:2], 3)).astype(np.float32)
         )
         if opacities is None:
-            return levels
-        if opacities.shape[:2] != levels.shape[:2]:
-            width = max(opacities.shape[1], levels.shape[1])
-            height = max(opacities.shape[0], levels.shape[0])
+            return display_colors
+        if opacities.shape[:2] != display_colors.shape[:2]:
+            width = max(opacities.shape[1], display_colors.shape[1])
+            height = max(opacities.shape[0], display_colors.shape[0])
             opacities = _resize(opacities, (width, height))
-            levels = _resize(levels, (width, height))
-        return np.concatenate([levels, opacities[:, :, :1]], axis=2)
+            display_colors = _resize(display_colors, (width, height))
+        return np.concatenate([display_colors, opacities[:, :, :1]], axis=2)
 
     def _add_roughness_and_metallic(
         self, surface: dict[str, Any], *, is_specular: bool
     ) -> None:
-        """Fill in roughness and metallic; their images are packed into one."""
-        factors = {
+        """Fill in roughness and metallic; their images are packed into one.
+
+        An image with another layout than the first is replaced by its mean, and a
+        primvar by its fallback, with a note. A number without an image fills its
+        channel.
+        """
+        factor_by_name = {
             "roughness": self.shader.get_number("roughness", DEFAULT_ROUGHNESS),
             "metallic": self.shader.get_number("metallic", 0.0),
         }
-        planes: dict[str, Array] = {}
+        plane_by_name: dict[str, Array] = {}
         first_use: UsdTextureUse | None = None
-        for name in factors:
+        for name in factor_by_name:
             primvar = self._find_primvar(name, (READER_OF_NUMBERS,), (0.0,))
             if primvar is not None:
-                factors[name] = primvar.fallback[0]
+                factor_by_name[name] = primvar.fallback[0]
                 self.surfaces.note(
                     f"has a {name} of the primvar "
                     f"{primvar.name[:50]!r}, of which the fallback is "
@@ -752,7 +816,7 @@ class PreviewSurface:
                 continue
             use = self._find_texture(name)
             if isinstance(use, tuple):
-                factors[name] = use[0]
+                factor_by_name[name] = use[0]
                 continue
             values = None if use is None else self.surfaces.compute_values(use)
             if use is None or values is None:
@@ -760,29 +824,30 @@ class PreviewSurface:
             self._note_srgb(name, use)
             plane = np.clip(values[:, :, 0], 0.0, 1.0)
             if first_use is not None and use.layout != first_use.layout:
-                factors[name] = float(plane.mean())
+                factor_by_name[name] = float(plane.mean())
                 self.surfaces.note(
                     f"has a {name} with other texture coordinates, "
                     "of which the mean is read"
                 )
             else:
-                planes[name] = plane
+                plane_by_name[name] = plane
                 first_use = use
         if is_specular:  # this workflow has no metals
-            factors["metallic"] = 0.0
-            planes.pop("metallic", None)
-        if not planes or first_use is None:
-            surface["metallicFactor"] = factors["metallic"]
-            surface["roughnessFactor"] = factors["roughness"]
+            factor_by_name["metallic"] = 0.0
+            plane_by_name.pop("metallic", None)
+        if not plane_by_name or first_use is None:
+            surface["metallicFactor"] = factor_by_name["metallic"]
+            surface["roughnessFactor"] = factor_by_name["roughness"]
             return
         texture = self.surfaces.add_image(
-            _pack_planes(planes, factors), first_use.sampler
+            _pack_planes(plane_by_name, factor_by_name), first_use.sampler
         )
         surface["metallicFactor"] = 1.0
         surface["roughnessFactor"] = 1.0
         surface["metallicRoughnessTexture"] = self._make_slot(texture, first_use.layout)
 
     def _note_srgb(self, name: str, use: UsdTextureUse) -> None:
+        """Note that numbers are decoded from sRGB; an alpha never is."""
         if use.is_srgb and use.channels != CHANNELS["a"]:
             self.surfaces.note(
                 f"has a {name} that is decoded from sRGB, as its sourceColorSpace "
@@ -790,6 +855,12 @@ class PreviewSurface:
             )
 
     def _add_normal(self, entry: dict[str, Any]) -> None:
+        """Fill in the normal map.
+
+        An image of 8 bits with the scale and bias of normals is taken as it is, also if
+        these are missing and its texels look like normals; others are decoded and
+        written anew. A single normal, or one channel, is left out with a note.
+        """
         if self.shader.find_source("normal") is None:
             if not np.allclose(
                 self.shader.get_numbers("normal", UPRIGHT), UPRIGHT, atol=1e-3
@@ -832,7 +903,12 @@ class PreviewSurface:
             entry["normalTexture"] = self._make_slot(texture, use.layout)
 
     def _add_emission(self, entry: dict[str, Any]) -> None:
-        """Fill in the emission, whose factor may be larger than 1."""
+        """Fill in the emission, whose factor may be larger than 1.
+
+        An image of sRGB texels times factors is taken as it is; another one is written
+        anew, divided by its largest value. Factors above 1 go to an extension, which
+        glTF needs for it.
+        """
         factor: Sequence[float] = self.shader.get_numbers(
             "emissiveColor", (0.0, 0.0, 0.0)
         )

@@ -1,0 +1,749 @@
+"""Photographs that a scene is rendered into, and the camera that took them.
+
+    display-linear = rendered + shade * photograph
+    shade = 1 - coverage + change of the plane's radiance / its radiance
+
+`rendered` is the object's light times its coverage. The plane is a matt ground below
+the object that is itself not seen: what the object takes from its light, and adds,
+scales the photograph (Debevec 1998, Rendering synthetic objects into real scenes,
+section 5, adds the difference instead). Light that a matt surface reflects is its
+albedo times what arrives, so that the ratio is right whatever the albedo of the ground
+at that pixel is, and it never goes below zero; a difference is right only where the
+albedo of the plane is that of the ground, and makes dark ground negative.
+
+The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
+area of each pixel of the film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT`
+in pixels from its top left corner; the intrinsics of the camera follow.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from PIL import Image, ImageOps
+from torch import Tensor
+
+from advsearch.errors import FileFormatError, InputError
+from advsearch.pictures import check_decodable, open_image, to_8bit_levels
+from advsearch.scene.assets import Float32Array, Float64Array, ObjectAsset
+from advsearch.scene.camera_model import (
+    BROWN_CONRADY,
+    EQUIRECTANGULAR,
+    LINEAR_PARAMETERS,
+    NUMBER_NAMES,
+    CameraModel,
+    make_bundled_models,
+    make_pinhole,
+)
+from advsearch.scene.color import CHANNELS, linear_to_srgb, srgb_to_linear
+from advsearch.scene.geometry import camera_to_world, object_to_world, project_points
+from advsearch.scene.image_quality import make_noise, measure_blur, measure_noise
+from advsearch.scene.importing.pictures import average_area
+from advsearch.trust.stored_files import (
+    LARGEST_FILE,
+    record_opened,
+    track_opened_files,
+)
+
+if TYPE_CHECKING:
+    from advsearch.scene.description import SceneDescription
+
+MAX_ELEVATION = 89.0  # degrees, of a camera that orbits the object
+MIN_SIDE = 8  # pixels of a photograph, or of what is cut out of it
+# of an angle's cosine: how far from a rotation a matrix may be
+ROTATION_TOLERANCE = 1e-3
+# largest relative difference between the shapes of a photograph and of its camera
+SHAPE_TOLERANCE = 0.01
+PHOTOGRAPH_CAMERA = "photograph"  # name of the pinhole of a part of a photograph
+# settings of the plane that takes the shadow
+PLANE_SETTINGS = frozenset(
+    ("ground.size", "ground.level", *(f"ground.{channel}" for channel in CHANNELS))
+)
+MIN_BLUR = 0.15  # pixels; less is not seen
+PLANE_SIZE = 12.0  # side of the plane, object sizes
+# mean reflectance of what photographs show, that of the grey card to which cameras
+# meter: it gives the exposure
+GREY_CARD = 0.18
+ALBEDO_RANGE = (0.05, 0.8)  # of the plane
+# radii around the object, in object sizes, between which the plane's color is measured
+CONTACT_RING = (0.5, 1.5)
+N_CONTACT_POINTS = 400
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue (BT.709)
+LIGHT_SUFFIXES = (".hdr", ".exr")
+CROP = re.compile(r"(?P<path>.+)#(?P<numbers>\d+,\d+,\d+,\d+)")
+
+
+@dataclass(frozen=True, eq=False)
+class BackdropPhotograph:
+    """A photograph, or a part of one, that a scene is rendered into."""
+
+    spec: str  # how it was asked for: a path, and perhaps the part
+    levels: npt.NDArray[np.uint8]  # (H, W, 3) sRGB of the full photograph
+    digest: str  # SHA-256 of the levels, in hexadecimal
+    crop: tuple[int, int, int, int]  # left, top, width and height in pixels
+    # (H, W) levels: 255 where the photograph shows what is before the object; None if
+    # nothing is
+    front: npt.NDArray[np.uint8] | None = None
+    front_spec: str = ""  # how that was asked for
+
+    @property
+    def full_size(self) -> tuple[int, int]:
+        """Height and width of the full photograph, pixels."""
+        return self.levels.shape[0], self.levels.shape[1]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the part that is used, pixels."""
+        return self.crop[3], self.crop[2]
+
+    @property
+    def is_cropped(self) -> bool:
+        return self.size != self.full_size
+
+    def resample(self, resolution: tuple[int, int]) -> Tensor:
+        """Return the part in display-linear values at (height, width) pixels.
+
+        Each pixel is the mean over the area that it covers, in linear light. Where the
+        photograph has fewer pixels than that, it is interpolated.
+
+        Returns:
+            (H, W, 3) float32 in [0, 1].
+        """
+        decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
+        return self._resample_part(decoded[self.levels], resolution)
+
+    def resample_front(self, resolution: tuple[int, int]) -> Tensor | None:
+        """Return what is before the object, (H, W, 1) float32 in [0, 1], or None."""
+        if self.front is None:
+            return None
+        fractions = self.front[..., None].astype(np.float32) / np.float32(255.0)
+        return self._resample_part(fractions, resolution)
+
+    def make_noise(self, resolution: tuple[int, int], sigma: float | None) -> Tensor:
+        """Return noise (H, W, 3) float32, display-referred, as the photograph has.
+
+        It is made in the pixels of the photograph and resampled as that is, so that it
+        is as coarse. The same photograph gives the same noise.
+
+        Args:
+            resolution: height and width in pixels.
+            sigma: standard deviation in levels at that resolution; None: that of the
+                photograph.
+        """
+        part = self.levels[
+            self.crop[1] : self.crop[1] + self.crop[3],
+            self.crop[0] : self.crop[0] + self.crop[2],
+        ]
+        seed = int(self.digest[:8], 16)
+        if sigma is not None:
+            return make_noise(np.full(3, sigma / 255.0), resolution, seed)
+        noise = make_noise(measure_noise(part) / 255.0, self.size, seed)
+        return _resample_image(noise.numpy(), resolution)
+
+    def _resample_part(
+        self, image: Float32Array, resolution: tuple[int, int]
+    ) -> Tensor:
+        """Return the used part of an image (H, W, C) at (height, width) pixels."""
+        left, top, width, height = self.crop
+        part = image[top : top + height, left : left + width]
+        return _resample_image(part, resolution)
+
+
+def _resample_image(image: Float32Array, resolution: tuple[int, int]) -> Tensor:
+    """Average an image (H, W, C) down to (height, width) pixels, or interpolate it."""
+    height, width = image.shape[:2]
+    averaged = average_area(
+        image, min(height, resolution[0]), min(width, resolution[1])
+    )
+    resampled = torch.from_numpy(averaged)
+    if tuple(averaged.shape[:2]) == resolution:
+        return resampled
+    enlarged = torch.nn.functional.interpolate(
+        resampled.permute(2, 0, 1)[None],
+        size=resolution,
+        mode="bilinear",
+        align_corners=False,
+    )
+    return enlarged[0].permute(1, 2, 0).contiguous()
+
+
+def read_backdrop(spec: str | Path) -> BackdropPhotograph:
+    """Read a photograph that a scene is to be rendered into.
+
+    Args:
+        spec: a picture file; with the part to use behind it, ``#X,Y,WIDTH,HEIGHT``.
+
+    Raises:
+        FileFormatError: the file is missing, no picture, too large, corrupt, too small
+            or transparent.
+        InputError: the part leaves the photograph.
+    """
+    text = str(spec)
+    part = CROP.fullmatch(text)
+    path = Path(part["path"] if part else text)
+    with track_opened_files(path), open_image(path, LARGEST_FILE) as image:
+        levels = _decode_photograph(image, path)
+    height, width = levels.shape[:2]
+    crop = (0, 0, width, height)
+    if part:
+        left, top, crop_width, crop_height = map(int, part["numbers"].split(","))
+        crop = (left, top, crop_width, crop_height)
+        if left + crop_width > width or top + crop_height > height:
+            raise InputError(
+                f"backdrop: {text} leaves the photograph, which has {width} x {height} "
+                "pixels (width x height); give a part inside it"
+            )
+    if min(crop[2:]) < MIN_SIDE:
+        raise InputError(
+            f"backdrop: expected at least {MIN_SIDE} x {MIN_SIDE} pixels of "
+            f"{path}, got {crop[2]} x {crop[3]}; take another photograph"
+        )
+    return make_backdrop(levels, text, crop)
+
+
+def find_light_beside(photograph: object) -> Path | None:
+    """Return the environment map that lies beside a photograph, or None.
+
+    It is called as the photograph, with the suffix .hdr or .exr.
+    """
+    if not isinstance(photograph, (str, Path)):
+        return None
+    part = CROP.fullmatch(str(photograph))
+    path = Path(part["path"] if part else photograph)
+    for suffix in LIGHT_SUFFIXES:
+        light = path.with_suffix(suffix)
+        if light != path and light.is_file():
+            with track_opened_files(path):
+                record_opened(light)
+            return light
+    return None
+
+
+def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhotograph:
+    """Return a photograph with the mask of what is before the object.
+
+    Args:
+        photograph: the photograph.
+        spec: a picture file of the full photograph's size, white where something is
+            before the object, black elsewhere.
+
+    Raises:
+        FileFormatError: the file cannot be used.
+        InputError: it has another size.
+    """
+    path = Path(spec)
+    with track_opened_files(path), open_image(path, LARGEST_FILE) as image:
+        levels = _decode_photograph(image, path)
+    if levels.shape != photograph.levels.shape:
+        height, width = photograph.full_size
+        raise InputError(
+            f"occluder: expected a mask of {width} x {height} pixels (width x height), "
+            f"as the photograph has, got {levels.shape[1]} x {levels.shape[0]} in "
+            f"{spec}"
+        )
+    front = np.ascontiguousarray(levels[..., 1])
+    return replace(photograph, front=front, front_spec=str(spec))
+
+
+def make_image_inputs(
+    description: SceneDescription, resolution: tuple[int, int]
+) -> dict[str, Tensor]:
+    """Return the inputs by which a rendered image becomes a part of its photograph.
+
+    Empty for a scene that is rendered into none.
+
+    Returns:
+        ``backdrop.color`` (H, W, 3) the photograph; and if there is any
+        ``backdrop.plane`` (3,), see `compute_plane_radiance`; ``backdrop.front`` (H, W,
+        1) what is before the object; ``backdrop.noise`` (H, W, 3) display-referred
+        noise, and ``backdrop.blur`` (1,) in pixels, of what is rendered.
+    """
+    photograph = description.backdrop_photograph
+    if photograph is None:
+        return {}
+    color = photograph.resample(resolution)
+    blur = description.values.get("backdrop.blur")
+    if blur is None:
+        blur = measure_blur((color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32))
+    noise = photograph.make_noise(resolution, description.values.get("backdrop.noise"))
+    inputs: dict[str, Tensor | None] = {
+        "backdrop.color": color,
+        "backdrop.plane": compute_plane_radiance(description),
+        "backdrop.front": photograph.resample_front(resolution),
+        "backdrop.noise": noise if bool(noise.any()) else None,
+        "backdrop.blur": torch.tensor([blur]) if blur >= MIN_BLUR else None,
+    }
+    return {name: value for name, value in inputs.items() if value is not None}
+
+
+def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
+    """Return the levels (H, W, 3) of an opened photograph, as a viewer shows it."""
+    check_decodable(image, path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of large images and odd metadata
+        image.load()
+        upright = ImageOps.exif_transpose(image)
+    if image.has_transparency_data and bool(
+        (to_8bit_levels(upright, alpha=True)[:, :, 3] < 255).any()
+    ):
+        raise FileFormatError(
+            f"{path}: expected a photograph, got a picture that is transparent in some "
+            "pixels; save it without transparency"
+        )
+    return np.ascontiguousarray(to_8bit_levels(upright, alpha=False))
+
+
+def make_backdrop(
+    levels: npt.NDArray[np.uint8],
+    spec: str = "photograph",
+    crop: tuple[int, int, int, int] | None = None,
+) -> BackdropPhotograph:
+    """Make a backdrop of 8-bit sRGB levels (H, W, 3).
+
+    Args:
+        levels: of the full photograph.
+        spec: how it is called.
+        crop: left, top, width and height in pixels of the part to use; None: all.
+
+    Raises:
+        InputError: the levels have another shape or type.
+    """
+    if levels.ndim != 3 or levels.shape[2] != 3 or levels.dtype != np.uint8:
+        raise InputError(
+            "backdrop: expected a photograph (h, w, 3) of uint8, got an array of shape "
+            f"{levels.shape} of {levels.dtype}"
+        )
+    levels = np.ascontiguousarray(levels)
+    digest = hashlib.sha256(f"{levels.shape}".encode() + levels.tobytes()).hexdigest()
+    height, width = levels.shape[:2]
+    return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
+
+
+# ---- The light of a photograph
+
+
+def compute_photograph_gain(
+    description: SceneDescription, photograph: BackdropPhotograph
+) -> float:
+    """Return the factor from radiance to display-linear values of a photograph.
+
+    A level surface with the mean reflectance of what photographs show is as bright as
+    the photograph is on average. 1 where no environment lights the scene.
+    """
+    irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
+    if not irradiance > 0.0:
+        return 1.0
+    counts = [
+        np.bincount(photograph.levels[..., channel].reshape(-1), minlength=256)
+        for channel in range(len(CHANNELS))
+    ]
+    decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
+    means = np.array([np.average(decoded, weights=count) for count in counts])
+    mean = max(float(means @ LUMINANCE), 1e-3)
+    return mean * math.pi / (GREY_CARD * irradiance)
+
+
+def compute_level_irradiance(description: SceneDescription) -> Float64Array:
+    """Return the irradiance (3,) of a level surface under the environment alone.
+
+    It is that of the map, before `environment.exposure`.
+    """
+    environment = description.environment
+    if environment is None:
+        return np.zeros(len(CHANNELS))
+    rows = environment.radiance.shape[0]
+    edges = np.cos(np.arange(rows + 1) * math.pi / rows)
+    # of each row the integral of cosine and solid angle, where it lies above
+    upper = np.maximum(edges[:-1], 0.0)
+    lower = np.maximum(edges[1:], 0.0)
+    row_means = environment.radiance.mean(axis=1, dtype=np.float64)
+    weights = math.pi * (upper**2 - lower**2)
+    # no BLAS, whose last bits depend on its threads
+    return np.asarray((weights[:, None] * row_means).sum(axis=0))
+
+
+def has_plane(description: SceneDescription) -> bool:
+    """Return whether a scene has a plane that takes the shadow in a photograph.
+
+    It needs an environment, whose light the shadow is in, and a camera above it.
+    """
+    return (
+        description.backdrop_photograph is not None
+        and description.number("ground.size") > 0.0
+        and bool((compute_level_irradiance(description) > 0.0).all())
+        and camera_to_world(description)[2, 3] > description.number("ground.level")
+    )
+
+
+def compute_plane_radiance(description: SceneDescription) -> Tensor | None:
+    """Return the radiance (3,) float32 of the plane without the object.
+
+    None if a scene has no plane.
+    """
+    if not has_plane(description):
+        return None
+    srgb = np.array(description.ground_color, np.float32)
+    albedo = srgb_to_linear(srgb).astype(np.float64)
+    brightness = 2.0 ** description.number("environment.exposure")
+    radiance = albedo * brightness * compute_level_irradiance(description) / math.pi
+    return torch.from_numpy(radiance).float()
+
+
+def measure_plane_color(
+    description: SceneDescription, photograph: BackdropPhotograph
+) -> dict[str, float]:
+    """Return the settings of the plane's color, sRGB, measured around the object.
+
+    They follow from the median color of the photograph there and its light; empty if
+    the user stated a color, or none of it is in the photograph.
+
+    Args:
+        description: the scene, with the camera of the full photograph.
+        photograph: that it is rendered into.
+    """
+    names = [f"ground.{channel}" for channel in CHANNELS]
+    if not has_plane(description) or description.requested & set(names):
+        return {}
+    levels = _look_up_levels(description, photograph, _sample_ring(description))
+    if not len(levels):
+        return {}
+    display = levels.astype(np.float32) / np.float32(255.0)
+    light = description.gain * compute_level_irradiance(description) / math.pi
+    albedo = np.median(srgb_to_linear(display), axis=0) / light
+    color = linear_to_srgb(np.clip(albedo, *ALBEDO_RANGE).astype(np.float32))
+    return dict(zip(names, map(float, color), strict=True))
+
+
+def _sample_ring(description: SceneDescription) -> Float64Array:
+    """Return points (N, 3) of the plane around the object."""
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0.0, 2.0 * math.pi, N_CONTACT_POINTS)
+    radius = rng.uniform(*CONTACT_RING, N_CONTACT_POINTS)
+    center = object_to_world(description)[:2, 3]
+    x = center[0] + radius * np.cos(angle)
+    y = center[1] + radius * np.sin(angle)
+    level = np.full(N_CONTACT_POINTS, description.number("ground.level"))
+    return np.column_stack([x, y, level])
+
+
+def _look_up_levels(
+    description: SceneDescription, photograph: BackdropPhotograph, points: Float64Array
+) -> npt.NDArray[np.uint8]:
+    """Return the levels (M, 3) of a photograph at those of points (N, 3) that it shows.
+
+    The scene has the camera of the full photograph.
+    """
+    height, width = photograph.full_size
+    camera = camera_to_world(description, width / height)
+    relative = (points - camera[:3, 3]) @ camera[:3, :3]
+    positions, is_visible = project_points(
+        replace(description, aspect=width / height),
+        {},
+        torch.from_numpy(relative),
+        (height, width),
+    )
+    size = np.array([width, height])
+    pixels = np.floor(positions.numpy() + size / 2.0).astype(int)
+    is_inside = is_visible.numpy() & ((pixels >= 0) & (pixels < size)).all(axis=1)
+    inside: npt.NDArray[np.intp] = pixels[is_inside]
+    return photograph.levels[inside[:, 1], inside[:, 0]]
+
+
+# ---- The camera of a photograph
+
+
+def make_matrix_camera(
+    camera_matrix: npt.ArrayLike, size: tuple[int, int]
+) -> CameraModel:
+    """Return the camera of an intrinsic matrix (3, 3), as OpenCV has it.
+
+    Args:
+        camera_matrix: in pixels; the center of the first pixel is (0, 0).
+        size: height and width in pixels of the photographs that it is for.
+
+    Raises:
+        InputError: it is no such matrix.
+    """
+    matrix = np.asarray(camera_matrix, np.float64)
+    has_form = (
+        matrix.shape == (3, 3)
+        and bool(np.isfinite(matrix).all())
+        and matrix[1, 0] == 0.0
+        and matrix[2].tolist() == [0.0, 0.0, 1.0]
+        and min(matrix[0, 0], matrix[1, 1]) > 0.0
+    )
+    if not has_form:
+        raise InputError(
+            "camera_matrix: expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in "
+            f"pixels, got {matrix.tolist()}"
+        )
+    height, width = size
+    linear = (
+        matrix[0, 0] / width,
+        matrix[1, 1] / height,
+        (matrix[0, 2] + 0.5) / width,
+        (matrix[1, 2] + 0.5) / height,
+        matrix[0, 1] / width,
+    )
+    n_coefficients = len(NUMBER_NAMES) - len(LINEAR_PARAMETERS)
+    numbers = (*map(float, linear), *[0.0] * n_coefficients)
+    return CameraModel(BROWN_CONRADY, numbers, PHOTOGRAPH_CAMERA, size)
+
+
+def fit_to_photograph(
+    description: SceneDescription,
+    photograph: BackdropPhotograph,
+    resolution: tuple[int, int],
+) -> SceneDescription:
+    """Return a scene with the camera of the part of a photograph that is used.
+
+    Args:
+        description: the scene, whose camera took the full photograph.
+        photograph: that it is rendered into.
+        resolution: height and width of the film, pixels.
+
+    Raises:
+        InputError: the film, or the camera's picture, has another shape than the
+            photograph.
+    """
+    _check_film(photograph, resolution)
+    full_height, full_width = photograph.full_size
+    full_aspect = full_width / full_height
+    model = description.camera_model
+    if model is not None:
+        model = make_bundled_models(full_aspect).get(model.name, model)
+        _check_camera_shape(photograph, model)
+    uncropped = replace(description, camera_model=model)
+    plane_color = measure_plane_color(uncropped, photograph)
+    if photograph.is_cropped:
+        if model is None:
+            fov = description.number("camera.fov")
+            model = replace(make_pinhole(fov, full_aspect), name=PHOTOGRAPH_CAMERA)
+        model = crop_camera(model, photograph)
+    return replace(
+        description,
+        aspect=resolution[1] / resolution[0],
+        camera_model=model,
+        values={**description.values, **plane_color},
+    )
+
+
+def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraModel:
+    """Return the camera that sees the used part of a photograph.
+
+    `model` is the camera of the full photograph. Raises InputError: it is a panorama.
+    """
+    if model.kind == EQUIRECTANGULAR:
+        raise InputError(
+            f"backdrop: {photograph.spec} is a part of a picture of {model.name}, which "
+            "shows all around; give the full photograph"
+        )
+    left, top, width, height = photograph.crop
+    full_height, full_width = photograph.full_size
+    values = model.values
+    values["fx"] *= full_width / width
+    values["skew"] *= full_width / width
+    values["cx"] = (values["cx"] * full_width - left) / width
+    values["fy"] *= full_height / height
+    values["cy"] = (values["cy"] * full_height - top) / height
+    numbers = tuple(values[name] for name in NUMBER_NAMES)
+    return replace(model, numbers=numbers, size=None)
+
+
+def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> None:
+    """Raise InputError if a film has another shape than the photograph.
+
+    Its sides may be rounded to pixels.
+    """
+    height, width = photograph.size
+    film_height, film_width = resolution
+    rounding = max(width / film_width, height / film_height)
+    if abs(film_width / film_height * height - width) <= rounding:
+        return
+    scale = min(width / film_width, height / film_height)
+    part_width = int(film_width * scale)
+    part_height = int(film_height * scale)
+    left = photograph.crop[0] + (width - part_width) // 2
+    top = photograph.crop[1] + (height - part_height) // 2
+    path = photograph.spec.partition("#")[0]
+    raise InputError(
+        f"backdrop: {photograph.spec} has {width} x {height} pixels (width x height) "
+        f"and the rendered picture {film_width} x {film_height}, which is another "
+        f"shape; give a part of the photograph, such as {path}#{left},{top},"
+        f"{part_width},{part_height}, or another `resolution`"
+    )
+
+
+def _check_camera_shape(photograph: BackdropPhotograph, model: CameraModel) -> None:
+    """Raise InputError if a camera takes pictures of another shape."""
+    if model.size is None:
+        return
+    height, width = photograph.full_size
+    camera_height, camera_width = model.size
+    stretch = camera_width * height / (camera_height * width)
+    if abs(stretch - 1.0) > SHAPE_TOLERANCE:
+        raise InputError(
+            f"backdrop: {photograph.spec.partition('#')[0]} has {width} x {height} "
+            f"pixels (width x height) and {model.name} is for {camera_width} x "
+            f"{camera_height}, which is another shape: the photograph was turned or "
+            "cropped; take it as the camera took it, and give the part to use behind "
+            "its name, photo.jpg#X,Y,WIDTH,HEIGHT"
+        )
+
+
+# ---- The pose of a photograph
+
+
+def compute_view_settings(
+    asset: ObjectAsset,
+    object_to_camera: npt.ArrayLike,
+    up: npt.ArrayLike | None = None,
+) -> dict[str, float]:
+    """Return the settings of the scene in which a camera sees the object in a pose.
+
+    The camera orbits a point on its axis at the depth of the object's center, and the
+    object is shifted and turned from where it would stand.
+
+    Args:
+        asset: the object, from a file whose unit is known.
+        object_to_camera: rigid (4, 4) from coordinates of the object's file to those of
+            the camera: x right, y down, z ahead, in the file's unit.
+        up: (3,) direction in the camera's coordinates that is up in the world; None:
+            the object's own up axis, so that it stands upright.
+
+    Returns:
+        Values of ``camera.azimuth``, ``camera.elevation``, ``camera.roll``,
+        ``camera.distance``, ``pose.*`` and ``ground.level``, the height of the object's
+        lowest point, for `load_scene(settings=)`.
+
+    Raises:
+        InputError: the object comes from no file, or its size in metres is not known;
+            the pose is not rigid, or puts the object behind the camera.
+    """
+    mesh_to_camera = _compute_mesh_to_camera(asset, object_to_camera)
+    vertices = asset.mesh.vertices.astype(np.float64)
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    center = mesh_to_camera[:3, :3] @ middle + mesh_to_camera[:3, 3]
+    distance = float(center[2])
+    if distance <= 0.0:
+        raise InputError("object_to_camera: puts the object behind the camera")
+    world_axes = _make_world_axes(
+        mesh_to_camera[:3, 2] if up is None else np.asarray(up, np.float64)
+    )
+    rotation = world_axes @ mesh_to_camera[:3, :3]
+    offset = world_axes @ (center - np.array([0.0, 0.0, distance]))
+    lowest = float(((vertices - middle) @ rotation.T)[:, 2].min())
+    return {
+        **_compute_orbit(world_axes),
+        "camera.distance": distance * (asset.metres or 1.0),
+        **_decompose_rotation(rotation),
+        "pose.x": float(offset[0]),
+        "pose.y": float(offset[1]),
+        # from where its lowest vertex would be at the height 0
+        "pose.z": float(offset[2] + middle[2]) + lowest,
+        "ground.level": float(offset[2] + middle[2]) + lowest,
+    }
+
+
+def _compute_mesh_to_camera(
+    asset: ObjectAsset, object_to_camera: npt.ArrayLike
+) -> Float64Array:
+    """Return the map (4, 4) from a mesh to camera coordinates, both in object sizes.
+
+    Raises InputError as `compute_view_settings`.
+    """
+    pose = _check_rigid(object_to_camera)
+    if asset.file_to_mesh is None or asset.metres is None:
+        raise InputError(
+            f"{asset.name}: expected an object from a mesh file with a known unit, to "
+            "be seen in a measured pose; give `unit`, such as unit=mm"
+        )
+    mesh_to_file = np.linalg.inv(asset.file_to_mesh)
+    object_size = float(np.cbrt(np.linalg.det(mesh_to_file[:3, :3])))
+    mesh_to_camera: Float64Array = pose @ mesh_to_file
+    mesh_to_camera[:3] /= object_size
+    return mesh_to_camera
+
+
+def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
+    """Return the settings of a camera on an orbit, by world axes (3, 3).
+
+    They are rows in the camera's coordinates. Raises InputError: it looks straight up
+    or down.
+    """
+    outwards = -world_axes[:, 2]  # from the object to the camera
+    elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
+    if abs(elevation) > MAX_ELEVATION:
+        raise InputError(
+            "object_to_camera: the camera looks straight up or down, more than "
+            f"{MAX_ELEVATION:g} degrees from level, which no camera does that orbits "
+            "the object; give another `up`"
+        )
+    level_left = np.array([outwards[1], -outwards[0], 0.0])
+    level_left /= np.linalg.norm(level_left)
+    upright = np.cross(-outwards, level_left)
+    left = -world_axes[:, 0]
+    return {
+        "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
+        "camera.elevation": elevation,
+        "camera.roll": math.degrees(math.atan2(left @ upright, left @ level_left)),
+    }
+
+
+def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
+    """Return a pose (4, 4) as float64. Raises InputError: it is not rigid."""
+    matrix = np.asarray(pose, np.float64)
+    is_rigid = (
+        matrix.shape == (4, 4)
+        and bool(np.isfinite(matrix).all())
+        and matrix[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+        and np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max()
+        <= ROTATION_TOLERANCE
+        and np.linalg.det(matrix[:3, :3]) > 0.0
+    )
+    if not is_rigid:
+        raise InputError(
+            "object_to_camera: expected a rotation and a translation as a (4, 4) "
+            f"matrix, got {matrix.tolist()}"
+        )
+    return matrix
+
+
+def _make_world_axes(up: Float64Array) -> Float64Array:
+    """Return world axes (3, 3), rows in camera coordinates, with z along `up`.
+
+    +x points from the object to the camera as far as that is level.
+    """
+    if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
+        raise InputError(f"up: expected a direction of three numbers, got {up!r}")
+    z_axis = up / np.linalg.norm(up)
+    towards_camera = np.array([0.0, 0.0, -1.0])
+    x_axis = towards_camera - (towards_camera @ z_axis) * z_axis
+    if np.linalg.norm(x_axis) < 1e-6:  # the camera looks straight up or down
+        x_axis = np.array([0.0, 1.0, 0.0]) - z_axis[1] * z_axis
+    x_axis /= np.linalg.norm(x_axis)
+    return np.stack([x_axis, np.cross(z_axis, x_axis), z_axis])
+
+
+def _decompose_rotation(rotation: Float64Array) -> dict[str, float]:
+    """Return the settings of `Rz(yaw) Ry(pitch) Rx(roll)`, degrees."""
+    pitch = math.asin(min(max(-float(rotation[2, 0]), -1.0), 1.0))
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    if abs(rotation[2, 0]) > 1.0 - 1e-9:  # yaw and roll turn about one axis
+        yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
+        roll = 0.0
+    return {
+        "pose.yaw": math.degrees(yaw),
+        "pose.pitch": math.degrees(pitch),
+        "pose.roll": math.degrees(roll),
+    }
