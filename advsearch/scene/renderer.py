@@ -334,7 +334,6 @@ class Renderer:
         """
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
-        window = self.window
         undenoised = self.copy_with(denoiser="none")
         noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
         halves = [
@@ -343,9 +342,9 @@ class Renderer:
         ]
         mean = (halves[0] + halves[1]) / 2.0
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
-        with self.scene.limit_window(window):
+        with self.scene.limit_window(self.window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
-        traced = mean if window is None else window.select(mean)
+        traced = mean if self.window is None else self.window.select(mean)
         plane_radiance = self.scene.plane_radiance if hide else None
         clean = denoise_image(traced, albedo, normal, plane_radiance)
         if self.crop is not None:
