@@ -15,7 +15,9 @@ beside them, how often another seed changes the verdict.
 The last row is a search over cameras, whose steps render nothing where light on
 surfaces predicts them: milliseconds of a predicted picture, the gain over a rendered
 one (squared error x time), and how far both are off, in levels of 255. With
-`--predicted` it is all that is measured.
+`--predicted` it is all that is measured. Behind it stands a gradient of a texture in
+the avenue of which only the part of the picture that can change is traced, alone with
+`--window`.
 
 First every number of every setting is fixed at both ends of its range, alone, and those
 of one material in all combinations of ends: the picture with everything left out
@@ -32,7 +34,7 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +53,13 @@ from advsearch.engine.loading import (
     make_renderer,
 )
 from advsearch.engine.problem import Problem
+from advsearch.engine.windows import MIN_STEPS, find_window
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.formation import ALL_OMISSIONS, NO_OMISSIONS
+from advsearch.scene.predictor import Refusal
+from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import FAMILIES, MATERIAL, SETTINGS
 from advsearch.scene.surface.renderer import SurfaceRenderer
 
@@ -88,6 +93,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--predicted", action="store_true", help="the row of light on surfaces alone"
     )
     parser.add_argument(
+        "--window", action="store_true", help="the row of the window alone"
+    )
+    parser.add_argument(
         "--ends",
         action="store_true",
         help="the pictures with numbers at the ends of their range alone",
@@ -97,6 +105,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return battery()
     if args.predicted:
         print(predicted(args.size, args.spp, args.repeats))
+        return 0
+    if args.window:
+        print(cropped(args.size, args.spp, args.repeats))
         return 0
     rows = []
     print(
@@ -120,6 +131,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"{min(row['gain'] for row in rows):.2f}"
     )
     print(predicted(args.size, args.spp, args.repeats))
+    print(cropped(args.size, args.spp, args.repeats))
     verdicts = agreement(PAIRS[0], args.size, args.spp, args.configurations)
     print(
         f"verdicts of {verdicts['configurations']} configurations: {verdicts['agree']} "
@@ -259,6 +271,28 @@ def measured(
             for one in (lean, full)
         ]
     ).mean(dim=0)
+    times, errors = _time_gradients(ways, loss, u, truth, spp, repeats)
+    return {
+        "pair": list(pair),
+        "seconds": times[0],
+        "gain": times[1] * errors[1] / (times[0] * errors[0]),
+        "gain_cut": times[1] * errors[1] / (times[2] * errors[2]),
+        "time_ratio": times[1] / times[0],
+        "error": math.sqrt(errors[0]) / float(truth.norm()),
+        "errors": errors,
+        "depth": depth,
+    }
+
+
+def _time_gradients(
+    ways: Sequence[Renderer],
+    loss: Callable[[torch.Tensor], torch.Tensor],
+    u: torch.Tensor,
+    truth: torch.Tensor,
+    spp: int,
+    repeats: int,
+) -> tuple[list[float], list[float]]:
+    """The median seconds of a gradient by each renderer, and its squared error."""
     for way in ways:
         way.gradient(loss, u, 0, spp)
     found: list[list[tuple[float, float]]] = [[] for _ in ways]
@@ -270,16 +304,43 @@ def measured(
             results.append((seconds, float((estimate - truth).square().sum())))
     times = [statistics.median(one[0] for one in results) for results in found]
     errors = [statistics.fmean(one[1] for one in results) for results in found]
-    return {
-        "pair": list(pair),
-        "seconds": times[0],
-        "gain": times[1] * errors[1] / (times[0] * errors[0]),
-        "gain_cut": times[1] * errors[1] / (times[2] * errors[2]),
-        "time_ratio": times[1] / times[0],
-        "error": math.sqrt(errors[0]) / float(truth.norm()),
-        "errors": errors,
-        "depth": depth,
-    }
+    return times, errors
+
+
+def cropped(size: int, spp: int, repeats: int) -> str:
+    """What a gradient takes where only the part of the picture that can change is
+    traced, and how far it is off; as a row.
+    """
+    config = AttackConfig(
+        object="car",
+        environment="avenue",
+        controls={"texture": {}},
+        resolution=(size, size),
+        set={"camera.azimuth": 0.0, "camera.elevation": 5.0, "camera.distance": 15.0},
+        label="mug",
+        minimise=True,
+    )
+    problem = problem_from_config(config)[0]
+    problem.steps = MIN_STEPS
+    found = find_window(problem)
+    if isinstance(found, Refusal):
+        return f"| car, avenue, texture: its window | refused: {found} |"
+    whole = problem.renderer
+    u = find_interior_point(whole)
+    loss = make_smooth_loss((size, size))
+    truth = torch.stack(
+        [
+            whole.gradient(loss, u, seeds.stream(1, "truth", n), 4 * spp)[1]
+            for n in range(REFERENCES)
+        ]
+    ).mean(dim=0)
+    crop = whole.crop_to(found.window, u, 0, spp)
+    times, errors = _time_gradients((crop, whole), loss, u, truth, spp, repeats)
+    gain = times[1] * errors[1] / (times[0] * errors[0])
+    return (
+        f"| car, avenue, texture: its window | {1e3 * times[0]:.0f} | {gain:.1f} | "
+        f"{math.sqrt(errors[0]) / float(truth.norm()):.3f} | | |"
+    )
 
 
 def predicted(size: int, spp: int, repeats: int) -> str:

@@ -1,8 +1,8 @@
 """Searches that render only the window of the image in which something can change.
 
-The rest of each image is that of a full one. It is rendered again every
+The rest of each image is that of a whole one. It is rendered again every
 `COMPARISON_INTERVAL` evaluations, which also measures what was missed. Where this is
-too much twice in a row, the rest of the search renders full images. The ranking and
+too much twice in a row, the rest of the search renders whole images. The ranking and
 all trials do so anyway. How the window is chosen: `advsearch.engine.windows`.
 """
 
@@ -23,7 +23,7 @@ from advsearch.engine.windows import (
     Windowing,
     find_window,
     measure_outside,
-    render_full_image,
+    render_full,
 )
 from advsearch.scene.predictor import Refusal
 from advsearch.scene.renderer import Renderer
@@ -45,8 +45,7 @@ class CroppedSearch(PredictedSearch):
 
     windowing: Windowing | None = None
     refusal: Refusal | None = None
-    # the latest full image of each kind of search, and the renderer that pastes windows
-    # into its surroundings
+    # the latest whole image of each kind of search, and the renderer with that around
     _current: dict[str, tuple[FullImage, Renderer]] = field(default_factory=dict)
 
     @property
@@ -82,15 +81,7 @@ class CroppedSearch(PredictedSearch):
     def _use(
         self, windowing: Windowing, kind: str, number: int, image: FullImage
     ) -> Renderer:
-        """Render the surroundings that a kind of search has from now on, and return the
-        renderer that pastes windows into them.
-
-        Args:
-            windowing: the window.
-            kind: of search, or "start" for all that have none of their own yet.
-            number: of the evaluation.
-            image: the full image at whose configuration they are rendered.
-        """
+        """Render the surroundings that a kind of search has from now on."""
         problem = self.problem
         seed = seeds.stream(problem.seed, f"crop {kind}", number)
         with problem.renderer.scene.limit_depth(problem.search_depth):
@@ -111,16 +102,13 @@ class CroppedSearch(PredictedSearch):
         return self.problem.evaluate_full(query, query.u, query.seed, renderer)[0]
 
     def _update(self, query: Query) -> Renderer | None:
-        """Return the renderer of a query; None where full images are rendered.
+        """Return the renderer of a query; None where whole images are rendered.
 
-        Every `COMPARISON_INTERVAL` evaluations a full image is rendered and compared,
-        and surroundings are rendered anew. If the comparison fails twice in a row, full
-        images are rendered from then on.
+        Where that is due, a whole image is rendered, measured and used.
         """
         kind = query.kind
         number = query.number
         first_full = self.first_traced.get(kind, self.steps)
-        # Full images are rendered from this evaluation on.
         if query.phase != "search" or number >= first_full:
             return None
         if self.windowing is None:
@@ -131,19 +119,19 @@ class CroppedSearch(PredictedSearch):
             return renderer
         was_accepted = self.deviations[-1].is_accepted
         with self.count_time():
-            full_image = self._measure(self.windowing, image, query.u)
+            current = self._measure(self.windowing, image, query.u)
             if self.deviations[-1].is_accepted or was_accepted:
                 self.n_renewals = (self.n_renewals or 0) + 1
-                return self._use(self.windowing, kind, number, full_image)
+                return self._use(self.windowing, kind, number, current)
         self.trace_from(kind, number, f" of the {kind}")
         return None
 
     def _measure(self, windowing: Windowing, image: FullImage, u: Tensor) -> FullImage:
         """Measure how far the surroundings of an image are off at u (d,), and return
-        the full image there.
+        the whole image there.
         """
-        full_image = render_full_image(self.problem, u)
+        current = render_full(self.problem, u)
         self.n_traced += 1
-        deviation = measure_outside(self.problem, windowing.window, image, [full_image])
+        deviation = measure_outside(self.problem, windowing.window, image, [current])
         self.deviations.append(deviation)
-        return full_image
+        return current

@@ -30,7 +30,7 @@ from advsearch.engine.windows import (
     Windowing,
     find_window,
     measure_outside,
-    render_full_image,
+    render_full,
 )
 from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.color import round_to_8_bit
@@ -278,7 +278,7 @@ class Transport(PredictedSearch):
     _score_bias: float = 0.0
     # the latest matrix of each kind of search
     _current: dict[str, Predictor] = field(default_factory=dict)
-    # where a window is traced, the full image behind each of them
+    # where a window is traced, the whole image behind each of them
     _full_images: dict[str, FullImage] = field(default_factory=dict)
     _is_prepared: bool = False
 
@@ -369,7 +369,7 @@ class Transport(PredictedSearch):
                 renderer=renderer,
             )
         )
-        has_same_surroundings = self._has_same_surroundings(kind, query.u)
+        has_same_surroundings, current = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
         # Basis images of lights do not depend on u: nothing can be linearised again.
@@ -377,24 +377,26 @@ class Transport(PredictedSearch):
             self.trace_from(kind, number, f" of the {kind}")
             return None
         self._current[kind] = self._make_predictor(query.u, kind, number)
+        if current is not None:
+            self._full_images[kind] = current
         self.n_renewals = (self.n_renewals or 0) + 1
         return self._current[kind]
 
-    def _has_same_surroundings(self, kind: str, u: Tensor) -> bool:
+    def _compare_surroundings(
+        self, kind: str, u: Tensor
+    ) -> tuple[bool, FullImage | None]:
         """Return whether what is outside of the window is still the same at u (d,).
 
-        If not, the matrix is computed again, and what is outside with it.
+        The second value is the image there; None if images are traced in full.
         """
         if self.window is None:
-            return True
-        before = self._full_images.setdefault(kind, self._full_images["start"])
+            return True, None
+        before = self._full_images.get(kind, self._full_images["start"])
         with self.count_time():
-            after = render_full_image(self.problem, u)
-            deviation = measure_outside(self.problem, self.window, before, [after])
+            current = render_full(self.problem, u)
+            deviation = measure_outside(self.problem, self.window, before, [current])
         self.n_traced += 1
-        if not deviation.is_accepted:
-            self._full_images[kind] = after
-        return deviation.is_accepted
+        return deviation.is_accepted, current
 
     def is_likely_success(self, u: Tensor) -> bool:
         """Return whether the predicted image of u (d,) would pass its trials.

@@ -1,7 +1,7 @@
 """Find the window of the image outside of which what is searched changes nothing.
 
 What is searched may show in a small part of the image. A search then traces the
-smallest window around it for which this holds: outside, full images at both ends of
+smallest window around it for which this holds: outside, whole images at both ends of
 the budget differ from that of the start by less than `MAX_LEVELS` on average, and with
 these surroundings the margin is as without (docs/leaving-out.md, "The rest of the
 picture").
@@ -50,11 +50,11 @@ MOVING_SUFFIXES = (".vertices", ".normals")
 
 
 class FullImage(NamedTuple):
-    """A full image, traced twice with independent noise.
+    """A whole image, traced twice with independent noise.
 
     Attributes:
         u: (d,) its configuration.
-        halves: the two traced images, linear radiance (H, W, 3 or 4) with noise.
+        halves: both, linear radiance (H, W, 3 or 4) with noise.
         radiance: their mean (H, W, 3 or 4), denoised.
     """
 
@@ -69,7 +69,7 @@ class Windowing:
 
     Attributes:
         window: of the pixels that are traced.
-        start: the full image at the start.
+        start: the whole image at the start.
         deviation: of images with its surroundings.
     """
 
@@ -79,12 +79,9 @@ class Windowing:
 
 
 def find_window(problem: Problem) -> Windowing | Refusal:
-    """Return the smallest window outside of which a search changes little, or why there
-    is none.
+    """Return the smallest window outside of which a search changes little.
 
-    It renders three full images with few samples: at the start, and with all searched
-    coordinates at 0 and at 1. The window is the box of what is searched, with the
-    smallest of `MARGINS` around it for which the images agree outside.
+    It takes three whole images of few samples. Without one, why there is none.
     """
     refusal = find_crop_refusal(problem)
     if refusal is not None:
@@ -99,7 +96,7 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         return Refusal("what is searched fills much of the picture")
     lower = domain.project(torch.zeros_like(domain.start))
     upper = domain.project(torch.ones_like(domain.start))
-    start, *ends = [render_full_image(problem, u) for u in (domain.start, lower, upper)]
+    start, *ends = [render_full(problem, u) for u in (domain.start, lower, upper)]
     for margin in MARGINS:
         window = box.grow(margin, resolution)
         if window.area > largest_area:
@@ -111,9 +108,9 @@ def find_window(problem: Problem) -> Windowing | Refusal:
 
 
 def find_crop_refusal(problem: Problem) -> Refusal | None:
-    """Return why a search renders full images; None if a crop may be enough.
+    """Return why a search renders whole images; None if a crop may be enough.
 
-    Whether it is enough has to be measured.
+    What it misses outside is measured only then.
     """
     renderer = problem.renderer
     if renderer.composition_reason:
@@ -166,10 +163,10 @@ def _find_box(problem: Problem) -> Window | None:
     return Window.from_mask(mask)
 
 
-def render_full_image(problem: Problem, u: Tensor) -> FullImage:
-    """Render the full image of u (d,) that is compared with others.
+def render_full(problem: Problem, u: Tensor) -> FullImage:
+    """Render the whole image of u (d,) that is compared with others.
 
-    It has the same seeds of the noise for each u.
+    It has the same noise for each u.
     """
     with torch.no_grad(), problem.renderer.scene.limit_depth(problem.search_depth):
         halves, radiance = problem.renderer.trace_halves(
@@ -186,30 +183,26 @@ def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
 def measure_outside(
     problem: Problem, window: Window, before: FullImage, others: Sequence[FullImage]
 ) -> Deviation:
-    """Measure how far predictions are off that paste the window of an image into the
-    surroundings of an earlier one; the mean over several images.
-
-    Levels are the difference outside of the window, the bias of the margin that of the
-    model on the pasted image.
+    """Measure by how much images differ outside of a window, the mean over several.
 
     Args:
         problem: of the search.
         window: the pixels that are traced.
         before: the image whose surroundings are pasted.
-        others: the images that are compared with it, at least one.
+        others: the images that are compared with it.
     """
-    squared_levels = []
+    squares = []
     biases = []
     changes = []
     for image in others:
-        squared_levels.append(_measure_squared_levels(problem, window, before, image))
+        squares.append(_measure_square(problem, window, before, image))
         bias, change = _measure_margin(problem, window, before, image)
         biases.append(bias)
         changes.append(change)
     count = len(others)
     limit = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * sum(changes) / count)
     return Deviation(
-        levels=math.sqrt(max(0.0, sum(squared_levels) / count)),
+        levels=math.sqrt(max(0.0, sum(squares) / count)),
         logits=sum(biases) / count,
         allowed_levels=MAX_LEVELS,
         n_traced=count,
@@ -217,31 +210,27 @@ def measure_outside(
     )
 
 
-def _measure_squared_levels(
+def _measure_square(
     problem: Problem, window: Window, before: FullImage, after: FullImage
 ) -> float:
-    """Return the mean squared difference of images outside of a window, in squared
-    levels.
+    """Return the mean squared difference outside of a window, in squared levels.
 
-    Differences are averaged over blocks of `SQUARE` pixels before they are squared. In
-    each half, both images have one seed, and so nearly the same noise. The product of
-    the differences of the two halves is their square without the noise that is left.
+    Images of one seed have nearly the same noise. The product of the differences of two
+    seeds is the square without what noise is left.
     """
-    is_outside = window.is_outside(problem.renderer.formation.resolution).float()
+    outside = window.is_outside(problem.renderer.formation.resolution).float()
     slope = _compute_slope(problem, before)
     sums = [
-        _sum_blocks(255.0 * slope * (new - old)[..., :3] * is_outside[..., None])
+        _sum_squares(255.0 * slope * (new - old)[..., :3] * outside[..., None])
         for old, new in zip(before.halves, after.halves, strict=True)
     ]
-    n_pixels = _sum_blocks(is_outside[..., None])
+    n_pixels = _sum_squares(outside[..., None])
     products = sums[0] * sums[1] / n_pixels.clamp_min(1.0)
     return float(products.sum() / (3.0 * n_pixels.sum().clamp_min(1.0)))
 
 
-def _sum_blocks(image: Tensor) -> Tensor:
-    """Return the sums (1, c, h, w) over blocks of `SQUARE` x `SQUARE` pixels of an
-    image (H, W, c).
-    """
+def _sum_squares(image: Tensor) -> Tensor:
+    """Return the sums over squares of `SQUARE` pixels of an image (H, W, c)."""
     sums: Tensor = functional.avg_pool2d(
         image.movedim(-1, 0)[None], SQUARE, ceil_mode=True, divisor_override=1
     )
@@ -249,10 +238,7 @@ def _sum_blocks(image: Tensor) -> Tensor:
 
 
 def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
-    """Return the derivative (H, W, 3) of each displayed value by its own radiance.
-
-    It is exact where a pixel is displayed by its own radiance alone.
-    """
+    """Return the derivative of the displayed image by its radiance, (H, W, 3)."""
     radiance = image.radiance.clone()
     inputs = _compute_inputs(problem, image.u)
     with torch.enable_grad():
@@ -266,8 +252,8 @@ def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
 def _measure_margin(
     problem: Problem, window: Window, before: FullImage, after: FullImage
 ) -> tuple[float, float]:
-    """Return the bias of the margin of the image `after` if it has the surroundings of
-    `before`, and the distance between the margins of the two images.
+    """Return how much larger the margin is with the surroundings of another image, and
+    by how much it has moved from that image.
     """
     pasted = window.paste(window.select(after.radiance), before.radiance)
     margin = _compute_margin(problem, after.radiance, after.u)

@@ -313,8 +313,7 @@ def _crop_search(
 
     None if whole images are rendered. `refusal` is why nothing predicts them.
     """
-    findings.crop_refusal = find_crop_refusal(problem)
-    if findings.crop_refusal is None:
+    if find_crop_refusal(problem) is None:
         crop = CroppedSearch(problem, problem.steps)
         findings.crop_refusal = _prepare(crop, stages)
         if findings.crop_refusal is None:
