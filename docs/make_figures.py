@@ -38,8 +38,8 @@ from advsearch.questions.region.result import RegionResult
 from advsearch.questions.replay.result import ReplayResult
 from advsearch.questions.stability.result import CaseRow
 from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.questions.twins.result import TwinsResult
 from advsearch.questions.test.result import SuiteResult
+from advsearch.questions.twins.result import TwinsResult
 from advsearch.runs.results import (
     CleanScene,
     Fields,
