@@ -249,9 +249,9 @@ class TwinsResult(views.InNotebook, results.RunResult):
 
 TABLE_NOTE = (
     "Rates are means over frames, with 95 % intervals over frames. Kappa (Cohen's) is "
-    "of right and wrong, 0 for agreement by chance; margins are compared by Spearman's "
-    "rank correlation. Where a photograph or a twin is wrong in fewer than five "
-    "frames, no number is stated, only the counts."
+    "of right and wrong, 0 for agreement by chance; of margins it is Spearman's rank "
+    "correlation with those of the photographs. Where a photograph or a twin is wrong "
+    "in fewer than five frames, no number is stated, only the counts."
 )
 
 
@@ -277,10 +277,10 @@ HEADS = (
     "model sees",
     "pairs",
     "right",
-    "agrees with the photograph",
+    "agrees",
     "kappa",
-    "rank correlation of margins",
-    "photograph wrong where this is wrong",
+    "margins",
+    "photograph wrong where this is",
 )
 
 
@@ -392,22 +392,22 @@ def summarize_twins(table: Sequence[results.TwinAgreement]) -> str:
     composed = find_row(table, COMPOSED)
     if composed is None:
         return "Nothing was compared."
-    sentences = [
-        f"Over {wording.format_count(composed.pairs, 'pair')} of "
-        f"{wording.format_count(composed.frames, 'frame')}, the model says of the twin in the "
-        f"photograph what it says of the photograph, right or wrong, in "
-        f"{wording.format_estimate(composed.agreement)}."
-    ]
+    agreement = wording.format_estimate(composed.agreement)
+    counts = (
+        f"{wording.format_count(composed.pairs, 'pair')} of "
+        f"{wording.format_count(composed.frames, 'frame')}"
+    )
+    sentences = [f"Twins in the photograph agree with it in {agreement} of {counts}."]
     if composed.wrong_where_twin_wrong is not None:
         sentences.append(
-            f"Where that twin is wrong, the photograph is wrong in "
-            f"{wording.format_estimate(composed.wrong_where_twin_wrong)}, and in "
-            f"{wording.format_estimate(composed.photo_wrong)} at all."
+            f"Where a twin is wrong, the photograph is wrong in "
+            f"{wording.format_estimate(composed.wrong_where_twin_wrong)}; at all, in "
+            f"{wording.format_estimate(composed.photo_wrong)}."
         )
     else:
         sentences.append(
-            f"Only {composed.wrong_twins} of these twins are wrong: what a failing "
-            "twin says of the photograph was not measured."
+            f"{composed.wrong_twins} of them are wrong, too few to state what a failing "
+            "twin says of its photograph."
         )
     return " ".join(sentences)
 
@@ -419,7 +419,7 @@ def _pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
     groups = []
     for pair in result.pairs:
         row = pair.row
-        name = f"{row.object} ({row.label}) in {row.frame}"
+        name = f"{row.object} in {row.frame}"
         texts = [
             f"{image.surroundings}: {_verdict(image)}" for image in row.predictions
         ]
