@@ -317,7 +317,10 @@ def model_condition(
 
 @workbench.with_settings_signature(ReplayConfig)
 def replay(
-    attack: str | Path | AttackResult, *, progress: ProgressOption = None, **options: Any
+    attack: str | Path | AttackResult,
+    *,
+    progress: ProgressOption = None,
+    **options: Any,
 ) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions (docs/questions.md).
 
