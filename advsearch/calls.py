@@ -44,7 +44,7 @@ TYPE_WORDS = {
 """Types by name, for messages."""
 
 ALIASES = {
-    *"Controls ProgressOption SettingValues Texture Read MakeOptimizer "
+    *"Controls Loss ProgressOption SettingValues Texture Read MakeOptimizer "
     "Examples Unpack Literal UniqueNames StackedTensors Names Named Tensor".split()
 }
 """Names in annotations that are no classes."""

@@ -183,11 +183,6 @@ class Renderer:
             return encode_levels(to_uint8(self.copy_with()(self.start)).numpy())
 
     @property
-    def window(self) -> Window | None:
-        """The window of the image that is rendered; None for all of it."""
-        return None if self.crop is None else self.crop.window
-
-    @property
     def composition_reason(self) -> str:
         """Why an image is not that of one scene as one camera sees it.
 
