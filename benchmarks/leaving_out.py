@@ -316,7 +316,7 @@ def cropped(size: int, spp: int, repeats: int) -> str:
         environment="avenue",
         controls={"texture": {}},
         resolution=(size, size),
-        set={"camera.azimuth": 0.0, "camera.elevation": 5.0, "camera.distance": 15.0},
+        set_={"camera.azimuth": 0.0, "camera.elevation": 5.0, "camera.distance": 15.0},
         label="mug",
         minimise=True,
     )
