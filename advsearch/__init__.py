@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from advsearch.questions.sweep.carry_out import sweep as sweep
     from advsearch.questions.sweep.result import SweepResult as SweepResult
     from advsearch.questions.test import test as test
+    from advsearch.questions.twins import twins as twins
     from advsearch.tasks import Task as Task
     from advsearch.trust.code import allow_code as allow_code
 

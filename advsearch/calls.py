@@ -44,8 +44,8 @@ TYPE_WORDS = {
 """Types by name, for messages."""
 
 ALIASES = {
-    *"Controls Watched SettingValues Texture Read MakeOptimizer Examples Unpack "
-    "Literal UniqueNames StackedTensors Names Named Tensor".split()
+    *"Controls Loss ProgressOption SettingValues Texture Read MakeOptimizer "
+    "Examples Unpack Literal UniqueNames StackedTensors Names Named Tensor".split()
 }
 """Names in annotations that are no classes."""
 Function = TypeVar("Function", bound=Callable[..., Any])

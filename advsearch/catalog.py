@@ -127,6 +127,12 @@ BUILT_INS = (
         "run stiff and extreme cases, and check that each of them holds",
     ),
     BuiltIn(
+        "experiment",
+        "twins",
+        f"{_EXPERIMENTS}.twins:twins",
+        "measure on photographs with known poses how far verdicts on renders hold",
+    ),
+    BuiltIn(
         "control",
         "pose",
         f"{_CONTROLS}.pose:PoseControl",

@@ -413,7 +413,9 @@ class Experiment(Generic[AnyResult]):
                 make("resume", make.KEYWORD_ONLY, default=False, annotation="bool")
             )
         parameters.append(
-            make("progress", make.KEYWORD_ONLY, default=None, annotation="Watched")
+            make(
+                "progress", make.KEYWORD_ONLY, default=None, annotation="ProgressOption"
+            )
         )
         parameters.append(make("settings", make.VAR_KEYWORD))
         return inspect.Signature(parameters, return_annotation=self.result.__name__)

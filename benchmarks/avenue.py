@@ -256,7 +256,7 @@ def _search_once(
         resolution=(args.size, args.size),
         steps=steps,
         seed=seed,
-        set=_camera(distance),
+        set_=_camera(distance),
         label=_find_label(place, distance, args.size),
     )
     parts = load_parts(config)

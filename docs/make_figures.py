@@ -39,6 +39,7 @@ from advsearch.questions.replay.result import ReplayResult
 from advsearch.questions.stability.result import CaseRow
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test.result import SuiteResult
+from advsearch.questions.twins.result import TwinsResult
 from advsearch.runs.results import (
     CleanScene,
     Fields,
@@ -766,6 +767,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("results.md", "compare-fields"): result_fields(CompareResult),
     ("results.md", "harden-fields"): result_fields(HardenResult),
     ("results.md", "test-fields"): result_fields(SuiteResult),
+    ("results.md", "twins-fields"): result_fields(TwinsResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,
     ("recipe-results.md", "recipe-results"): recipe_results,

@@ -101,8 +101,8 @@ FAULTS = (
     Fault(
         "importing: the stride of a buffer is ignored",
         "advsearch/scene/importing/gltf.py",
-        "step = stride or row_size",
-        "step = row_size",
+        "row_stride = stride or row_size",
+        "row_stride = row_size",
         ("tests/scene/test_gltf.py",),
     ),
     Fault(
@@ -137,8 +137,8 @@ FAULTS = (
     Fault(
         "models: a limit is not applied",
         "advsearch/trust/archives.py",
-        "if unpacked > scaled(LARGEST_RATIO) * size + SLACK:",
-        "if unpacked > scaled(LARGEST):",
+        "elif unpacked > scale_limit(LARGEST_RATIO) * size + SLACK:",
+        "elif unpacked > scale_limit(LARGEST):",
         ("tests/models/test_hostile_models.py",),
     ),
     Fault(
@@ -195,7 +195,7 @@ FAULTS = (
     Fault(
         "policies: every generation has the same noise",
         "advsearch/attacks/policies/evolution.py",
-        "seeded(self.seed, self.generation * (self.population // 2) + pair)",
+        "seeded(self.seed, self.generation * pairs_per_generation + pair)",
         "seeded(self.seed, pair)",
         ("tests/attacks/policies/test_policy_evolution.py",),
     ),
@@ -244,8 +244,8 @@ FAULTS = (
     Fault(
         "runs: an export has no metrics",
         "advsearch/runs/export.py",
-        "return [*OWN, *metrics, *values, *AFTER]",
-        "return [*OWN, *values, *AFTER]",
+        "return [*LEADING_COLUMNS, *metrics, *values, *TRAILING_COLUMNS]",
+        "return [*LEADING_COLUMNS, *values, *TRAILING_COLUMNS]",
         ("tests/runs/test_runs.py",),
     ),
     Fault(
@@ -266,7 +266,7 @@ FAULTS = (
     Fault(
         "viewer: any name leads to the server",
         "advsearch/trust/pages.py",
-        "if not _is_own(host, named, port, token):",
+        "if not _is_server_address(host, named, port, token):",
         "if not host:",
         ("tests/viewer/test_server.py",),
     ),

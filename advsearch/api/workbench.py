@@ -111,8 +111,11 @@ from advsearch.runs.results import AxisValue as AxisValue
 from advsearch.runs.store import Row as Row
 from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import read_units as read_units
+from advsearch.runs.twins import find_twin_evidence as find_twin_evidence
+from advsearch.runs.twins import read_twins as read_twins
 from advsearch.scene import library as library
 from advsearch.scene.assembly import pose_mesh as pose_mesh
+from advsearch.scene.camera_files import read_camera as read_camera
 from advsearch.scene.glb import encode_glb as encode_glb
 from advsearch.scene.grounds import is_paved as is_paved
 from advsearch.scene.importing.files import get_last_line as get_last_line
@@ -129,6 +132,7 @@ from advsearch.threads import count_cores as count_cores
 from advsearch.trust.code import allow_named as allow_named
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import make_environment as make_environment
+from advsearch.trust.yaml_text import parse_yaml as parse_yaml
 
 
 def load_photographs() -> Any:

@@ -401,16 +401,18 @@ def _ignore_inputs(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
 
 
 def _pass_copies(objective: Objective) -> Objective:
-    """The objective of another package, called with copies."""
+    """Return an objective of another package as one that is called with copies, so that
+    it cannot change what a run computes with.
+    """
 
-    def handed(
+    def with_copies(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
         return objective(
             *copy_value((output, images, truth)), lambda name: copy_value(more(name))
         )
 
-    return handed
+    return with_copies
 
 
 def _make_score_objective(task: Task) -> Objective:

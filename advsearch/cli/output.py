@@ -184,9 +184,8 @@ def print_answer(
 
 def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
-    from advsearch.runs.results import (
-        to_json_value,  # late, so that --help answers at once
-    )
+    # late, so that --help answers at once
+    from advsearch.runs.results import to_json_value
 
     text = json.dumps(
         to_json_value(value), indent=2, allow_nan=False, ensure_ascii=False
@@ -337,9 +336,8 @@ def open_command_progress(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
     """Watch a command's work; where JSON is to be printed, keep everything else off
     standard output meanwhile.
     """
-    from advsearch.cli.flags import (
-        format_as_flags,  # late, so that --help answers at once
-    )
+    # late, so that --help answers at once
+    from advsearch.cli.flags import format_as_flags
 
     with (
         redirect_output() if as_json else nullcontext(),

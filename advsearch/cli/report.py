@@ -53,6 +53,12 @@ LARGEST_POSES = 1 << 20
         "rendering-12-again.jpg; its model judges them, and the run keeps them",
     ),
     argument(
+        "--twins",
+        metavar="RUN",
+        help="a run of advsearch twins, which states how far verdicts hold for "
+        "photographs",
+    ),
+    argument(
         "--by",
         metavar="NAME",
         help="who answers for it, as it is to be written",
@@ -88,7 +94,11 @@ def report(args: argparse.Namespace) -> int:
     if args.photographs is not None:
         _add_photographs(args.photographs, args.runs[0])
     evidence, images = collect_evidence(
-        args.runs, criterion=args.criterion, exposure=exposure, by=args.by
+        args.runs,
+        criterion=args.criterion,
+        exposure=exposure,
+        by=args.by,
+        twins=args.twins,
     )
     try:
         folder.mkdir(parents=True, exist_ok=True)

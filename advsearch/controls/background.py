@@ -97,11 +97,12 @@ class BackgroundControl(Control):
             )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        as_ever = (
-            parameter.name == "what"
-            and "environment" in self.list_allowed_values("what")
-        )
-        return replace(parameter, default="environment") if as_ever else parameter
+        """See the base; `what` defaults to the environment where that is allowed."""
+        if parameter.name == "what" and "environment" in self.list_allowed_values(
+            "what"
+        ):
+            return replace(parameter, default="environment")
+        return parameter
 
     def get_scene_value(self, parameter: Parameter) -> float | str:
         return "environment" if parameter.name == "what" else parameter.default

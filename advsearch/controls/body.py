@@ -51,7 +51,7 @@ class BodyControl(Control):
 
     @property
     def rig(self) -> assets.MeshRig:
-        """What moves the mesh."""
+        """What moves the mesh. Raises InputError if it has no joints."""
         mesh = self.get_mesh(self.scene)
         if mesh.mesh.rig is None:
             raise InputError(
@@ -63,7 +63,11 @@ class BodyControl(Control):
 
     @property
     def clip(self) -> str | None:
-        """The name of the animation that is played; None for none."""
+        """The name of the animation that is played; None for none.
+
+        Raises UnknownNameError if the mesh has no animation of the chosen name or
+        number.
+        """
         clips = self.rig.clips
         requested = self.chosen["clip"]
         if requested is None:
@@ -111,7 +115,7 @@ class BodyControl(Control):
             for parameter in self.instance_parameters
             if parameter.name in known
         )
-        self.clip  # noqa: B018 - refuses one that is not there
+        self.clip  # noqa: B018 - raises for one that is not there
         super().fit()
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:

@@ -105,9 +105,9 @@ class EnvironmentControl(Control):
         setting = settings.get("which") if isinstance(settings, Mapping) else None
         if isinstance(setting, Mapping):
             setting = setting.get("choices")
-        names = setting
-        if isinstance(setting, str) or not isinstance(setting, Sequence):
-            names = [setting]
+        names: Sequence[object] = [setting]
+        if isinstance(setting, Sequence) and not isinstance(setting, str):
+            names = setting
         files = [
             name
             for name in names
@@ -141,18 +141,18 @@ class EnvironmentControl(Control):
             if _is_file(name)
         }
         notes = [note for asset in maps.values() for note in asset.warnings]
-        is_own_allowed = (
+        may_keep = (
             SCENE_ENVIRONMENT in allowed
             or self._find_scene_environment_name(scene) is not None
         )
-        if not is_own_allowed and (isinstance(spec, Fixed) or maps):
+        if not may_keep and (isinstance(spec, Fixed) or maps):
             name = str(allowed[0])
             scene = replace(
                 scene, environment=_load_environment(name), environment_spec=name
             )
         else:
-            own = scene.require_environment(f"`controls` {self.name}")
-            shows_photograph = scene.photograph is not None or own.photographed
+            environment = scene.require_environment(f"`controls` {self.name}")
+            shows_photograph = scene.photograph is not None or environment.photographed
             if maps and not shows_photograph and scene.number("ground.size") > 0.0:
                 names = ", ".join(Path(name).name for name in maps)
                 notes.append(

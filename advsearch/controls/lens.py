@@ -26,7 +26,7 @@ POSITION_PARAMETERS = ("x", "y")
 STICKER_SIDE = 256
 # past this exponent a dot counts as invisible: exp(-40) is 4e-18, and no power
 # overflows
-_FAR = 40.0
+_MAX_EXPONENT = 40.0
 
 
 def _per_dot(
@@ -193,9 +193,9 @@ def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Te
     row = torch.arange(height, device=device) + 0.5
     x_offset = (column - values["x"][:, None] * width) / shorter_side
     y_offset = (row - values["y"][:, None] * height) / shorter_side
-    squared = y_offset[:, :, None] ** 2 + x_offset[:, None, :] ** 2
-    squared = squared / values["radius"][:, None, None] ** 2
+    squared_distance = y_offset[:, :, None] ** 2 + x_offset[:, None, :] ** 2
+    in_radii = squared_distance / values["radius"][:, None, None] ** 2
     falloff = values["falloff"]
-    reach = float(_FAR ** (1.0 / falloff.detach()))
-    fading = torch.exp(-(squared.clamp(1e-12, reach) ** falloff))
+    max_in_radii = float(_MAX_EXPONENT ** (1.0 / falloff.detach()))
+    fading = torch.exp(-(in_radii.clamp(1e-12, max_in_radii) ** falloff))
     return values["opacity"][:, None, None] * fading

@@ -270,14 +270,22 @@ def marble(grid: Grid) -> Float64Array:
         (1, 3, 0.012, 0.3, 26),
     ):
         turbulence = 0.5 * _clouds(finely_warped, (2, 2), 4, seed)
-        # 0 in the middle of a vein
-        wave = np.abs(np.sin(np.pi * (n_right * x + n_down * y + turbulence)))
         strength = 0.25 + 0.75 * _step(_clouds(warped, (3, 3), 2, seed + 50), 0.0, 0.8)
-        core = np.exp(-((wave / width) ** 2))
-        halo = 0.3 * np.exp(-(wave / (4.0 * width)))
-        veins += depth * strength * (core + halo)
-    base = _mix(_color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, 0.58, 0.8))
-    return _mix(base, _color("4c5159"), np.clip(veins, 0.0, 0.9))
+        profile = _compute_vein_profile(n_right * x + n_down * y + turbulence, width)
+        veins += depth * strength * profile
+    return _mix(
+        _mix(_color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, 0.58, 0.8)),
+        _color("4c5159"),
+        np.clip(veins, 0.0, 0.9),
+    )
+
+
+def _compute_vein_profile(phase: Float64Array, width: float) -> Float64Array:
+    """Return how dark a vein is: a dark core with a halo around each integer phase."""
+    distance = np.abs(np.sin(np.pi * phase))
+    core = np.exp(-((distance / width) ** 2))
+    halo = 0.3 * np.exp(-(distance / (4.0 * width)))
+    return np.asarray(core + halo)
 
 
 @register_pattern(0.6, roughness=0.9, specular=0.2)

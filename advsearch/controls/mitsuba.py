@@ -105,6 +105,7 @@ class MitsubaControl(Control):
         return not isinstance(spec, Fixed)
 
     def _get_numbers(self) -> tuple[parts.PluginNumber, ...]:
+        """Return the numbers of the scene that this control sets."""
         return next(
             part.numbers
             for part in self.scene.parts

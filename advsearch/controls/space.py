@@ -351,8 +351,9 @@ class Space:
 def _spread_over_box(size: int) -> Tensor:
     """Return points (n, size) spread over the unit box, and the centers of its faces."""
     spread = SobolEngine(size).draw(N_CAMERA_VIEWS) if size else torch.zeros(1, 0)
-    is_own_axis = torch.eye(size) > 0.0
-    face_centers = [torch.where(is_own_axis, end, 0.5) for end in (0.0, 1.0)]
+    # Each row is the axis of two faces.
+    is_axis = torch.eye(size) > 0.0
+    face_centers = [torch.where(is_axis, end, 0.5) for end in (0.0, 1.0)]
     return torch.cat([spread, *face_centers])
 
 

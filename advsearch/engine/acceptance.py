@@ -37,6 +37,14 @@ MIN_ALLOWED_LEVELS = 2.0
 # seldom passes by chance
 ACCEPTED_FRACTION = 0.9
 CHECK_SPP = 16  # samples per pixel of each of the two traced images of a view
+N_FIRST_VIEWS = 2  # views that are compared at first
+N_VIEWS = 6  # views that are compared where the first do not decide
+# fractions of what is allowed up to which, and from which on, the first views decide
+CLEARLY_GOOD = 0.7
+CLEARLY_BAD = 1.4
+
+MeasureMargin = Callable[[Tensor, Tensor], float]
+"""From an image (H, W, 3) and its configuration (d,) to the model's margin."""
 
 
 @dataclass(frozen=True)
@@ -81,23 +89,23 @@ class Deviation:
     def from_views(cls, views: Sequence[ComparedView]) -> Deviation:
         """Return the deviation over several views."""
         square = statistics.fmean(view.squared_error for view in views)
-        allowed = statistics.fmean(view.allowed_squared_error for view in views)
-        logits = statistics.fmean(view.margin_bias for view in views)
-        moved = statistics.fmean(view.margin_change for view in views)
+        allowed_square = statistics.fmean(view.allowed_squared_error for view in views)
+        margin_change = statistics.fmean(view.margin_change for view in views)
+        margin_limit = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * margin_change)
         return cls(
             levels=_root(square),
-            logits=logits,
-            allowed_levels=max(MIN_ALLOWED_LEVELS, _root(allowed)),
+            logits=statistics.fmean(view.margin_bias for view in views),
+            allowed_levels=max(MIN_ALLOWED_LEVELS, _root(allowed_square)),
             n_traced=sum(view.n_traced for view in views),
-            allowed_margin_bias=max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * moved),
+            allowed_margin_bias=margin_limit,
         )
 
     @property
     def levels_fraction(self) -> float:
         """The levels as a fraction of those that are allowed."""
-        return (
-            self.levels / self.allowed_levels if self.allowed_levels > 0.0 else math.inf
-        )
+        if self.allowed_levels > 0.0:
+            return self.levels / self.allowed_levels
+        return math.inf
 
     @property
     def is_accepted(self) -> bool:
@@ -122,7 +130,8 @@ class Deviation:
 
 
 def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
-    """Compare predictions over several views, in few where these decide.
+    """Compare predictions over `N_VIEWS` views, or over the first `N_FIRST_VIEWS` if
+    these are clearly good or clearly bad.
 
     `compare_view` compares a single view, by its index below `N_VIEWS`.
     """
@@ -155,23 +164,23 @@ def compare_with_traced(
         seed: of the noise of the traced images.
         spp: samples per pixel of the search.
         measure_margin: from an image and a configuration to the model's margin.
-        predicted_start: (H, W, 3) image that was predicted in its place before the
-            search, if there was one.
+        predicted_start: (H, W, 3) image that is predicted for the start of the search
+            under the same conditions; None if `u` is that.
     """
     with torch.no_grad():
         rendered = renderer(u, seeds.stream(seed, "rendered"), spp)
         *halves, converged = renderer.render_halves(u, seed, CHECK_SPP)
         object_mask = renderer.mask(u)
     predicted_margin = measure_margin(predicted, u)
-    moved = 0.0
+    margin_change = 0.0
     if predicted_start is not None:
-        moved = abs(predicted_margin - measure_margin(predicted_start, u))
+        margin_change = abs(predicted_margin - measure_margin(predicted_start, u))
     return ComparedView(
         squared_error=compute_squared_error(predicted, halves, object_mask),
         allowed_squared_error=compute_squared_error(rendered, halves, object_mask),
         margin_bias=predicted_margin - measure_margin(converged, u),
         n_traced=3,
-        margin_change=moved,
+        margin_change=margin_change,
     )
 
 
@@ -202,23 +211,20 @@ def compute_squared_error(
 def compute_level_errors(
     renderer: Renderer, images: Sequence[Tensor], u: Tensor, seed: int, spp: int
 ) -> list[float]:
-    """Return the root-mean-square error of full images (H, W, 3), in levels of 255.
+    """Return the root-mean-square error of each image (H, W, 3) over all its pixels, in
+    levels of 255.
 
-    All are of the configuration u (d,).
+    Args:
+        renderer: traces the images that they are compared with.
+        images: of one configuration.
+        u: (d,) the configuration.
+        seed: of the noise of the traced images.
+        spp: samples per pixel of each of the two traced images.
     """
     halves = renderer.render_halves(u, seed, spp)[:2]
-    return [_root(compute_squared_error(picture, halves)) for picture in images]
+    return [_root(compute_squared_error(image, halves)) for image in images]
 
 
 def _root(square: float) -> float:
     """Return the square root, or 0 of a negative number; NaN stays NaN."""
     return 0.0 if square <= 0.0 else math.sqrt(square)
-
-
-N_FIRST_VIEWS = 2  # views that are compared at first
-N_VIEWS = 6  # views that are compared where the first do not decide
-# fractions of what is allowed up to which, and from which on, the first views decide
-CLEARLY_GOOD = 0.7
-CLEARLY_BAD = 1.4
-MeasureMargin = Callable[[Tensor, Tensor], float]
-"""The margin of what a model says of a picture (H, W, 3) of a configuration (d,)."""

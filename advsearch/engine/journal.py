@@ -390,6 +390,10 @@ class Journal:
     def _read(self, query: Query) -> Evaluation | None:
         """Return the stored evaluation of a query; None if there is none.
 
+        A query without a phase is one of the trials that are kept here, any other is
+        read from the run's files. The renderer counts non-finite values again that
+        were stored with it.
+
         Raises:
             InputError: the stored evaluation is one of another configuration.
         """

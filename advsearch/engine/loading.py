@@ -31,7 +31,7 @@ from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
 from advsearch.scene.backdrop import (
     BackdropPhotograph,
-    find_light_beside,
+    find_photographed_light,
     fit_to_photograph,
 )
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
@@ -292,7 +292,7 @@ def load_scene(
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
     if environment is None:
-        environment = find_light_beside(backdrop)
+        environment = find_photographed_light(backdrop)
     description = load_description(
         object_spec,
         environment,

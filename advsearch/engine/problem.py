@@ -82,8 +82,10 @@ MAX_CACHED_TRUTHS = 512
 """Truths that are cached, at most."""
 
 
-def _cache(cached: dict[bytes, Any], key: bytes, value: Any) -> None:
-    """Add a value to a cache; the oldest ones make room."""
+def _add_to_cache(cached: dict[bytes, Any], key: bytes, value: Any) -> None:
+    """Add a value to a cache of at most `MAX_CACHED_TRUTHS`; the oldest ones make
+    room.
+    """
     while len(cached) >= MAX_CACHED_TRUTHS:
         del cached[next(iter(cached))]
     cached[key] = value
@@ -311,7 +313,8 @@ class Problem:
         for index, full_u in enumerate(full_configurations):
             key = full_u.detach()[self._is_geometric].numpy().tobytes()
             if key not in self._things:
-                _cache(self._things, key, find_visible_things(self.renderer, full_u))
+                things = find_visible_things(self.renderer, full_u)
+                _add_to_cache(self._things, key, things)
             judged[index] = add_visible_things(judged[index], self._things[key])
         return judged
 
@@ -345,6 +348,7 @@ class Problem:
             predicted_start = None if torch.equal(start, full_u) else predict(start)
 
         def measure_margin(image: Tensor, u: Tensor) -> float:
+            """Return the model's margin on an image of a configuration."""
             return self.judge(image, u).margin
 
         return compare_with_traced(
@@ -378,19 +382,21 @@ class Problem:
     ) -> Truth:
         """Return what is true of the scene at a full configuration; None for the start.
 
-        Values that are `stated_values` replace those of the configuration, which has
-        single precision only.
+        `stated_values` replace values of the configuration, which has single precision
+        only.
         """
         if full_u is None or not self.task.varies:
             return self._start_truth
-        # What the camera sees first does not depend on base colors. So a truth is
-        # cached if few other coordinates exist, unless the task reads numbers.
+        # A truth may depend on what the camera sees, which base colors do not change.
+        # So it is cached by the other coordinates, if these are few, unless the task
+        # has read the configuration's numbers.
         geometric_u = full_u.detach()[self._is_geometric]
         key = geometric_u.numpy().tobytes()
         if not stated_values and key in self._truths:
             return self._truths[key]
 
         def describe() -> dict[str, Value]:
+            """Describe the configuration, by stated values where there are any."""
             values = self.space.describe(full_u)
             return {
                 name: (stated_values or {}).get(name, values[name]) for name in values
@@ -403,11 +409,12 @@ class Problem:
         truth = self.task.truth(facts)
         is_cacheable = not stated_values and len(geometric_u) <= MAX_CACHED_COORDINATES
         if is_cacheable and "numbers" not in vars(facts):
-            _cache(self._truths, key, truth)
+            _add_to_cache(self._truths, key, truth)
         return truth
 
     @cached_property
     def _start_truth(self) -> Truth:
+        """What is true at the start, and always if the task's truth does not vary."""
         start = self.add_conditions(self.domain.start)
         if self.task.varies:
             return self.find_truth(start)
@@ -420,7 +427,7 @@ class Problem:
 
     @cached_property
     def _is_geometric(self) -> Tensor:
-        """Which coordinates do more than to color surfaces, (d,) bool."""
+        """Whether each coordinate does more than color surfaces, (d,) bool."""
         color_inputs = find_linear_inputs(self.renderer)
         is_geometric = torch.ones(len(self.space.start), dtype=torch.bool)
         for group in self.space.groups:
@@ -448,13 +455,13 @@ class Problem:
         """Return what a result stores of a plan, each step in its parameter's unit."""
         groups = []
         for group, row in zip(plan.groups, plan.to_dict()["groups"], strict=True):
-            step, unit = self._step_in_unit(group)
+            step, unit = self._compute_step_in_unit(group)
             groups.append(GroupDerivative(**row, step_in_unit=step, unit=unit))
         return PlannedGradient(
             renders_per_gradient=plan.renders, spp=plan.spp, groups=groups
         )
 
-    def _step_in_unit(self, group: Group) -> tuple[float | None, str]:
+    def _compute_step_in_unit(self, group: Group) -> tuple[float | None, str]:
         """Return the step of a single coordinate in its parameter's unit, and the unit.
 
         It is measured in the middle of the range. (None, "") for a group of several
@@ -502,7 +509,10 @@ class Problem:
         return map(self.evaluate, queries)
 
     def evaluate(self, query: Query) -> Evaluation:
-        """Evaluate one query: a run renders, predicts and judges here only."""
+        """Evaluate one query: collect light, render an image, or judge one.
+
+        A run renders, predicts and judges here only.
+        """
         non_finite_before = self.renderer.non_finite
         if query.product == "light":
             linear = self.make_linear_renderer(query.u, query.seed, query.spp)
@@ -624,6 +634,7 @@ class Problem:
         input_gradient = torch.zeros(())
 
         def loss(image: Tensor) -> Tensor:
+            """Return the objective of an image, and record the call."""
             nonlocal input_gradient
             output = self.model(image)
             calls.append((image.detach(), output))
@@ -801,7 +812,7 @@ class Problem:
             for evaluation in evaluations
             if evaluation.judgement is not None
         ]
-        judgement = self._mean_judgement(judged, outputs)
+        judgement = self._average_judgements(judged, outputs)
         n_successes = sum(evaluation.success for evaluation in evaluations)
         n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
         total_objective = sum(evaluation.objective for evaluation in evaluations)
@@ -814,7 +825,7 @@ class Problem:
             judgement=replace(judgement, metrics=mean_metrics(judged)),
         )
 
-    def _mean_judgement(
+    def _average_judgements(
         self, judged: Sequence[Judgement], outputs: Sequence[Output]
     ) -> Judgement:
         """Return the judgement over several conditions.

@@ -162,6 +162,7 @@ def add_judgement(row: Row, judgement: Judgement) -> Row:
 
 
 def _none_if_nan(value: float | None) -> float | None:
+    """Return a number; None, which JSON has, for NaN."""
     return None if value is None or math.isnan(value) else value
 
 

@@ -483,13 +483,13 @@ def _make_view_facts(
     facts, *camera_facts = [
         make_facts(
             description,
-            description.object_name,
-            settings.label,
-            partial(space.describe, u),
-            look,
-            settings.judge,
+            name=description.object_name,
+            label=settings.label,
+            describe=partial(space.describe, u),
+            render_surfaces=render_surfaces,
+            judge=settings.judge,
         )
-        for look in list_camera_renders(renderer, u, len(description.rig))
+        for render_surfaces in list_camera_renders(renderer, u, len(description.rig))
     ]
     return replace(facts, views=tuple(camera_facts))
 

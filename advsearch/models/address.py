@@ -206,11 +206,10 @@ class _Connection(http.client.HTTPConnection):
     connected: socket.socket | None = None
 
     def connect(self) -> None:
+        """Connect. Raises TimeoutError after the deadline, so that nothing is sent."""
         super().connect()
         self.connected = self.sock
-        if (
-            time.monotonic() > self.deadline
-        ):  # nobody waits any more, so nothing is sent
+        if time.monotonic() > self.deadline:
             self.close()
             raise TimeoutError("timed out: connected too late")
 
@@ -224,39 +223,46 @@ class _Connection(http.client.HTTPConnection):
 
 
 class _SecureConnection(_Connection, http.client.HTTPSConnection):
-    pass
+    """A connection by TLS with a deadline."""
 
 
-class _TracksConnections(urllib.request.AbstractHTTPHandler):
+class _TrackingHandler(urllib.request.AbstractHTTPHandler):
     """Opens connections with a deadline, and lists them for another thread to break
     off.
+
+    Args:
+        deadline: of each connection, as `time.monotonic` counts.
+        connections: list to add to.
     """
 
-    def __init__(self, end: float, connections: list[_Connection]) -> None:
+    def __init__(self, deadline: float, connections: list[_Connection]) -> None:
         super().__init__()
-        self._end = end
+        self._deadline = deadline
         self._connections = connections
 
     def do_open(
         self, http_class: Any, req: urllib.request.Request, **options: Any
     ) -> Any:
+        """Send a request by a tracked connection, see the base."""
         is_secure = issubclass(http_class, http.client.HTTPSConnection)
+        kind = _SecureConnection if is_secure else _Connection
 
-        def connection_to(host: str, **more: Any) -> _Connection:
-            connection = (_SecureConnection if is_secure else _Connection)(host, **more)
-            connection.deadline = self._end
+        def make_connection(host: str, **settings: Any) -> _Connection:
+            """Make a connection to a host, as `http_class` does."""
+            connection = kind(host, **settings)
+            connection.deadline = self._deadline
             self._connections.append(connection)
             return connection
 
-        return super().do_open(connection_to, req, **options)
+        return super().do_open(make_connection, req, **options)
 
 
-class _Handler(_TracksConnections, urllib.request.HTTPHandler):
-    pass
+class _PlainHandler(_TrackingHandler, urllib.request.HTTPHandler):
+    """Opens tracked connections of ``http``."""
 
 
-class _SecureHandler(_TracksConnections, urllib.request.HTTPSHandler):
-    pass
+class _SecureHandler(_TrackingHandler, urllib.request.HTTPSHandler):
+    """Opens tracked connections of ``https``."""
 
 
 @dataclass(eq=False)
@@ -356,7 +362,7 @@ class AddressModel(models.RemoteNetwork):
         """Return the answer to each image and turn: a stored one, or a new one, which
         is stored as it arrives.
 
-        Trials differ in their noise, and so in their images.
+        Trials are each sent, since their noise differs, and so their images.
         """
         keys = list[str]()
         answers = dict[str, Any]()
@@ -450,6 +456,7 @@ class AddressModel(models.RemoteNetwork):
         return {"text": content[:MAX_ANSWER_CHARACTERS]}
 
     def _store_spent(self) -> None:
+        """Store what has been spent, if there is a run."""
         if self.store is not None:
             self.store.write_note(f"asked {self.spec}", json.dumps(self.spent))
 
@@ -484,6 +491,7 @@ class AddressModel(models.RemoteNetwork):
 
     @property
     def _priced_by_token(self) -> bool:
+        """Whether tokens cost money."""
         return bool(self.limits["per_million_in"] or self.limits["per_million_out"])
 
     def _send(
@@ -552,10 +560,13 @@ class AddressModel(models.RemoteNetwork):
         return text, _Request(request.index, request.tries - 1, delay)
 
     def _reserve(self, max_count: int) -> int:
-        """Count calls before they are made, as many as the limits allow.
+        """Count calls as spent before they are made, as many as the limits allow.
+
+        Tokens are known only after a call, so that their limit stops later calls.
 
         Returns:
-            How many are allowed, at most `max_count`.
+            The number of calls that may be made now, at least 1 and at most
+            `max_count`.
 
         Raises:
             ModelError: none is allowed.
@@ -619,11 +630,8 @@ class AddressModel(models.RemoteNetwork):
                     error.url, error.code, error.reason, error.headers, io.BytesIO(text)
                 )
             return error
-        except (
-            OSError,
-            http.client.HTTPException,
-            errors.ModelError,
-        ) as error:  # URLError is an OSError
+        # URLError is an OSError
+        except (OSError, http.client.HTTPException, errors.ModelError) as error:
             return error
 
     def _explain_failure(
@@ -679,7 +687,7 @@ class AddressModel(models.RemoteNetwork):
             request.add_unredirected_header("Authorization", f"Bearer {key}")
         handlers: list[Any] = [
             models.NoRedirect,
-            _Handler(deadline, connections),
+            _PlainHandler(deadline, connections),
             _SecureHandler(deadline, connections),
         ]
         if models.is_local(request.host.rpartition(":")[0].strip("[]") or request.host):

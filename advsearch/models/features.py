@@ -204,26 +204,26 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
 
 
 def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
-    """Return the calls of the layers of a graph of operators, such as a `torch.export`
-    program.
+    """Run a graph of operators, such as a `torch.export` program, and return the calls
+    of its layers, those of `OPERATORS`, or of the node `only`.
+
+    There are none if the network is no graph.
     """
     calls: list[_Call] = []
 
     class Reader(fx.Interpreter):
+        """Records the calls while it runs the graph."""
+
         def run_node(self, n: fx.Node) -> Any:
+            """Run a node, and record its call if it is a layer."""
             value = super().run_node(n)
-            if (
-                n.op == "call_function"
-                and n.target in OPERATORS
-                and only in (None, n)
-                and isinstance(value, Tensor)
-            ):
+            is_layer = n.op == "call_function" and n.target in OPERATORS
+            if is_layer and only in (None, n) and isinstance(value, Tensor):
                 source = n.args[OPERATORS[n.target]]
-                input = (
-                    self.env[source]
-                    if isinstance(source, fx.Node) and source.op != "get_attr"
-                    else None
-                )
+                # weights come from `get_attr`, activations from other nodes
+                input = None
+                if isinstance(source, fx.Node) and source.op != "get_attr":
+                    input = self.env[source]
                 axis = -1 if n.target in CHANNELS_LAST else 1
                 calls.append(_Call(n, f"the operator {n.name}", input, value, axis))
             return value

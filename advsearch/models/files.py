@@ -77,7 +77,7 @@ def load_file(path: Path) -> Source:
         opened = open_regular(path, "a model file", LARGEST)
     except FileNotFoundError:
         raise FileFormatError(
-            f"model file {path}: no such file.{_hint_of_missing(path)}"
+            f"model file {path}: no such file.{_make_missing_hint(path)}"
         ) from None
     except OSError as error:
         raise FileFormatError(
@@ -111,7 +111,7 @@ def load_file(path: Path) -> Source:
         return _apply_signature(make_source(module, path.stem), program)
 
 
-def _hint_of_missing(path: Path) -> str:
+def _make_missing_hint(path: Path) -> str:
     """Return a hint for a path that does not exist: names like it, if there are any."""
     if not path.parent.is_dir():
         return f" The folder {path.parent} does not exist either"
@@ -228,8 +228,8 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
         source = replace(source, size_type=size_type)
     else:
         source = replace(source, takes_more=len(inputs) > 1, size_type=None)
-    source = _with_image_input(source, images, is_rig=is_rig)
-    min_batch, max_batch = _batch_limits(program, images.shape[0])
+    source = _apply_image_input(source, images, is_rig=is_rig)
+    min_batch, max_batch = _find_batch_limits(program, images.shape[0])
     if not is_rig:
         return replace(source, batch_limits=(min_batch, max_batch))
     cameras = int(images.shape[1])
@@ -242,7 +242,7 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     )
 
 
-def _with_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
+def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
     """Return the source with input size, layout and dtype of an input of images.
 
     Raises:
@@ -294,7 +294,9 @@ def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
     return is_rig
 
 
-def _batch_limits(program: torch.export.ExportedProgram, batch: Any) -> tuple[int, int]:
+def _find_batch_limits(
+    program: torch.export.ExportedProgram, batch: Any
+) -> tuple[int, int]:
     """Return the minimum and maximum of a batch dimension, fixed or symbolic."""
     if isinstance(batch, int):
         return batch, batch

@@ -111,10 +111,10 @@ def load_model(
         layout: ``"NCHW"`` (default) or ``"NHWC"``.
         channels: ``"RGB"`` (default) or ``"BGR"``.
         max_batch: maximum batch size; default 64, or what the program allows.
-        read: finds the output in what the network returns for a number of images, if
-            it is not logits: a tensor (N, ...) or a list of N elements.
         task: as in `attack`. It defines how outputs are read. Default: classification,
             unless there is `read`.
+        read: finds the output in what the network returns for a number of images, if
+            it is not logits: a tensor (N, ...) or a list of N elements.
         ask: ceilings and prices of a model behind an address (docs/addresses.md).
 
     Raises:
@@ -198,7 +198,7 @@ def load_model(
             model = replace(model, labels=names, named=True)
     else:
         if read is not None and isinstance(source.module, nn.Module):
-            source = _with_training_arguments(source)
+            source = _add_training_arguments(source)
         _check_max_batch(max_batch)
         model = _probe_source(source, options, read, name, names, origin)
     is_named_alone = not options and labels is None and name is None
@@ -212,8 +212,10 @@ def _drop_unset(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def _with_training_arguments(source: Source) -> Source:
-    """Return a source with the names and the image size that YOLO networks store."""
+def _add_training_arguments(source: Source) -> Source:
+    """Return a source with the names and the image size that YOLO networks store, where
+    it states none.
+    """
     arguments = getattr(source.module, "args", None)
     size = arguments.get("imgsz") if isinstance(arguments, Mapping) else None
     input_size = (size, size) if isinstance(size, int) and size > 1 else None
@@ -248,7 +250,7 @@ def _probe_source(
     max_batch = min(max_batch, options.get("max_batch") or max_batch)
     preprocessing = _make_preprocessing(source, options)
     model = Model(
-        module=_with_images_alone(source, preprocessing),
+        module=_adapt_to_images_alone(source, preprocessing),
         name=name or source.name,
         labels=(),
         preprocessing=preprocessing,
@@ -260,7 +262,7 @@ def _probe_source(
     return probe(model, source.labels if names is None else names, origin)
 
 
-def _with_images_alone(
+def _adapt_to_images_alone(
     source: Source, preprocessing: Preprocessing
 ) -> Callable[[Tensor], Any]:
     """Return the network of a source as one that is called with images alone."""
@@ -319,10 +321,10 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
         or os.path.exists(text)
     ):
         return files.load_file(Path(text))
-    raise _unknown_model(text)
+    raise _make_unknown_error(text)
 
 
-def _unknown_model(text: str) -> UnknownNameError:
+def _make_unknown_error(text: str) -> UnknownNameError:
     """Return the error for a model's name that means nothing."""
     forms = {
         "hf": "hf:REPOSITORY",

@@ -570,11 +570,11 @@ def _try_attached(
         for step_size in (STEP, STEP / 8.0):
             step_size = max(step_size, ROUNDING_STEPS * torch.finfo(model.dtype).eps)
             step = step_size * (attached_gradient - gradient).sign()
-            change, (attached_change, own_change), *_ = _measure_change(
+            change, (attached_change, detached_change), *_ = _measure_change(
                 model, images, step, attached_gradient, gradient
             )
-            own_error = abs(change - own_change)
-            max_error = min(own_error, MAX_ATTACHED_ERROR * abs(attached_change))
+            detached_error = abs(change - detached_change)
+            max_error = min(detached_error, MAX_ATTACHED_ERROR * abs(attached_change))
             if abs(change - attached_change) < max_error:
                 return attached, attached_gradient
     return model, gradient

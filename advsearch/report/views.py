@@ -199,6 +199,9 @@ def list_remarks(result: Result, view: ShownResult) -> list[str]:
         remarks.append("Not finished: these are the results so far.")
     if ending == RUNNING:
         remarks.append("It is running: this is what has come out so far.")
+    twins = getattr(result, "twins", None)
+    if twins is not None:
+        remarks.append(wording.format_twin_evidence(twins))
     return [*remarks, *view.cautions, *getattr(result, "warnings", ())]
 
 

@@ -10,16 +10,19 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
+from advsearch.runs.results import IN_PHOTOGRAPH, TwinMatch
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
     from advsearch.runs.results import (
         ConditionRow,
         ControlGroup,
+        Estimate,
         Extent,
         Formation,
         Interval,
         SharedWork,
+        TwinEvidence,
         VerifiedRate,
     )
 
@@ -578,3 +581,61 @@ def format_extent(extent: Extent) -> str:
         f"{extent.count} of {extent.total} ({share}, 95 % interval "
         f"{format_interval(extent.interval)})"
     )
+
+
+def format_estimate(estimate: Estimate | None, otherwise: str = "") -> str:
+    """Return a number with its interval: ``.96 (.94 to .98)``."""
+    if estimate is None:
+        return otherwise
+    text = _two_decimals(estimate.value)
+    if estimate.interval is None:
+        return text
+    lower, upper = map(_two_decimals, estimate.interval)
+    return f"{text} ({lower} to {upper})"
+
+
+def _two_decimals(value: float) -> str:
+    text = f"{value:.2f}"
+    return text.replace("0.", ".", 1) if abs(value) < 0.995 else text
+
+
+def format_twin_evidence(evidence: TwinEvidence) -> str:
+    """Return in a sentence or two how far a verdict holds for photographs."""
+    name = PurePath(evidence.run).name
+    row = evidence.row
+    if row is None:
+        return (
+            f"How far this holds for photographs was not measured: "
+            f"{_TWIN_MISMATCHES[evidence.match].format(run=name)}."
+        )
+    of_objects = row.object or "all objects together"
+    if not evidence.same_object:
+        of_objects += ", not of this object"
+    surroundings = f"in the environment {row.surroundings}"
+    if row.surroundings == IN_PHOTOGRAPH:
+        surroundings = "composed over their photographs"
+    if not evidence.same_surroundings:
+        surroundings += ", not in these surroundings"
+    agreement = (
+        f"Photographs ({name}; {of_objects}; renders {surroundings}): this model was "
+        f"right or wrong on both in {format_estimate(row.agreement)} of "
+        f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}."
+    )
+    failing = f"{row.both_wrong} of {row.wrong_twins}"
+    if row.wrong_where_twin_wrong is None:
+        return (
+            f"{agreement} Too few renders failed to state how often a failing render "
+            f"is a failing photograph ({failing})."
+        )
+    return (
+        f"{agreement} A failing render was a failing photograph in "
+        f"{format_estimate(row.wrong_where_twin_wrong)} ({failing}); photographs failed "
+        f"in {format_estimate(row.photo_wrong)} at all."
+    )
+
+
+_TWIN_MISMATCHES = {
+    TwinMatch.NOTHING: "{run} compared nothing",
+    TwinMatch.OTHER_MODEL: "{run} is of another model",
+    TwinMatch.OTHER_TASK: "{run} is of another task",
+}

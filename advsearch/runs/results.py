@@ -150,6 +150,76 @@ class Result(Fields):
         return ""
 
 
+class Estimate(Fields):
+    """An estimated number with its interval."""
+
+    value: JsonFloat
+    interval: Interval | None = Field(description="95 %; null where there is none")
+
+
+IN_PHOTOGRAPH = "twin in the photograph"
+"""Surroundings of twins that are composed over their photographs."""
+WITHOUT_OBJECT = "photograph without the object"
+"""Surroundings of the control without a twin."""
+
+
+class TwinAgreement(Fields):
+    """How far the predictions of renders hold for photographs of the same views.
+
+    A twin is the render of an object as a photograph shows it.
+    """
+
+    model: str
+    task: str
+    surroundings: str = Field(
+        description="what is around the object in the twins: "
+        "`twin in the photograph`, the name of an environment, or, as a control, "
+        "`photograph without the object`"
+    )
+    object: str = Field(description="empty: all of them")
+    condition: str = Field(description="of the photographs; empty: all of them")
+    pairs: int = Field(description="photographs with a twin")
+    frames: int = Field(description="independent frames or scenes that they are of")
+    wrong_photos: int
+    wrong_twins: int
+    both_wrong: int
+    photo_right: Estimate
+    twin_right: Estimate
+    agreement: Estimate = Field(description="both right, or both wrong")
+    kappa: Estimate | None = Field(
+        description="Cohen's, of right and wrong; null where too few are wrong"
+    )
+    margins: Estimate | None = Field(
+        description="Spearman's correlation of the margins; null where it has none"
+    )
+    photo_wrong: Estimate = Field(description="rate of wrong photographs")
+    wrong_where_twin_wrong: Estimate | None = Field(
+        description="rate of wrong photographs where the twin is wrong; null where "
+        "too few twins are wrong"
+    )
+
+
+class TwinMatch(enum.Enum):
+    """Whether a run of twins measured what a verdict is about."""
+
+    MEASURED = "measured"
+    OTHER_MODEL = "other model"
+    OTHER_TASK = "other task"
+    NOTHING = "nothing compared"
+
+
+class TwinEvidence(Fields):
+    """What a run of twins measured for the conditions nearest to those of a run."""
+
+    run: str = Field(description="the run of twins")
+    match: TwinMatch
+    same_object: bool = Field(description="the row is of the object of this run")
+    same_surroundings: bool = Field(
+        description="the twins had the surroundings of this run"
+    )
+    row: TwinAgreement | None = Field(description="null where nothing was measured")
+
+
 class RunResult(Result):
     """The result of a command that keeps a run."""
 
@@ -168,6 +238,10 @@ class RunResult(Result):
         default=[],
         description="parts that existed only in Python, so that no command "
         "asks the same; absent without",
+    )
+    twins: TwinEvidence | None = optional_field(
+        "how far verdicts hold for photographs, by the run of twins that was named; "
+        "absent without"
     )
 
     def to_dict(self) -> JsonObject:

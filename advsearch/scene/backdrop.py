@@ -107,6 +107,7 @@ class BackdropPhotograph:
 
     @property
     def is_cropped(self) -> bool:
+        """Whether only a part of the photograph is used."""
         return self.size != self.full_size
 
     def resample(self, resolution: tuple[int, int]) -> Tensor:
@@ -210,7 +211,7 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     return make_backdrop(levels, text, crop)
 
 
-def find_light_beside(photograph: object) -> Path | None:
+def find_photographed_light(photograph: object) -> Path | None:
     """Return the environment map that lies beside a photograph, or None.
 
     It is called as the photograph, with the suffix .hdr or .exr.

@@ -392,8 +392,9 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
 def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of Agisoft Metashape (manual, appendix "Camera models").
 
-    Offsets are from the center of the image, p1 and p2 are swapped against OpenCV, and
-    k4 is the fourth coefficient of a polynomial.
+    The focal lengths are f + b1 along x and f along y, and b2 is the skew. Offsets are
+    from the center of the image, p1 and p2 are swapped against OpenCV, and k4 is the
+    fourth coefficient of a polynomial.
     """
     stated_type = str(data.get("projection", "frame"))
     value_by_name = {

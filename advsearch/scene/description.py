@@ -254,6 +254,9 @@ class SceneDescription:
     ) -> SceneDescription:
         """Return the scene as the camera of its photograph was measured to see it.
 
+        Where the photograph shows the object itself, its shadow is in it already: leave
+        the plane out (``ground.size`` 0).
+
         Args:
             camera_matrix: intrinsics (3, 3) of the full photograph, in pixels, as
                 OpenCV has them.

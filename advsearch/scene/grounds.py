@@ -69,6 +69,7 @@ class Photograph:
     """
 
     def __init__(self, radiance: Float32Array, height: float, rotation: float) -> None:
+        """Make the plane and its texture; arguments are those of the class."""
         self._map_rows = radiance.shape[0]
         # the last row at or above the horizon, where the plane's texture begins
         self._horizon_row = (self._map_rows - 1) // 2

@@ -70,7 +70,7 @@ def _split_blocks(image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
         return image.reshape(1, -1)
     cut = image[: rows * BLOCK, : columns * BLOCK]
     blocks = cut.reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2)
-    return blocks.reshape(rows * columns, -1)
+    return np.asarray(blocks.reshape(rows * columns, -1))
 
 
 def make_noise(sigma: Float64Array, size: tuple[int, int], seed: int) -> Tensor:
@@ -88,11 +88,11 @@ def measure_blur(image: Float32Array) -> float:
     Args:
         image: (H, W) linear luminance.
     """
-    raw = _measure_edges(image.astype(np.float64))
-    if raw is None:
+    measured_blur = _measure_edges(image.astype(np.float64))
+    if measured_blur is None:
         return 0.0
-    blurs, measured = _calibrate()
-    return float(np.interp(raw, measured, blurs))
+    blurs, measured_blurs = _calibrate()
+    return float(np.interp(measured_blur, measured_blurs, blurs))
 
 
 def _measure_edges(image: Float64Array) -> float | None:
@@ -105,16 +105,20 @@ def _measure_edges(image: Float64Array) -> float | None:
     is_steepest_row = narrow >= ndimage.maximum_filter(narrow, size=(3, 1))
     is_steepest_column = narrow >= ndimage.maximum_filter(narrow, size=(1, 3))
     is_edge = np.where(row_slope > column_slope, is_steepest_row, is_steepest_column)
+    # relative to the steepest of the image, but for a few outliers
     is_edge &= narrow > MIN_SLOPE * float(np.quantile(narrow, 0.995))
+    # the filters reach over the border there
     margin = int(3 * WIDE)
     is_edge[:margin] = is_edge[-margin:] = False
     is_edge[:, :margin] = is_edge[:, -margin:] = False
     if is_edge.sum() < MIN_EDGES:
         return None
     ratio = (narrow[is_edge] / np.maximum(wide[is_edge], 1e-12)) ** 2
+    # 1.01: so blurred that both copies are alike; the upper end: not blurred at all
     ratio = np.clip(ratio, 1.01, (WIDE / NARROW) ** 2)
-    squared = (WIDE**2 - ratio * NARROW**2) / (ratio - 1.0)
-    return float(np.sqrt(np.quantile(squared, SHARP_FRACTION)))
+    # s^2 of the formula above, solved for
+    squared_blur = (WIDE**2 - ratio * NARROW**2) / (ratio - 1.0)
+    return float(np.sqrt(np.quantile(squared_blur, SHARP_FRACTION)))
 
 
 @lru_cache(maxsize=1)
@@ -124,14 +128,19 @@ def _calibrate() -> tuple[Float64Array, Float64Array]:
     size = CALIBRATION_SIZE
     grid = (np.arange(size * oversampling) + 0.5) / oversampling - size / 2.0
     blurs = np.arange(0.0, MAX_BLUR + 0.1, 0.25)
-    measured = np.zeros(len(blurs))
+    measured_blurs = np.zeros(len(blurs))
     for angle in np.radians(CALIBRATION_ANGLES):
-        side = grid[None] * np.cos(angle) + grid[:, None] * np.sin(angle) > 0.0
-        pixels = side.reshape(size, oversampling, size, oversampling).mean(axis=(1, 3))
+        is_bright = grid[None] * np.cos(angle) + grid[:, None] * np.sin(angle) > 0.0
+        pixels = is_bright.reshape(size, oversampling, size, oversampling).mean(
+            axis=(1, 3)
+        )
         for index, blur in enumerate(blurs):
             image = ndimage.gaussian_filter(pixels, blur) if blur else pixels
-            measured[index] += (_measure_edges(image) or 0.0) / len(CALIBRATION_ANGLES)
-    return blurs, np.maximum.accumulate(measured + 1e-9 * np.arange(len(blurs)))
+            measured_blurs[index] += (_measure_edges(image) or 0.0) / len(
+                CALIBRATION_ANGLES
+            )
+    # Rising, as an interpolation needs it.
+    return blurs, np.maximum.accumulate(measured_blurs + 1e-9 * np.arange(len(blurs)))
 
 
 def blur_image(image: Tensor, sigma: float) -> Tensor:

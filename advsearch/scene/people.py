@@ -171,11 +171,13 @@ left.
 class Person:
     """A dressed person as a `MeshRig`.
 
-    Its largest extent at its defaults is `size` metres.
-
     Args:
         data: the arrays of body.npz, which `scenes/person.py` makes.
         defaults: default values that replace those of `PARAMETERS`.
+
+    Attributes:
+        standing_points: (V, 3) the vertices at the defaults, metres.
+        size: their largest extent, metres.
     """
 
     parameters = PARAMETERS
@@ -187,9 +189,11 @@ class Person:
         defaults: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         """Convert the arrays to tensors, and pose the person at its defaults."""
-        usual = {parameter.name: float(parameter.default) for parameter in PARAMETERS}
+        default_by_name = {
+            parameter.name: float(parameter.default) for parameter in PARAMETERS
+        }
         self.data = data
-        self.defaults = usual | dict(defaults)
+        self.defaults = default_by_name | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
         # `mean` (P, 3) are points in tenths of a millimetre, `basis` (R, P, 3) the
@@ -367,6 +371,7 @@ class Person:
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
+        # (G, A, W); and heights (H,) of bodies so mixed, of the three extremes of height
         mixture = torch.einsum(
             "g,a,w->gaw", gender_weights, age_weights, weight_weights
         )
@@ -378,9 +383,9 @@ class Person:
             torch.maximum(requested_height, statures[0]), statures[2]
         )
         height_weights = compute_interpolation_weights(clamped_height, statures)
-        return mixture[..., None] * height_weights, requested_height / (
-            height_weights * statures
-        ).sum()
+        # Beyond the extremes the body is scaled.
+        mixed_height = (height_weights * statures).sum()
+        return mixture[..., None] * height_weights, requested_height / mixed_height
 
     def _pose_bones(
         self, joints: Tensor, angle_by_joint: Mapping[str, Tensor]
@@ -599,7 +604,7 @@ def _compute_limb_turns(
     """Return the turns (3, 3) of the bones of arm and leg of a side.
 
     Args:
-        angle: of joints, degrees.
+        angle_by_joint: degrees.
         side: "left" or "right".
         sign: 1 for the left, -1 for the right, which is its mirror image.
     """

@@ -183,11 +183,6 @@ class Renderer:
             return encode_levels(to_uint8(self.copy_with()(self.start)).numpy())
 
     @property
-    def window(self) -> Window | None:
-        """The window of the image that is rendered; None for all of it."""
-        return None if self.crop is None else self.crop.window
-
-    @property
     def composition_reason(self) -> str:
         """Why an image is not that of one scene as one camera sees it.
 
@@ -227,6 +222,11 @@ class Renderer:
         other._predict = predict or self._predict
         other.crop = crop or self.crop
         return other
+
+    @property
+    def window(self) -> Window | None:
+        """Window of the image that is rendered; None for all of it."""
+        return self.crop.window if self.crop else None
 
     def crop_to(self, window: Window, u: Tensor, seed: int, spp: int) -> Renderer:
         """Return a renderer that renders a window alone.
@@ -344,12 +344,12 @@ class Renderer:
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
         with self.scene.limit_window(self.window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
-        traced = mean if self.window is None else self.window.select(mean)
         plane_radiance = self.scene.plane_radiance if hide else None
+        if self.crop is None:
+            return halves, denoise_image(mean, albedo, normal, plane_radiance)
+        traced = self.crop.window.select(mean)
         clean = denoise_image(traced, albedo, normal, plane_radiance)
-        if self.crop is not None:
-            clean = self.crop.window.paste(clean, self.crop.surroundings)
-        return halves, clean
+        return halves, self.crop.window.paste(clean, self.crop.surroundings)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration (d,), without a

@@ -99,7 +99,7 @@ class _MeshTarget(NamedTuple):
 
     name: str
     node: int
-    index: int  # among the targets of the node
+    index_in_node: int  # among the targets of the node
     rest_weight: float
     rows: Tensor  # (K,) of the mesh's vertices
     offsets: Tensor  # (K, 3) at weight 1
@@ -188,7 +188,7 @@ class SkeletonRig:
                     _MeshTarget(
                         name=target.name,
                         node=part.node,
-                        index=index,
+                        index_in_node=index,
                         rest_weight=float(part.rest_weights[index]),
                         rows=torch.from_numpy(mesh_rows[is_moved]),
                         offsets=torch.from_numpy(target.offsets[target_rows[is_moved]]),
@@ -321,7 +321,7 @@ class SkeletonRig:
         for target in self._targets:
             weight = number_by_name.get(f"{target.name}.{WEIGHT}")
             if weight is None and target.node in clip_weights:
-                weight = clip_weights[target.node][target.index]
+                weight = clip_weights[target.node][target.index_in_node]
             elif weight is None:
                 weight = torch.tensor(target.rest_weight, dtype=torch.float64)
             # A weight of 0 is left out, unless its derivative is wanted.

@@ -211,49 +211,64 @@ def add_things(
     parts = list[ThingPart]()
     remarks = list[str]()
     for thing in requested:
-        object_spec = thing.object_spec
-        name = thing.name
-        asset = with_size(load(object_spec, thing.facing), thing.size, None)
-        if asset.metres is None:
-            example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
-            raise InputError(
-                f"things: the size of {object_spec} in metres is not known; say it: "
-                f"{example}"
-            )
-        if name in {part.name for part in scene.parts}:
-            raise InputError(
-                f"things: something of the scene is called {name} "
-                "already; add name=NAME to it"
-            )
-        part = make_mesh_part(
-            name,
-            asset,
-            _compute_pose(scene, asset, thing, asset.metres),
-            asset.material,
-        )
-        fields = {**vars(part), "label": thing.label or asset.label}
-        parts.append(ThingPart(**fields, metres=asset.metres, lamps=thing.lamps))
-        remarks += [
-            *asset.notes,
-            *describe_size_doubts(
-                asset, has_user_size=thing.size is not None, needs_metres=True
-            ),
-        ]
-        if asset.front is not None and asset.front.reason and has_lanes(scene):
-            remarks.append(asset.front.reason)
+        part, thing_remarks = _make_thing(scene, thing, load)
+        parts.append(part)
+        remarks += thing_remarks
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=things_spec or "")
+    remarks += _list_overlap_remarks(scene)
+    return replace(scene, remarks=(*scene.remarks, *remarks))
+
+
+def _make_thing(
+    scene: SceneDescription,
+    thing: RequestedThing,
+    load: Callable[[str, str | None], ObjectAsset],
+) -> tuple[ThingPart, list[str]]:
+    """Return a thing that stands in a scene, and remarks on it.
+
+    Arguments and errors are as for `add_things`.
+    """
+    object_spec = thing.object_spec
+    name = thing.name
+    asset = with_size(load(object_spec, thing.facing), thing.size, unit=None)
+    if asset.metres is None:
+        example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
+        raise InputError(
+            f"things: the size of {object_spec} in metres is not known; say it: "
+            f"{example}"
+        )
+    if name in {part.name for part in scene.parts}:
+        raise InputError(
+            f"things: something of the scene is called {name} "
+            "already; add name=NAME to it"
+        )
+    pose = _compute_pose(scene, asset, thing, asset.metres)
+    part = make_mesh_part(name, asset, pose, asset.material)
+    fields = {**vars(part), "label": thing.label or asset.label}
+    remarks = [
+        *asset.notes,
+        *describe_size_doubts(
+            asset, has_user_size=thing.size is not None, needs_metres=True
+        ),
+    ]
+    if asset.front is not None and asset.front.reason and has_lanes(scene):
+        remarks.append(asset.front.reason)
+    return ThingPart(**fields, metres=asset.metres, lamps=thing.lamps), remarks
+
+
+def _list_overlap_remarks(scene: SceneDescription) -> list[str]:
+    """Return a remark on each two of the object and the things that overlap."""
     footprints = {"the object": compute_footprint(scene.base_vertices)} | {
         name: compute_footprint(compute_base_vertices(part))
         for name, part in scene.meshes.items()
         if isinstance(part, ThingPart)
     }
-    remarks += [
-        f"{first_name[0].upper()}{first_name[1:]} and {second_name} stand in each other: their "
+    return [
+        f"{name[0].upper()}{name[1:]} and {other_name} stand in each other: their "
         "outlines on the ground overlap."
-        for first_name, second_name in combinations(footprints, 2)
-        if is_overlapping(footprints[first_name], footprints[second_name])
+        for name, other_name in combinations(footprints, 2)
+        if is_overlapping(footprints[name], footprints[other_name])
     ]
-    return replace(scene, remarks=(*scene.remarks, *remarks))
 
 
 def _compute_pose(

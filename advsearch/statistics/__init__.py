@@ -11,13 +11,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from advsearch.statistics import agreement as agreement
     from advsearch.statistics import clustered as clustered
     from advsearch.statistics import intervals as intervals
     from advsearch.statistics import monotone as monotone
     from advsearch.statistics import paired as paired
     from advsearch.statistics import sequential as sequential
 
-__all__ = ["clustered", "intervals", "monotone", "paired", "sequential"]
+__all__ = ["agreement", "clustered", "intervals", "monotone", "paired", "sequential"]
 
 
 def __getattr__(name: str) -> Any:

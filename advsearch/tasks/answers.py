@@ -46,10 +46,10 @@ class FreeAnswer(Task):
     """Judge whether an answer contains one of the right words, as a full word in any
     case.
 
-    The truth is those words. Whether an answer is right depends on its text alone; how
-    nearly, on the logits. Let p be the sigmoid of the lead that tokens which begin such
-    a word have over all others, at the step where it is largest: the loss is log(1 - p)
-    for a right answer and -log(p) for a wrong one.
+    The truth is those words. Whether an answer is right depends on its text alone; its
+    loss depends on the logits. At each step, the tokens that begin such a word have a
+    lead over all others, and p is the sigmoid of the largest lead of all steps. The
+    loss is log(1 - p) for a right answer and -log(p) for a wrong one.
 
     For a model without logits (`AnswersWithoutLogits`) the loss is 1 - 2 s, where s is
     the fraction of right answers among those about one image: it is right if at least

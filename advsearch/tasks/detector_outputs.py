@@ -722,12 +722,7 @@ def _order_of_pairs(
     neither can be classes, both are scores of a network with two classes, or
     objectness and score of one with a single class.
     """
-    pairs_of_images = []
-    for detections in detections_of_images:
-        if "either" in detections:
-            pairs = detections["either"][are_counted(detections)]
-            is_finite = pairs.isfinite().all(dim=1)
-            pairs_of_images.append(pairs[is_finite].detach())
+    pairs_of_images = _collect_pairs(detections_of_images)
     if not any(map(len, pairs_of_images)):
         return ""
     columns = torch.cat(pairs_of_images).unbind(dim=1)
@@ -755,6 +750,17 @@ def _order_of_pairs(
     if scores_first == labels_first:
         return ""
     return ORDERS[0] if scores_first else ORDERS[1]
+
+
+def _collect_pairs(detections_of_images: Sequence[Detections]) -> list[Tensor]:
+    """Return the finite pairs `either` (K, 2) of the boxes that count of each image."""
+    pairs_of_images = []
+    for detections in detections_of_images:
+        if "either" in detections:
+            pairs = detections["either"][are_counted(detections)]
+            is_finite = pairs.isfinite().all(dim=1)
+            pairs_of_images.append(pairs[is_finite].detach())
+    return pairs_of_images
 
 
 def _may_be_classes(values: Tensor, max_classes: float) -> bool:

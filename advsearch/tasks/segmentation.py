@@ -21,7 +21,7 @@ EXPECTED = (
 # Minimum fraction of right pixels at which the object is segmented in part.
 MIN_PARTIAL_ACCURACY = 0.1
 
-# Computes the lead (P,) of classes from logits (P, classes).
+# From logits (P, classes) and labels to the margin (P,) of these classes.
 PixelMargin = Callable[[Tensor, tasks.Labels], Tensor]
 
 

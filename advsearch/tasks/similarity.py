@@ -112,14 +112,14 @@ def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
             root, f"at most {limit:,} reference pictures", f"{len(paths):,}"
         )
     features = _embed_images(paths, model)
-    owners = torch.tensor(name_indices)
+    name_index = torch.tensor(name_indices)
     return Gallery(
         names=tuple(name for name, _ in named_folders),
-        name_index=owners,
+        name_index=name_index,
         paths=tuple(path.relative_to(root).as_posix() for path in paths),
         features=features,
         embedder=(model.module, model.preprocessing),
-        head=fit_linear_head(features, owners) if linear else None,
+        head=fit_linear_head(features, name_index) if linear else None,
     )
 
 

@@ -120,7 +120,7 @@ READING = {
 """And those that look at them."""
 
 ALONE = (
-    *("attack", "harden", "render", "list", "labels", "check", "precision", "stability", "doctor"),
+    *("attack", "harden", "render", "twins", "list", "labels", "check", "precision", "stability", "doctor"),
     *("import", "import-3db", "completion"),
 )
 """Those that are told everything, and the dashboard, which is tried below."""

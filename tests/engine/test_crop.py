@@ -12,6 +12,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.engine import windows
+from advsearch.engine.acceptance import Deviation
 from advsearch.engine.problem import Problem
 from advsearch.engine.windows import Windowing, find_window
 from advsearch.questions.attack.carry_out import problem_from_config
@@ -179,7 +180,7 @@ def test_surroundings_that_change_are_rendered_again_and_then_always(monkeypatch
     deviations = iter([0.0, 9.0, 9.0])
     measure = windows.measure_outside
 
-    def measure_outside(*arguments: Any) -> windows.Deviation:
+    def measure_outside(*arguments: Any) -> Deviation:
         return replace(measure(*arguments), levels=next(deviations))
 
     for module in ("windows", "crop"):

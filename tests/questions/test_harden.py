@@ -61,10 +61,10 @@ def test_a_run_trains_measures_and_goes_on(
     given.pop("model")
     taught = ClassifierTrainer.round
 
-    def stopped(self: Any, number: int, *args: Any) -> None:
+    def stopped(self: Any, number: int, *args: Any, **options: Any) -> None:
         if number == 2:
             raise KeyboardInterrupt
-        taught(self, number, *args)
+        taught(self, number, *args, **options)
 
     monkeypatch.setattr(ClassifierTrainer, "round", stopped)
     first = asked.run(config)

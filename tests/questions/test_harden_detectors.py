@@ -164,10 +164,10 @@ def test_a_run_trains_on_what_it_found_and_measures_scene_by_scene(
     monkeypatch.setattr("advsearch.questions.harden.scenes.CLEAN_SCENES", 1)
     given["data"], taught = str(coco(tmp_path / "own")), DetectorTrainer.round
 
-    def stopped(self: DetectorTrainer, number: int, *args: Any) -> None:
+    def stopped(self: DetectorTrainer, number: int, *args: Any, **options: Any) -> None:
         if number == 2:
             raise KeyboardInterrupt
-        taught(self, number, *args)
+        taught(self, number, *args, **options)
 
     monkeypatch.setattr(DetectorTrainer, "round", stopped)
     first = advsearch.harden(OneBox(), **given)

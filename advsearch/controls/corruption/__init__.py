@@ -36,7 +36,7 @@ _GREY = 1.0 / 512.0
 
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Raise the value, keep hue and saturation."""
+    """Raise the value of each pixel, keep hue and saturation."""
     (increase,) = filters.interpolate_table(BRIGHTNESS, level)
     value = image.amax(dim=-1, keepdim=True)
     return image + ((value + increase).clamp(max=1.0) - value) * (image + _GREY) / (
@@ -211,7 +211,8 @@ def apply_corruption(
         apply_at = STEPPED_CORRUPTIONS[name]
         applied_severity = round_severity(severity)
         result = apply_at(image, applied_severity) if applied_severity else image
-        # by the straight lines between the steps: a staircase has no slope
+        # A staircase has no slope: the gradient is that of the straight lines between
+        # its steps; what is added is zero.
         if severity.requires_grad:
             below = min(int(severity.detach()), filters.MAX_SEVERITY - 1)
             low = apply_at(image, below).detach() if below else image.detach()
@@ -229,5 +230,5 @@ def apply_corruption(
 
 
 def round_severity(severity: Tensor) -> int:
-    """Return the whole severity nearest to one, halves upwards."""
+    """Return the whole number nearest to a severity (), halves upwards."""
     return int(float(severity.detach()) + 0.5)

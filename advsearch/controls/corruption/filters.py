@@ -138,7 +138,10 @@ SPECKLE = ((0.15,), (0.2,), (0.35,), (0.45,), (0.6,))
 _DARK = 1e-3  # keeps the slope of a square root finite in black
 
 
-def _noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> Tensor:
+def _draw_noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> Tensor:
+    """Return noise of an image's shape (H, W, 3), other for each name: standard normal,
+    or uniform in [0, 1).
+    """
     return images.draw_noise(
         image.shape[0], image.shape[1], seed, f"corruption {name}", normal=normal
     ).to(image.device)
@@ -147,13 +150,13 @@ def _noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> Tenso
 def gaussian_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add normal noise, as of a sensor in the dark."""
     (sigma,) = interpolate_table(GAUSSIAN, level)
-    return image + sigma * _noise(image, seed, "gaussian noise")
+    return image + sigma * _draw_noise(image, seed, "gaussian noise")
 
 
 def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add normal noise in proportion to the value."""
     (sigma,) = interpolate_table(SPECKLE, level)
-    return image + image * sigma * _noise(image, seed, "speckle noise")
+    return image + image * sigma * _draw_noise(image, seed, "speckle noise")
 
 
 def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -164,7 +167,7 @@ def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     or the standard deviation changes a little.
     """
     (photons,) = interpolate_table(SHOT, level)
-    quantile = _noise(image, seed, "shot noise", normal=False)
+    quantile = _draw_noise(image, seed, "shot noise", normal=False)
     with torch.no_grad():
         noisy = sample_poisson(image * photons, quantile) / photons
         z = (noisy - image) / torch.sqrt(image / photons + _DARK)
@@ -198,8 +201,8 @@ def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     derivative is that of the average over all draws of which ones are lost.
     """
     (lost_fraction,) = interpolate_table(IMPULSE, level)
-    draw = _noise(image, seed, "impulse noise", normal=False)
-    extreme = (_noise(image, seed, "impulse value", normal=False) < 0.5).float()
+    draw = _draw_noise(image, seed, "impulse noise", normal=False)
+    extreme = (_draw_noise(image, seed, "impulse value", normal=False) < 0.5).float()
     noisy = torch.where(draw < lost_fraction.detach(), extreme, image)
     slope = extreme - image.detach()
     return noisy + (lost_fraction - lost_fraction.detach()) * slope
@@ -235,7 +238,13 @@ def gaussian_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Blur with a disc, the picture of a point that a lens has out of focus."""
+    """Blur with a disc, the picture of a point that a lens has out of focus.
+
+    Args:
+        image: (H, W, 3).
+        level: () severity in [1, 5]; larger ones have larger discs.
+        seed: has no effect.
+    """
     (radius,) = interpolate_table(DEFOCUS, level)
     radius = radius * compute_pixel_scale(image)
     reach = math.ceil(float(radius.detach()) + 0.5)
@@ -291,7 +300,9 @@ def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     sigma = interpolate_table(GLASS, level)[0] * compute_pixel_scale(image)
     shift = interpolate_severity(
         level,
-        lambda severity: _glass_shift(image.shape[0], image.shape[1], seed, severity),
+        lambda severity: _make_glass_shift(
+            image.shape[0], image.shape[1], seed, severity
+        ),
     )
     return blur_gaussian(
         images.warp(blur_gaussian(image, sigma), shift * compute_pixel_scale(image)),
@@ -308,8 +319,8 @@ def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
-    """Return from how far each pixel is taken behind frosted glass.
+def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
+    """Make the shift of each pixel to where it is taken from behind frosted glass.
 
     One pixel after another, from the bottom right, takes over what a random neighbor
     has by then; so it may come from further away than one step.
@@ -330,13 +341,13 @@ def _glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     for _ in range(n_passes):
         jumps = torch.randint(-reach, reach, (rows, columns, 2), generator=source)
         to_neighbor = (jumps[..., 0] * columns + jumps[..., 1]).flatten().tolist()
-        _swap_in_neighbors(origins, to_neighbor, rows, columns, reach)
+        _take_over_origins(origins, to_neighbor, rows, columns, reach)
     shift = _compute_shifts(torch.tensor(origins), columns)
     shift = shift.view(1, 2, rows, columns).float()
     return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
 
 
-def _swap_in_neighbors(
+def _take_over_origins(
     origins: list[int], to_neighbor: list[int], rows: int, columns: int, reach: int
 ) -> None:
     """Let each pixel take over the origin of its neighbor, from the bottom right.
@@ -353,18 +364,20 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Shear the picture and wrinkle it; below severity 1 by less."""
     height, width = image.shape[:2]
     if float(severity.detach()) < 1.0:
-        shift = severity * _elastic_shift(height, width, seed, 1).to(severity.device)
+        shift = severity * _make_elastic_shift(height, width, seed, 1).to(
+            severity.device
+        )
     else:
         shift = interpolate_severity(
             severity,
-            lambda level: _elastic_shift(height, width, seed, level),
+            lambda level: _make_elastic_shift(height, width, seed, level),
         )
     return images.warp(image, compute_pixel_scale(image) * shift)
 
 
 @lru_cache(maxsize=8)
-def _elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
-    """Return from how far each pixel is taken: wrinkles and a shear.
+def _make_elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
+    """Make the shift of each pixel to where it is taken from: wrinkles and a shear.
 
     Args:
         height: of the image.
@@ -386,18 +399,21 @@ def _elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
         mode="reflect",
         truncate=3.0,
     )
-    shear = _shear(rows, columns, corners)
+    shear = _make_shear(rows, columns, corners)
     shift = torch.from_numpy(waves) * wrinkle_height + shear
     return images.resized(shift, height, width)
 
 
-def _shear(rows: int, columns: int, corners: Tensor) -> Tensor:
-    """Return the affine shift (rows, columns, 2) that moves three corners (3, 2).
+def _make_shear(rows: int, columns: int, corners: Tensor) -> Tensor:
+    """Make the affine shift (rows, columns, 2) in which three corners of the middle
+    third of the image have given shifts.
 
-    They are corners of the middle third of the image.
+    Args:
+        rows: of the image.
+        columns: of the image.
+        corners: (3, 2) shifts of the lower right, upper right and upper left corner.
     """
-    # An affine map is its value at the center, and its slopes along rows and columns,
-    # from the shifts of the lower right, upper right and upper left corner.
+    # An affine map is its value at the center, and its slopes along rows and columns.
     third = REFERENCE_SIDE // 3
     by_row = (corners[0] - corners[1]) / (2 * third)
     by_column = (corners[0] - corners[2]) / (2 * third) - by_row
@@ -434,7 +450,8 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
     height, width = image.shape[:2]
     (density,) = interpolate_table(FOG, level)
     drift = interpolate_severity(
-        level, lambda severity: _drift(height, width, seed, FOG_DECAY[severity - 1])
+        level,
+        lambda severity: _make_drift(height, width, seed, FOG_DECAY[severity - 1]),
     )
     brightest = image.max()
     return (
@@ -443,7 +460,7 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
+def _make_drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     """Make fog (H, W, 1) in [0, 1]."""
     rows, columns = compute_reference_size(height, width)
     return images.resized(
@@ -486,24 +503,26 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
 def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Lay ice crystals over the picture."""
     image_weight, ice_weight = interpolate_table(FROST, level)
-    ice = _crystals(image.shape[0], image.shape[1], seed).to(image.device)
+    ice = _make_ice(image.shape[0], image.shape[1], seed).to(image.device)
     return image_weight * image + ice_weight * ice
 
 
 @lru_cache(maxsize=4)
-def _crystals(height: int, width: int, seed: int) -> Tensor:
+def _make_ice(height: int, width: int, seed: int) -> Tensor:
     """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film."""
     rows, columns = compute_reference_size(height, width)
     source = make_generator(seed, "frost")
     film = make_fractal_noise(max(rows, columns), 1.4, source)[:rows, :columns, None]
-    feathers = images.resized(_feathers(2 * rows, 2 * columns, source), rows, columns)
+    feathers = images.resized(
+        _draw_feathers(2 * rows, 2 * columns, source), rows, columns
+    )
     ice = 0.2 + 0.3 * film + (0.45 + 0.75 * film) * feathers
     return images.resized(
         (ice * torch.tensor(ICE_COLOR)).clamp(0.0, 1.0), height, width
     )
 
 
-def _feathers(height: int, width: int, source: torch.Generator) -> Tensor:
+def _draw_feathers(height: int, width: int, source: torch.Generator) -> Tensor:
     """Draw ice needles with barbs at 60 degrees, as ice grows on glass.
 
     Returns:
@@ -520,21 +539,30 @@ def _feathers(height: int, width: int, source: torch.Generator) -> Tensor:
 def _draw_feather(
     pen: ImageDraw.ImageDraw, start: complex, turn: float, size: float, shine: float
 ) -> None:
-    """Draw one ice needle from a point, with a direction, a size and a shine in [0,
-    1].
+    """Draw one ice needle with its barbs.
+
+    Args:
+        pen: to draw with.
+        start: of the needle; x is the real and y the imaginary part, in pixels.
+        turn: direction of the needle in full turns.
+        size: in [0, 1].
+        shine: brightness in [0, 1].
     """
     direction = cmath.rect(1.0, 2.0 * math.pi * turn)
     length = 12.0 + 110.0 * size**3
-    _line(pen, start, start + length * direction, shine)
+    _draw_line(pen, start, start + length * direction, shine)
     for step in range(4, int(length), 4):
         unevenness = 0.5 + 0.5 * math.sin(step + 50.0 * turn)
         barb = (0.2 + 0.35 * unevenness) * (length - step) * direction
         root = start + step * direction
         for angle in (math.pi / 3.0, -math.pi / 3.0):
-            _line(pen, root, root + barb * cmath.rect(1.0, angle), 0.7 * shine)
+            _draw_line(pen, root, root + barb * cmath.rect(1.0, angle), 0.7 * shine)
 
 
-def _line(pen: ImageDraw.ImageDraw, begin: complex, end: complex, shine: float) -> None:
+def _draw_line(
+    pen: ImageDraw.ImageDraw, begin: complex, end: complex, shine: float
+) -> None:
+    """Draw a line between points in pixels, with a brightness in [0, 1]."""
     pen.line((begin.real, begin.imag, end.real, end.imag), fill=int(255.0 * shine))
 
 
@@ -543,7 +571,7 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
     (image_weight,) = interpolate_table(SNOW_IMAGE_WEIGHT, level)
     layer = interpolate_severity(
         level,
-        lambda severity: _snowfall(image.shape[0], image.shape[1], seed, severity),
+        lambda severity: _make_snowfall(image.shape[0], image.shape[1], seed, severity),
     ).to(image.device)
     grey = (image * image.new_tensor(LUMA_WEIGHTS)).sum(dim=-1, keepdim=True)
     pale = torch.maximum(image, 1.5 * grey + 0.5)
@@ -553,7 +581,7 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
+def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Make falling snow (H, W, 1) in [0, 1] at a whole severity."""
     rows, columns = compute_reference_size(height, width)
     mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]

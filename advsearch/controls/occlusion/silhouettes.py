@@ -204,12 +204,15 @@ def spread_directions(frame: geometry.Frame) -> assets.Float64Array:
     ).list_directions()
 
 
-def compute_center_axes(hidden: assets.Float64Array) -> assets.Float64Array:
+def compute_center_axes(directions: assets.Float64Array) -> assets.Float64Array:
     """Return a camera's axes (3, 3) turned to look at the middle of a silhouette.
 
-    Rows right, up, forward.
+    Rows are right, up and forward.
+
+    Args:
+        directions: (N, 3) of the silhouette's points, from the camera.
     """
-    forward = hidden.mean(axis=0)
+    forward = directions.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
     # forward is never straight up: it is in front of the camera
     right = np.cross((0.0, 1.0, 0.0), forward)

@@ -129,9 +129,11 @@ class Waypoints:
         return torch.lerp(column[index - 1], column[index], fraction)
 
     def interpolate_rotation(self, time: Tensor) -> Tensor:
-        """Return the rotation (..., 3, 3) at times (...,).
+        """Return the camera's rotation (..., 3, 3) at times (...,).
 
-        Its columns are the camera's right, down and ahead.
+        Its columns are the camera's right, down and ahead. Between waypoints,
+        quaternions are interpolated linearly and normalized. There have to be
+        `rotations`.
         """
         assert self.rotations is not None
         quaternion = self.interpolate(time, self.rotations)
@@ -915,14 +917,17 @@ def unwrap_headings(
     note.
 
     Only headings within one turn are changed, those all in [0, 360] or in [-180, 180]
-    that do not span a full turn: others are counted on by the file itself. The note is
+    that do not span a full turn; a file with others counts turns itself. The note is
     None if nothing changes.
+
+    Args:
+        degrees: (n,) headings, at the waypoints in turn.
     """
     low = float(degrees.min())
     high = float(degrees.max())
     jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
-    is_full_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
-    if not len(jumps) or high - low >= 360.0 or not is_full_turn:
+    is_within_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
+    if not len(jumps) or high - low >= 360.0 or not is_within_turn:
         return degrees, None
     first = f"{degrees[jumps[0]]:g}"
     last = f"{degrees[jumps[0] + 1]:g}"

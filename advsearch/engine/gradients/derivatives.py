@@ -277,8 +277,8 @@ def measure_reference(
     pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
 
     def measure(factor: float, count: int) -> tuple[Reference, float]:
-        """Take differences at a step and at half of it until there are so many pairs,
-        of the same seeds each.
+        """Return the reference of `count` pairs of differences, at a step and at half
+        of it with the same seed, and its standard error; missing pairs are measured.
         """
         step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
         for number in range(len(pairs[factor]), count):
@@ -344,8 +344,14 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
 def measure_estimates(
     bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
 ) -> list[Estimate]:
-    """Measure one estimator of one control's groups along some probes of them, its
-    differences `factor` times as wide as planned.
+    """Measure one estimator of one control's groups along some probes of them.
+
+    Args:
+        bench: of the renderer.
+        estimator: of the groups.
+        probes: of these groups only.
+        repeats: number of gradients, each with its own seed.
+        factor: on the planned step of differences.
     """
     names = {probe.group.name for probe in probes}
     plan = restrict_plan(bench.renderer.plan.scale_steps(factor), names, estimator)
@@ -377,26 +383,28 @@ def measure_derivatives(
     of many samples.
 
     Args:
-        reference_spp, seeds_of_reference, reference_factors: as `spp` of the bench, and
-            as `repeats` and `factors` of `measure_reference`.
-        list_tries: from a group the estimators to try, by default as planned, with
-            multiples of the step; a wider one on what is not `ok` yet.
-        repeats: gradients by an estimator at first, and by one with another step, which
-            has to be surer.
-        stage: is told what begins and of how many steps.
+        bench: of the renderer.
+        reference_spp: samples per pixel of the references, if more than the bench's.
+        reference_repeats: as `repeats` of `measure_reference`.
+        reference_factors: as `factors` of `measure_reference`.
+        list_tries: returns the estimators to try on a group with factors on its step,
+            by default as planned; factors other than 1 are for probes that are not
+            `ok` yet.
+        repeats: number of gradients by an estimator with the planned step, and with
+            another one, which has to be surer.
+        stage: called with the name of what begins and its number of steps.
     """
 
-    def refer(probe: Probe) -> Reference:
+    def load_reference(probe: Probe) -> Reference:
+        """Return the reference along a probe, measured if it is not stored yet."""
         # what acts on the picture clips: its mean depends on the noise, so both get the
         # same
-        spp = (
-            bench.spp
-            if probe.group.estimator == "image"
-            else max(bench.spp, reference_spp)
-        )
+        is_on_picture = probe.group.estimator == "image"
+        spp = bench.spp if is_on_picture else max(bench.spp, reference_spp)
         finer = replace(bench, spp=spp)
 
         def measure() -> dict[str, Any]:
+            """Measure it, as JSON."""
             return measure_reference(
                 finer, probe, repeats=reference_repeats, factors=reference_factors
             )._asdict()
@@ -410,8 +418,8 @@ def measure_derivatives(
     ):
         probes = list(control_probes)
         stage(f"references for {control}", len(probes))
-        references = {probe.name: refer(probe) for probe in probes}
-        # each comes from one gradient
+        references = {probe.name: load_reference(probe) for probe in probes}
+        # probes whose derivatives come from one gradient
         sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
         for probe in probes:
             sets.setdefault((probe.group.valid, probe.group.estimator), []).append(
@@ -434,8 +442,15 @@ def _try_estimators(
     tries: Sequence[tuple[str, float]],
     repeats: tuple[int, int],
 ) -> Iterator[Measured]:
-    """Yield how estimators agree with references along probes; other steps are tried
-    where none was `ok` before.
+    """Yield how estimators agree with references along probes.
+
+    Args:
+        bench: of the renderer.
+        probes: of one control, which share their estimators.
+        references: by the names of all the control's probes.
+        tries: estimators with factors on the step; one with a factor other than 1 is
+            tried along probes along which none was `ok` before.
+        repeats: number of gradients with the factor 1, and with another one.
     """
     good: set[str] = set()
     for estimator, factor in tries:
@@ -465,6 +480,7 @@ def _try_estimators(
 def _estimates_as_json(
     bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
 ) -> list[dict[str, Any]]:
+    """Return the estimates of `measure_estimates` as JSON objects."""
     return [
         estimate._asdict()
         for estimate in measure_estimates(bench, estimator, probes, repeats, factor)

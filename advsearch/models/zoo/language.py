@@ -521,7 +521,8 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     Raises:
         ModelError: they differ.
     """
-    index = max(range(len(module.tokens)), key=lambda k: len(module.tokens[k]))
+    lengths = [len(name_tokens) for name_tokens in module.tokens]
+    index = lengths.index(max(lengths))
     generator = torch.Generator().manual_seed(0)
     image = torch.rand((3, *module.reader.image_size), generator=generator)
     prompt = module.reader.make_inputs(image)

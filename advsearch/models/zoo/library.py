@@ -102,7 +102,16 @@ def load_processor(transformers: Any, name: str, where: Mapping[str, Any]) -> An
 def find_cached_file(
     transformers: Any, name: str, file: str, where: Mapping[str, Any]
 ) -> str | None:
-    """Return the path of a file of a repository or a directory; None if it has none."""
+    """Return the path of a file of a repository or a directory; None if it has none.
+
+    The file of a repository is fetched if it is not in the cache.
+
+    Args:
+        transformers: the package.
+        name: of the repository or directory.
+        file: its name there.
+        where: arguments of `cached_file`, such as a revision.
+    """
     path: str | None = transformers.utils.cached_file(
         name, file, _raise_exceptions_for_missing_entries=False, **where
     )
@@ -189,8 +198,8 @@ def _run_processor(processor: Any, picture: Any, spec: str) -> Array:
 
 
 def _disable_resizing(processor: Any) -> Callable[..., Any]:
-    """Return a processor that neither resizes nor crops, for images of the right
-    size.
+    """Return a function that calls a processor with its resizing and cropping turned
+    off, for images of the right size.
     """
     switches = ("do_resize", "do_center_crop")
     disabled = {name: False for name in switches if getattr(processor, name, None)}
@@ -277,6 +286,7 @@ def _round_triple(numbers: Array) -> models.Triple:
 
 
 def _make_processor_error(spec: str, processor: Any, what: str) -> errors.ModelError:
+    """Return the error for a processor that cannot be used, with what it does."""
     return errors.ModelError(
         f"model {spec}: its processor {type(processor).__name__} {what}, which no "
         "size, mean and std stand for. Wrap "
@@ -293,7 +303,10 @@ RunNetwork = Callable[
 class AdaptedNetwork(nn.Module):
     """A network of a library, called as that library calls it.
 
-    `boxes` states that its boxes are corners in pixels.
+    Args:
+        network: of the library.
+        ask: calls it on images (N, 3, H, W).
+        boxes: whether what it returns are boxes as corners in pixels.
     """
 
     def __init__(
@@ -321,11 +334,10 @@ class LoadedNetwork:
         purpose: of the network.
     """
 
-    network: Any  # a `PreTrainedModel`
+    network: Any
     name: str
-    spec: str  # what its user wrote, for messages
-    processor: Any  # of images; None where it has none
-    # loads another part by the class that does it, such as "AutoTokenizer"
+    spec: str
+    processor: Any
     load_part: Callable[[str], Any]
     purpose: models.Purpose
 
@@ -370,7 +382,10 @@ class LoadedNetwork:
     ) -> models.Source:
         """Return the source of the network as `AdaptedNetwork` calls it.
 
-        `fields` go to `Source`.
+        Args:
+            ask: see `AdaptedNetwork`.
+            boxes: see `AdaptedNetwork`.
+            **fields: of `Source`; they overrule the measured preprocessing.
         """
         return models.make_source(
             AdaptedNetwork(self.network, ask, boxes=boxes),
@@ -382,19 +397,28 @@ class LoadedNetwork:
         self, module: nn.Module, names: tuple[str, ...], dtype: torch.dtype
     ) -> models.Source:
         """Return the source of a module made of the network and texts for names."""
-        described = self.get_sized_preprocessing(
-            getattr(self.network.config, "vision_config", None)
-        )
+        vision_config = getattr(self.network.config, "vision_config", None)
         return models.make_source(
-            module, self.name, labels=names, dtype=dtype, reads_text=True, **described
+            module,
+            self.name,
+            labels=names,
+            dtype=dtype,
+            reads_text=True,
+            **self.get_sized_preprocessing(vision_config),
         )
 
 
 def are_nearly_equal(
     expected: Tensor, computed: Tensor, size: float, dtype: torch.dtype
 ) -> bool:
-    """Whether a network's own scores and those that we compute from its parts are equal
-    up to rounding in its dtype, relative to a size.
+    """Return whether a network's scores and those computed from its parts are equal up
+    to rounding.
+
+    Args:
+        expected: scores of the network itself.
+        computed: scores from its parts.
+        size: of the numbers that are summed, which errors are relative to.
+        dtype: of the network.
     """
     return bool(
         (expected - computed).abs().max()

@@ -32,11 +32,15 @@ from advsearch.models.zoo.library import (
 
 
 class Family(NamedTuple):
-    """Networks of transformers that are loaded and asked alike: `matches` tells them, a
-    pattern in the name of an architecture (``DeiTForImageClassificationWithTeacher``),
-    or a function of that and the network or its class. The class of transformers that
-    builds them is AutoModel and `loader`, or for None the architecture itself;
-    `make_zero_shot_source` makes the model's source.
+    """Networks of transformers that are loaded and called alike.
+
+    Attributes:
+        matches: tells whether an architecture is of the family: a pattern in its name
+            (``DeiTForImageClassificationWithTeacher``), or a function of its name and
+            the network or its class.
+        loader: suffix to AutoModel of the class that loads the network; None if that is
+            the class of the architecture.
+        source: makes the source of a model.
     """
 
     matches: str | Callable[[str, Any], bool]
@@ -61,11 +65,11 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
     `NETWORKS`.
 
     One that reads texts gets its classes from the user (`zero_shot`, `language`).
-    Labels of others are those that they were published with; size, channel order and
-    normalization are measured on the image processor (`import_library.measured`); a
+    Labels of others are those that they were published with. Size, channel order and
+    normalization are measured on the image processor (`library.measure_processor`); a
     ModelWarning reports if there is none. Code in a repository is never run, and
-    weights are read from safetensors alone. A repository that timm has saved goes to
-    timm.
+    weights are read from safetensors alone. A repository that timm has saved is loaded
+    by timm.
 
     Raises:
         ModelError: transformers is missing, the repository cannot be loaded or lacks
@@ -93,18 +97,18 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         if not Path(name).is_dir() and _is_hub_unreachable(name):
             where["local_files_only"] = True
         saved = _load_config(transformers, name, spec, where)
-        # which timm itself has saved
+        # timm has saved it
         if saved.get("model_type") == "timm_wrapper" and "architectures" not in saved:
             return outputs.load_timm_repository(spec, name, revision, purpose)
         config = transformers.AutoConfig.from_pretrained(
             name, trust_remote_code=False, **where
         )
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
-        kind = _find_family(
+        family = _find_family(
             architecture, getattr(transformers, architecture, None), spec
         )
         check_fits(transformers, name, where, spec)
-        builder = architecture if kind.loader is None else f"AutoModel{kind.loader}"
+        builder = architecture if family.loader is None else f"AutoModel{family.loader}"
         network, report = getattr(transformers, builder).from_pretrained(
             name,
             use_safetensors=True,
@@ -114,12 +118,15 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         )
         _check_weights(network, report, spec)
         processor = load_processor(transformers, name, where)
-    part = partial(_load_part, transformers, spec, name, where)
-    return kind.source(
-        LoadedNetwork(
-            network, name.rstrip("/").rpartition("/")[2], spec, processor, part, purpose
-        )
+    loaded = LoadedNetwork(
+        network=network,
+        name=name.rstrip("/").rpartition("/")[2],
+        spec=spec,
+        processor=processor,
+        load_part=partial(_load_part, transformers, spec, name, where),
+        purpose=purpose,
     )
+    return family.source(loaded)
 
 
 def find_transformers_source(
@@ -136,7 +143,7 @@ def find_transformers_source(
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
         return None
     spec = type(network).__name__
-    kind = _find_family(spec, network, spec)
+    family = _find_family(spec, network, spec)
     origin = str(getattr(network, "name_or_path", "") or "")
     where = {"local_files_only": True}
     processor = None
@@ -144,8 +151,15 @@ def find_transformers_source(
         # it may not be there any more
         with suppress(errors.ModelError), report_library_errors(spec, ""):
             processor = load_processor(transformers, origin, where)
-    part = partial(_load_part, transformers, spec, origin, where)
-    return kind.source(LoadedNetwork(network, spec, spec, processor, part, purpose))
+    loaded = LoadedNetwork(
+        network=network,
+        name=spec,
+        spec=spec,
+        processor=processor,
+        load_part=partial(_load_part, transformers, spec, origin, where),
+        purpose=purpose,
+    )
+    return family.source(loaded)
 
 
 def _load_part(
@@ -199,9 +213,9 @@ def _load_config(
     Raises:
         ModelError: it is a repository of open_clip, or cannot be found.
     """
-    has = partial(find_cached_file, transformers, name, where=where)
+    find_file = partial(find_cached_file, transformers, name, where=where)
     try:
-        if not has("config.json") and has("open_clip_config.json"):
+        if not find_file("config.json") and find_file("open_clip_config.json"):
             raise errors.ModelError(
                 f"model {spec}: is a repository of open_clip, which transformers can't "
                 "read; give the network as "
@@ -309,8 +323,7 @@ def _run_detector(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
     classes) in [0, 1], without suppression.
 
     Networks whose last class means no object choose one class for each box (Carion et
-    al.
-    2020); the others score each class independently.
+    al. 2020); the others score each class independently.
     """
     returned = network(pixel_values=images)
     boxes = to_pixel_corners(returned.pred_boxes, images)
@@ -331,13 +344,15 @@ def _make_named_source(
 
 
 class _FrameProcessor:
-    """A processor of videos as one of images, each of which is a video of one frame."""
+    """A processor of videos that is called on one image, a video of one frame."""
 
     def __init__(self, processor: Any) -> None:
         self.processor = processor
 
-    def __call__(self, images: Any, **more: Any) -> Mapping[str, Any]:
-        return {"pixel_values": self.processor([images], **more)["pixel_values"][0]}
+    def __call__(self, images: Any, **settings: Any) -> Mapping[str, Any]:
+        """Process an image as the only frame of a video."""
+        video = self.processor([images], **settings)["pixel_values"]
+        return {"pixel_values": video[0]}
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.processor, name)

@@ -70,6 +70,7 @@ from advsearch.runs.results import (
     VariedValue,
 )
 from advsearch.runs.summary import write_configuration
+from advsearch.runs.twins import find_twin_evidence
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import Task, mean
 from advsearch.tasks.detection import Detection
@@ -93,6 +94,7 @@ def make_result(
     printable: bool,
     command_line: str | None,
     python_only: list[str],
+    twins: str | None = None,
 ) -> AttackResult:
     """Make the result of an attack, and store it with its images in the run, if any.
 
@@ -108,6 +110,7 @@ def make_result(
         printable: whether the search had print terms.
         command_line: repeats the attack; None if no command does.
         python_only: its parts that exist only in Python.
+        twins: a run of twins, which states how far the verdict holds.
     """
     problem = journal.problem
     search = findings.search
@@ -144,6 +147,14 @@ def make_result(
         seconds={**stages.seconds, "total": stages.total},
         command_line=command_line,
         python_only=python_only,
+        twins=find_twin_evidence(
+            twins,
+            model=problem.model.name,
+            task=problem.task.title,
+            object_name=object_name,
+            environment=problem.environment,
+            in_photograph=is_in_photograph(problem),
+        ),
     )
     if run is not None:
         write_result(run, summary)
@@ -159,6 +170,12 @@ def make_result(
         search,
         in_memory=tuple(journal.rows),
     )
+
+
+def is_in_photograph(problem: Problem) -> bool:
+    """Return whether the scene is rendered into a photograph."""
+    description, _ = problem.renderer.scene.definition
+    return description.backdrop_photograph is not None
 
 
 def _write_files(

@@ -53,6 +53,7 @@ from advsearch.questions.attack.stages import (
 )
 from advsearch.report.wording import format_count
 from advsearch.runs.directory import RunDirectory, check_free
+from advsearch.runs.twins import read_twins
 from advsearch.tasks import get_task_function
 
 PREPARING = "preparing the scene for rendering"
@@ -103,6 +104,8 @@ def run_attack(
         InputError: parts do not fit together, or the run that is continued has others.
     """
     config = parts.config
+    if config.twins is not None:
+        read_twins(config.twins)
     model, loading_notes = parts.model_and_warnings
     with ExitStack() as stack:
         run = None
@@ -138,6 +141,7 @@ def run_attack(
             printable=config.printable,
             command_line=config.command_line(None if run is None else run.path),
             python_only=config.python_only,
+            twins=config.twins,
         )
         # without the matrix of light transport, which may be large
         stored_parts = replace(parts, clean_matrix=CleanMatrix())

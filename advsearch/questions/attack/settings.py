@@ -49,6 +49,7 @@ class AttackConfig(DerivativeConfig):
         "log",
         "workers",
         "cluster",
+        "twins",
     )
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
@@ -337,6 +338,15 @@ class AttackConfig(DerivativeConfig):
         le=100_000,
     )
 
+    twins: str | None = setting(
+        None,
+        "verification",
+        "a run of twins, which states how far the verdict holds for photographs",
+        "the name or the folder of a run of twins",
+        metavar="RUN",
+        otherwise="nothing is stated",
+        min_length=1,
+    )
     workers: int | None = setting(
         None,
         "run",

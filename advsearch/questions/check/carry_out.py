@@ -186,9 +186,10 @@ class GradientCheck:
 
     def _report_row(self, row: CheckedRow) -> None:
         """Report a measurement."""
-        value = f"{row.value:.3g}"
         if row.cosine is not None:
             value = f"cosine {row.cosine:.2f}"
+        else:
+            value = f"{row.value:.3g}"
         self.progress.message(
             f"{row.object}, {row.name} by {row.estimator}: {value}, {row.status}"
         )

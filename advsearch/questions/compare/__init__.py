@@ -66,6 +66,7 @@ class CompareConfig(SweepConfig):
         "fps",
         "must_change",
         "must_not_change",
+        "twins",
     )
 
     # fmt: off

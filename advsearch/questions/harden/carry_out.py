@@ -294,11 +294,11 @@ class Hardening:
         for control, number in found:
             self._record(measurement, control, number, True)
 
-        times = scenes.STRONGER_STEPS_FACTOR if usual else 1
+        steps_factor = scenes.STRONGER_STEPS_FACTOR if usual else 1
         jobs = [
             partial(
                 SceneJobs.attack_held_out,
-                times=times,
+                steps_factor=steps_factor,
                 weights=weights,
                 control=control,
                 number=number,
@@ -324,7 +324,9 @@ class Hardening:
             success=is_wrong,
         )
 
-    def _robust(self, measurement: str, controls: Collection[str]) -> list[bool] | None:
+    def _find_robust(
+        self, measurement: str, controls: Collection[str]
+    ) -> list[bool] | None:
         """Return whether each scene withstood the searches over all of some controls.
 
         None if some are not measured yet.
@@ -346,13 +348,13 @@ class Hardening:
         """Return the result of the run, as far as it is measured."""
         config = self.config
         is_done = context.ending == "done"
-        if is_done and self.rounds.best == 0:
+        if is_done and self.rounds.best == 0:  # the network before all rounds
             text = (
                 "No round kept the clean accuracy, so the weights are the model's own."
             )
             warnings = [*warnings, text]
-        before = self._robust("before", config.controls)
-        after = self._robust("after", config.controls)
+        before = self._find_robust("before", config.controls)
+        after = self._find_robust("after", config.controls)
         rounds = [
             training_round.model_copy(
                 update={"kept": is_done and number == self.rounds.best}
@@ -369,15 +371,15 @@ class Hardening:
             objects=list(training_split.objects),
             before=make_share(before),
             after=make_share(after),
-            clean_before=self._clean_share("before"),
-            clean_after=self._clean_share("after"),
-            table=self._control_rows(),
-            split=self._split_rows(),
+            clean_before=self._make_clean_share("before"),
+            clean_after=self._make_clean_share("after"),
+            table=self._make_control_rows(),
+            split=self._make_split_rows(),
             rounds=rounds,
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search="portfolio of pgd with restarts, cmaes and random, "
             f"{scenes.STRONGER_STEPS_FACTOR * config.steps} steps",
-            hardened=self._hardened_name() if is_done else None,
+            hardened=self._make_hardened_name() if is_done else None,
             weights=str(weights_path) if is_done else None,
             pictures=str(self.run.path / IMAGE_DIRECTORY) if is_done else None,
             shared=results.SharedWork.of_facts(facts, facts.machines if facts else {}),
@@ -385,24 +387,27 @@ class Hardening:
             seconds=context.stages.seconds,
         )
 
-    def _clean_share(self, when: str) -> Share | None:
+    def _make_clean_share(self, when: str) -> Share | None:
+        """Return the fraction of right plain images "before" or "after"; None if it is
+        not measured.
+        """
         return make_share(
             self.clean_is_right.get(when), scenes.CLEAN_VIEWS, self.outcomes.get(when)
         )
 
-    def _control_rows(self) -> list[HardenedControl]:
+    def _make_control_rows(self) -> list[HardenedControl]:
         """Return the robustness to each control that is measured."""
         rows = []
         for control in self.config.controls:
             shares = {
-                measurement: make_share(self._robust(measurement, [control]))
+                measurement: make_share(self._find_robust(measurement, [control]))
                 for measurement in MEASUREMENTS
             }
             if None not in shares.values():
                 rows.append(HardenedControl.of({"control": control, **shares}))
         return rows
 
-    def _split_rows(self) -> dict[str, SplitSide]:
+    def _make_split_rows(self) -> dict[str, SplitSide]:
         """Describe the parts of the split."""
         training_views, validation_views = self.trainer.n_views
         n_views = {
@@ -418,7 +423,7 @@ class Hardening:
             for name, split in self.scenes.splits.items()
         }
 
-    def _hardened_name(self) -> str | None:
+    def _make_hardened_name(self) -> str | None:
         """Return the name that loads the hardened model; None if no name can."""
         name = self.config.model.partition("@")[0].strip()
         # A name with a colon is of code that makes the model.

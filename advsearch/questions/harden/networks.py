@@ -181,6 +181,7 @@ class Augmentation:
         scale = _uniform(
             self.smallest_crop, self.largest_crop, count, generator=generator
         )
+        # in the coordinates of `affine_grid`, in which the image extends from -1 to 1
         shift = _uniform(-1.0, 1.0, count, 2, generator=generator).view(2, count)
         shift = shift * (1.0 - scale).abs()
         mirror = 1.0 - 2.0 * _choose(self.flip, count, generator).float()
@@ -259,5 +260,5 @@ def _uniform(lower: float, upper: float, *shape: int, generator: Generator) -> T
 
 
 def _choose(probability: float, count: int, generator: Generator) -> Tensor:
-    """Return a random mask (count,)."""
+    """Return a mask (count,) whose values are each true with a probability."""
     return torch.rand(count, generator=generator) < probability

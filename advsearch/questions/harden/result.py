@@ -65,6 +65,7 @@ class HardenConfig(AttackConfig):
         "minimise", "over", "draws", "path", "shutter", "rolling", "average",
         "baseline", "seconds", "camera", "up", "facing", "size", "unit", "label",
         "measure", "estimators", "things", "judge", "backdrop", "occluder",
+        "twins",
     )
 
     object: str = setting_as_in(
@@ -268,6 +269,7 @@ class HardenResult(views.InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
+        """How many scenes are robust after and before; empty if that is unknown."""
         if self.before is None or self.after is None:
             return ""
         return (

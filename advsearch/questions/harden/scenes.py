@@ -152,7 +152,12 @@ class SceneJobs:
         )
 
     def attack_held_out(
-        self, *, control: str, number: int, times: int, weights: bytes | None = None
+        self,
+        *,
+        control: str,
+        number: int,
+        steps_factor: int,
+        weights: bytes | None = None,
     ) -> str:
         """Attack a held-out scene, and return the status of the attack.
 
@@ -162,7 +167,8 @@ class SceneJobs:
         Args:
             control: that is searched.
             number: of the scene.
-            times: multiple of the usual steps; more than one is the stronger search.
+            steps_factor: multiple of the usual steps; more than one is the stronger
+                search.
             weights: of the model, safetensors; None for the original ones.
         """
         name, scene = self.splits[HELD_OUT].load_scene(
@@ -170,8 +176,11 @@ class SceneJobs:
         )
         seed = seeds.stream(self.config.seed, f"measured {control}", number)
         search: dict[str, Any] = {}
-        if times > 1:
-            search = {"policy": STRONGER_POLICY, "steps": times * self.config.steps}
+        if steps_factor > 1:
+            search = {
+                "policy": STRONGER_POLICY,
+                "steps": steps_factor * self.config.steps,
+            }
         config = self.make_attack_config((control,), name, seed=seed, **search)
         model = self.model if weights is None else self.with_weights(weights)
         return attack_scene(config, scene, model)

@@ -42,6 +42,7 @@ class PhotographPages:
 
     @cached_property
     def _photographs(self) -> Any:
+        """What evaluates photographs: the injected object, or one of the package."""
         if self._injected is not None:
             return self._injected
         # The import takes seconds.

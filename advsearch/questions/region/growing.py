@@ -405,7 +405,7 @@ def draw_map(
 def find_ranges(
     problem: Problem, varied: VariedParameters, box: Sequence[BoxSide]
 ) -> list[AxisRange]:
-    """Return the full range of each parameter, in its unit if it has one."""
+    """Return the full range of each of two parameters, in its unit if it has one."""
     low_values = problem.describe(varied.with_values(torch.full((2,), 0.0)))
     high_values = problem.describe(varied.with_values(torch.full((2,), 1.0)))
     ranges = []

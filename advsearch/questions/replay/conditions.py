@@ -38,7 +38,7 @@ from advsearch.questions.replay.result import (
 )
 
 AttackResult = workbench.AttackResult
-Watched = workbench.ProgressOption
+ProgressOption = workbench.ProgressOption
 
 AS_VERIFIED = "as verified"
 """Name of the condition that changes nothing."""
@@ -317,7 +317,10 @@ def model_condition(
 
 @workbench.with_settings_signature(ReplayConfig)
 def replay(
-    attack: str | Path | AttackResult, *, progress: Watched = None, **options: Any
+    attack: str | Path | AttackResult,
+    *,
+    progress: ProgressOption = None,
+    **options: Any,
 ) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions (docs/questions.md).
 

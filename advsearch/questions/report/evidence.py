@@ -423,6 +423,7 @@ def _fixed_domain(
     things = (str(getattr(result, "object", "") or ""), join_values(recorded, "things"))
     fixed["road users and things"].append("; ".join(filter(None, things)))
     fixed["camera and picture"].append(join_values(recorded, "camera"))
+    fixed["camera and picture"].append(join_values(recorded, "backdrop"))
     # each value once
     values = dict[tuple[str, str], None]()
     for run_settings in recorded:
@@ -803,6 +804,7 @@ def collect_evidence(
     criterion: float | None = None,
     exposure: Exposure | None = None,
     by: str = "",
+    twins: str | None = None,
 ) -> tuple[Evidence, dict[str, bytes]]:
     """Return runs as evidence, with the pictures that it names.
 
@@ -811,13 +813,14 @@ def collect_evidence(
         criterion: minimum fraction of right predictions.
         exposure: weights of values by axis.
         by: who is responsible for the evidence.
+        twins: a run of twins; None: those that the runs themselves named.
     """
     evidence_runs = list[EvidenceRun]()
     pictures = dict[str, bytes]()
     for number, folder in enumerate(_list_folders(runs), 1):
         run_pictures = _read_pictures(folder, number)
         pictures |= run_pictures
-        run = _make_evidence_run(folder, criterion, exposure or {})
+        run = _make_evidence_run(folder, criterion, exposure or {}, twins)
         update = {"pictures": list(run_pictures), "begun": _format_start(folder)}
         evidence_runs.append(run.model_copy(update=update))
     known_axes = {row.axis for run in evidence_runs for row in run.conditions}
@@ -885,7 +888,7 @@ def _compare_models(runs: Sequence[EvidenceRun]) -> list[str]:
 
 
 def _make_evidence_run(
-    folder: Path, criterion: float | None, exposure: Exposure
+    folder: Path, criterion: float | None, exposure: Exposure, twins: str | None
 ) -> EvidenceRun:
     """Return a run as evidence; a run without a summary claims nothing."""
     if not (folder / directory.summary.NAME).is_file():
@@ -910,11 +913,37 @@ def _make_evidence_run(
             "exposure": weighted,
             "conditions": conditions,
             "photographs": count_conditions(result, photo_rows),
+            "twins": _find_twins(folder, result, twins),
             "domain": {name: part.text for name, part in domain.items()},
             "not_shown": _describe_limits(
                 claims_of_photographs, domain, is_weighted=bool(weighted)
             ),
         }
+    )
+
+
+def _find_twins(
+    folder: Path, result: results.Result, twins: str | None
+) -> results.TwinEvidence | None:
+    """Return how far a run's verdict holds for photographs; None if nobody states it.
+
+    Args:
+        folder: of the run.
+        result: of the run.
+        twins: a run of twins; None for that which the run named.
+    """
+    stored: results.TwinEvidence | None = getattr(result, "twins", None)
+    if twins is None or not hasattr(result, "model"):
+        return stored
+    from advsearch.extend import workbench  # it brings torch, which takes a second
+
+    return workbench.find_twin_evidence(
+        twins,
+        model=str(getattr(result, "model", "")),
+        task=str(getattr(result, "task", "classification")),
+        object_name=str(getattr(result, "object", "")),
+        environment=str(getattr(result, "environment", "")),
+        in_photograph=bool(read_run_settings(folder).get("backdrop")),
     )
 
 

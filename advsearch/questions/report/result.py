@@ -54,6 +54,9 @@ class EvidenceRun(results.Fields):
                         "that they were aligned with, by "
         "each value of each axis; absent without"
     )  # fmt: skip
+    twins: results.TwinEvidence | None = results.optional_field(
+        "how far the verdict holds for photographs, by a run of twins; absent without"
+    )
     domain: dict[str, str] = Field(
         {}, description="the operational design domain in words, by its parts"
     )
@@ -169,7 +172,9 @@ def make_sections(run: EvidenceRun) -> dict[str, list[str]]:
     versions = list_facts(run.made_with)
     if run.begun:
         versions.insert(0, f"begun: {run.begun}")
+    twins = [] if run.twins is None else [wording.format_twin_evidence(run.twins)]
     lines_of_title = {
+        "Photographs": twins,
         "Criterion": run.criterion,
         "Triggering conditions": run.triggering,
         "Exposure": run.exposure,

@@ -301,6 +301,7 @@ def register_case(
     """
 
     def register(measure: Callable[[], Outcome]) -> Callable[[], Outcome]:
+        """Append the case of a function, and return the function itself."""
         first_paragraph, _, _ = (measure.__doc__ or "").partition("\n\n")
         requirement = " ".join(first_paragraph.split())
         ALL_CASES.append(

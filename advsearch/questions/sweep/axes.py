@@ -375,12 +375,12 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
 
 
 def _check_count(where: str, count: int) -> None:
+    """Check that an axis does not have too many values."""
     if count > MAX_AXIS_VALUES:
         raise InputError(
             f"{where}: expected at most {MAX_AXIS_VALUES} values on an axis, got "
-            f"{count}; "
-            "draw the parameter by chance "
-            "instead, with `controls` and `samples`"
+            f"{count}; draw the parameter by chance instead, with `controls` and "
+            "`samples`"
         )
 
 

@@ -57,6 +57,7 @@ from advsearch.runs.directory import (
 )
 from advsearch.runs.listing import is_finished
 from advsearch.runs.summary import read_configuration
+from advsearch.runs.twins import read_twins
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.formation import parse_aovs
 from advsearch.scene.things import ALL_THINGS
@@ -384,6 +385,8 @@ def _run_config(
     context: Any = nullcontext(resumed)
     if config.run is not None and resumed is None:
         context = create_before_work(config)
+    if config.twins is not None:
+        read_twins(config.twins)
     with context as directory:
         named_scenes = scenes or load_scenes(config)
         job = _make_job(
@@ -432,6 +435,8 @@ def sweep_from_config(
     """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
+    if config.twins is not None:
+        read_twins(config.twins)
     progress = progress or NullProgress()
     progress.stage(LOADING)
     return _run_in_directory(config, load_job(config), progress, resumed)
@@ -693,11 +698,11 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
 
 
 def _check_different(names: Sequence[str]) -> None:
+    """Check that no two models have the same name: results are listed by it."""
     if len(set(names)) < len(names):
         raise InputError(
             f"model: expected models with different names, got {', '.join(names)}; "
-            "from Python, "
-            "load_model(..., name=...) gives one"
+            "from Python, load_model(..., name=...) gives one"
         )
 
 

@@ -676,6 +676,7 @@ def _drive_row_text(name: str, mean: str, interval: str, worst: str) -> str:
 
 
 def _accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
+    """Return the extent of the claim that predictions are right."""
     return make_extent(
         description,
         counts.correct,
@@ -1047,6 +1048,7 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
 
 
 def _dip_clause(dip: Dip, unit: str) -> str:
+    """Compare in words the images at a dip with those at larger distances."""
     n_right, n_images = dip.counts
     at_dip = f"{n_right} of {n_images} at {dip.distance:.3g} {unit}"
     n_right_beyond, n_images_beyond = dip.counts_beyond

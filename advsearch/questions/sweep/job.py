@@ -704,6 +704,7 @@ class SweptScene:
         return torch.stack(list(map(round_to_8_bit, rendered)))
 
     def _make_renderer(self, size: ImageSize) -> Renderer:
+        """Make a renderer of the scene's images at a size."""
         config = self.job.config
         description = fit_camera(self.job.scenes[self.number].scene.description, size)
         return make_renderer(

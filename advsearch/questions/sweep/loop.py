@@ -79,6 +79,7 @@ from advsearch.runs.results import (
 )
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES_NOTE, UNITS_NOTE
+from advsearch.runs.twins import find_twin_evidence
 from advsearch.statistics.clustered import max_lower_bound
 from advsearch.tasks import Judgement
 from advsearch.trust.writing import write_bytes
@@ -599,6 +600,14 @@ class Sweep:
             warnings=[*job.warnings, *self._remarks(predictions, verified, changes)],
             command_line=config.command_line(path),
             python_only=config.python_only,
+            twins=find_twin_evidence(
+                config.twins,
+                model=",".join(_get_names(job.models)),
+                task=config.task_name,
+                object_name=config.object,
+                environment=self.points.environment or config.environment_name,
+                in_photograph=getattr(config, "backdrop", None) is not None,
+            ),
         )
 
     def _describe_formation(self) -> tuple[Formation | None, dict[str, float]]:

@@ -531,6 +531,7 @@ class SweepPredictor:
             return self.problem.judge(round_to_8_bit(image), u).margin
 
         def view(check: int) -> ComparedView:
+            """Compare the prediction of a random configuration of the group."""
             index = seeds.stream(seed, "check", check) % self._groups.group_size
             u = self._configuration(number, index)
             (predicted,) = predictor.predict_images([u])

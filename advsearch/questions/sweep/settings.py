@@ -54,6 +54,7 @@ class SweepConfig(SceneConfig):
         "workers",
         "cluster",
         "log",
+        "twins",
     )
     list_settings: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
     clashes: ClassVar[tuple[Clash, ...]] = (
@@ -231,6 +232,7 @@ class SweepConfig(SceneConfig):
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(
         AttackConfig, "log"
     )
+    twins: str | None = setting_as_in(AttackConfig, "twins")
     workers: int | None = setting_as_in(
         AttackConfig,
         "workers",

@@ -82,6 +82,8 @@ def try_suite(
     start = time.perf_counter()
     config = context.config
     context.progress.stage("reading the suite")
+    if config.twins is not None:
+        workbench.read_twins(config.twins)
     loaded_suite = _read_noted_suite(context.resumed) or suite or _read_suite(config)
     added = None
     if config.add is not None:
@@ -333,6 +335,18 @@ class _SuiteRun:
             seed=tester.suite.seed,
             command_line=self._repeat_command(),
             python_only=config.python_only,
+            twins=self._find_twins(configs),
+        )
+
+    def _find_twins(self, configs: Sequence[SceneConfig]) -> Any:
+        """Return what a run of twins measured for the claims; None without one."""
+        config = self.tester.config
+        return workbench.find_twin_evidence(
+            config.twins,
+            model=_join_distinct(claim.model for claim in configs),
+            task=_join_distinct(claim.task_name for claim in configs),
+            object_name=_join_distinct(claim.object for claim in configs),
+            environment=_join_distinct(claim.environment_name for claim in configs),
         )
 
 

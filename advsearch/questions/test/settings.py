@@ -32,6 +32,7 @@ class SuiteConfig(Config):
     command: ClassVar[str] = "test"
     free: ClassVar[tuple[str, ...]] = (
         *Config.free, "seconds", "workers", "cluster", "junit", "sarif", "markdown", "update",
+        "twins",
     )
     clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *SceneConfig.clashes,
@@ -94,6 +95,7 @@ class SuiteConfig(Config):
                                              "of each claim"
     )
     cluster: str | None = setting_as_in(AttackConfig, "cluster")
+    twins: str | None = setting_as_in(AttackConfig, "twins", group="test")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/SUITE-test-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
     # fmt: on

@@ -368,6 +368,10 @@ class Notes:
 
     A thing in a file is a kind (a word of the format: ``"property"``, ``"keyword"``)
     and its name. Each warning is given once.
+
+    Attributes:
+        path: of the file, for errors.
+        source: what it is called in warnings: its name without the folder.
     """
 
     def __init__(self, path: Path | str) -> None:

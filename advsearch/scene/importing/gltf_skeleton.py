@@ -426,6 +426,7 @@ def _read_clips(
     moving_nodes = with_ancestors(header.parents, {*target_counts, *joints})
 
     def moves_geometry(channel: Channel) -> bool:
+        """Return whether a channel sets something that moves geometry, see above."""
         node = channel.target.node
         path = channel.target.path
         if node is None or path not in VALUE_WIDTHS:  # it is of an extension

@@ -321,9 +321,10 @@ class MtlReader:
             for key in material.statements
             if not any(parse_numbers(material.peek_argument(key)) or [1.0])
         }
-        base = parse_map(without_comment(material.statements.get("map_kd", "")))
+        base_map = parse_map(without_comment(material.statements.get("map_kd", "")))
 
         def is_quiet(key: str, statement: str) -> bool:
+            """Return whether a statement changes nothing."""
             rest = without_comment(statement)
             if not rest or key in IGNORED_KEYWORDS or key in zero_keys:
                 return True
@@ -333,7 +334,11 @@ class MtlReader:
                 return len(set(rest.split())) == 1
             if key == "map_ka":
                 use = parse_map(rest)
-                return use is not None and base is not None and use.name == base.name
+                return (
+                    use is not None
+                    and base_map is not None
+                    and use.name == base_map.name
+                )
             return False
 
         for key in material.overridden:

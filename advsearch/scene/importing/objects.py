@@ -370,10 +370,12 @@ def _make_mesh(
     from advsearch.scene.rigged import SkeletonRig
 
     movable_parts = [part.movable for part in parts if part.movable is not None]
-    size = compute_extent(parts) * float(
-        np.ptp(mesh.vertices.astype(np.float64), axis=0).max()
+    # The soup was divided by the first extent, the mesh is divided by the second.
+    soup_extent = compute_extent(parts)
+    mesh_extent = float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max())
+    rig = SkeletonRig(
+        movable_parts, stored_vertices, turn / (soup_extent * mesh_extent)
     )
-    rig = SkeletonRig(movable_parts, stored_vertices, turn / size)
     return replace(normalised_mesh, rig=rig)
 
 

@@ -144,7 +144,9 @@ def _texture_plain(
     else:
         soup_with_uvs = unwrap(soup, material)
     color = _make_plain_map(soup_with_uvs, surface)
-    return soup_with_uvs, SurfaceMaps(color, None, surface.emission)
+    return soup_with_uvs, SurfaceMaps(
+        color=color, normals=None, emission=surface.emission
+    )
 
 
 def _texture_with_images(

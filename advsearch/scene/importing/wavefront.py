@@ -693,8 +693,9 @@ def _count_words(data: Bytes) -> IntArray:
 def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntArray:
     """Return the column of each number in its corner, by the slashes before it.
 
-    It is how many slashes there are from the corner's first number on: the sum of its
-    own step and those of up to two predecessors, as a corner has three numbers at most.
+    In ``7//5`` the 7 is in column 0 and the 5, after two slashes, in column 2. As a
+    corner has three numbers at most, that is the sum of the slashes before a number and
+    before up to two predecessors in its corner.
 
     Args:
         is_first: whether a number is the first of its corner.

@@ -71,8 +71,10 @@ def denoise(
         return (output / gain).to(radiance.device)
 
 
-# pixels around what changes in which the denoised change is faded out
+# The denoised change is faded out where the mean relative change within so many pixels
+# is less than this, half of one of 255 levels.
 FADE_RADIUS = 8
+MIN_CHANGE = 0.004
 FILL_RADIUS = 3  # pixels over which the plane is continued below the object
 FILL_WEIGHT = 0.05  # of what is filled in, where the plane covers a pixel fully
 
@@ -97,8 +99,10 @@ def denoise_image(
     color = rendered[..., :3].contiguous()
     channels = [denoise(color, albedo, normal, quick=quick), rendered[..., 3:4]]
     if plane_radiance is not None:
+        is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
         channels.append(
             plane_radiance
+            * is_surface
             * _denoise_shade(
                 rendered[..., 4:] / plane_radiance,
                 (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0),
@@ -127,11 +131,8 @@ def _denoise_shade(
     filled = both[..., :3] / both[..., 3:].clamp_min(1e-4)
     full_change = (change + FILL_WEIGHT * filled) / (visible + FILL_WEIGHT)
     clean = remove_noise((1.0 + full_change).clamp_min(0.0).contiguous()) - 1.0
-    is_changed = (change != 0.0).any(dim=-1, keepdim=True).float()
-    near = torch.nn.functional.max_pool2d(
-        is_changed.permute(2, 0, 1)[None], 2 * FADE_RADIUS + 1, 1, FADE_RADIUS
-    )[0].permute(1, 2, 0)
-    return clean * visible * _average(near, FADE_RADIUS)
+    magnitude = _average(change.abs().mean(dim=-1, keepdim=True), FADE_RADIUS)
+    return clean * visible * (magnitude / MIN_CHANGE).clamp_max(1.0)
 
 
 def _average(image: Tensor, radius: int) -> Tensor:

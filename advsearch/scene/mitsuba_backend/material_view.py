@@ -390,8 +390,8 @@ def compute_outline_term(
         strength = dr.select(is_visible & dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
     # Outside of `suspend_grad`: from here on it is differentiated by the vertices.
-    point_behind, _, _, moves = view.attach_hit(hit)
-    film_behind = dr.select(moves, view.camera.project(point_behind), 0.0)
+    point_behind, _, _, moves_behind = view.attach_hit(hit)
+    film_behind = dr.select(moves_behind, view.camera.project(point_behind), 0.0)
     speed = dr.dot(film_normal, edge_film - film_behind)
     return dr.sum(strength * speed) * -sampled.pixels_per_sample
 
@@ -578,46 +578,76 @@ def compute_shadow_term(
     sampled = _sample_tangents(mesh, random)
     if sampled is None:
         return mi.Float(0)
-    ends = sampled.ends
-    fraction = sampled.fraction
-    direction = sampled.direction
+    with dr.suspend_grad():
+        shadow = _sample_shadow_borders(view, mesh, sampled, stream)
+    if shadow is None:
+        return mi.Float(0)
+    lit_point, _, _, lit_point_moves = view.attach_hit(shadow.hit)
+    # of the angle between each line and its edge
+    sine = torch.linalg.cross(
+        sampled.direction, _compute_edge_directions(mesh.vertices, sampled.ends)
+    ).norm(dim=1)
+    edge_point = mesh.interpolate_edge(
+        sampled.ends[shadow.sample_index], sampled.fraction[shadow.sample_index]
+    )
+    speed = dr.dot(
+        shadow.edge_normal, edge_point - dr.select(lit_point_moves, lit_point, 0.0)
+    )
+    return (
+        dr.sum(shadow.strength * to_drjit_float(sine[shadow.sample_index]) * speed)
+        * -sampled.measure_per_sample
+    )
+
+
+class _ShadowBorders(NamedTuple):
+    """Points of shadows' borders that the camera sees, of some of the samples."""
+
+    sample_index: Tensor  # (m,)
+    hit: Any  # the lit point, where the line past the edge ends
+    edge_normal: Any  # unit vector, away from the mesh at the edge
+    strength: Any  # how the light that passes the edge counts in the image
+
+
+def _sample_shadow_borders(
+    view: FilmView, mesh: TriMesh, sampled: _TangentSamples, stream: int
+) -> _ShadowBorders | None:
+    """Return where lines that touch a mesh end in lit points; None if none does.
+
+    Arguments are those of `compute_shadow_term`.
+    """
     edge_points = torch.lerp(
-        mesh.vertices[ends[:, 0]], mesh.vertices[ends[:, 1]], fraction[:, None]
+        mesh.vertices[sampled.ends[:, 0]],
+        mesh.vertices[sampled.ends[:, 1]],
+        sampled.fraction[:, None],
     )
     edge_position = to_drjit_vectors(mi.Point3f, edge_points)
-    light_direction = to_drjit_vectors(mi.Vector3f, direction)
+    light_direction = to_drjit_vectors(mi.Vector3f, sampled.direction)
     edge_normal = to_drjit_vectors(mi.Vector3f, sampled.normal)
     offset = SHADOW_OFFSET * mesh.extent * edge_normal
-    with dr.suspend_grad():
-        # The line goes on from just past the edge, with the light, to the lit point.
-        ray = mi.Ray3f(edge_position + offset, -light_direction)
-        hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
-        lit = _eval_lit_points(view, si, light_direction)
-        dr.eval(lit, hit, si, edge_position, offset)
-        # Most lines end where the camera sees nothing: what follows is for the others.
-        lit_index = dr.compress(dr.any(lit != 0.0))
-        if dr.width(lit_index) == 0:
-            return mi.Float(0)
-        lit, hit, si, edge_position, offset, edge_normal = (
-            dr.gather(type(value), value, lit_index)
-            for value in (lit, hit, si, edge_position, offset, edge_normal)
-        )
-        strength = dr.sum(
-            lit * _sample_radiance_difference(view, si, edge_position, offset, stream)
-        )
-        strength = dr.select(dr.isfinite(strength), strength, 0.0)
-        dr.eval(strength, hit)
-    sample_index = lit_index.torch().to("cpu", torch.int64)
-    lit_point, _, _, moves = view.attach_hit(hit)
-    sine = torch.linalg.cross(
-        direction, _compute_edge_directions(mesh.vertices, ends)
-    ).norm(dim=1)
-    edge_point = mesh.interpolate_edge(ends[sample_index], fraction[sample_index])
-    speed = dr.dot(edge_normal, edge_point - dr.select(moves, lit_point, 0.0))
-    return (
-        dr.sum(strength * to_drjit_float(sine[sample_index]) * speed)
-        * -sampled.measure_per_sample
+    # The line goes on from just past the edge, with the light, to the lit point.
+    ray = mi.Ray3f(edge_position + offset, -light_direction)
+    hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
+    lit = _eval_lit_points(view, si, light_direction)
+    dr.eval(lit, hit, si, edge_position, offset)
+    # Most lines end where the camera sees nothing: what follows is for the others.
+    lit_index = dr.compress(dr.any(lit != 0.0))
+    if dr.width(lit_index) == 0:
+        return None
+    lit, hit, si, edge_position, offset, edge_normal = (
+        dr.gather(type(value), value, lit_index)
+        for value in (lit, hit, si, edge_position, offset, edge_normal)
+    )
+    strength = dr.sum(
+        lit * _sample_radiance_difference(view, si, edge_position, offset, stream)
+    )
+    strength = dr.select(dr.isfinite(strength), strength, 0.0)
+    dr.eval(strength, hit)
+    return _ShadowBorders(
+        sample_index=lit_index.torch().to("cpu", torch.int64),
+        hit=hit,
+        edge_normal=edge_normal,
+        strength=strength,
     )
 
 
@@ -810,11 +840,13 @@ def _measure_between_faces(
 ) -> tuple[Tensor, Tensor]:
     """Return where the exterior angles of edges open to (N, 3), and their sizes (N,).
 
-    The directions of an exterior angle are cos(t) along_second + sin(t) opening, with t from 0
-    to the angle: it is pi minus the angle between the faces, and pi at a single face.
+    The directions of an exterior angle are cos(t) along_second + sin(t) opening, with t
+    from 0 to the angle: it is pi minus the angle between the faces, and pi at a single
+    face.
 
     Args:
-        along_first, along_second: (N, 3) unit vectors along both faces, perpendicular to the edge.
+        along_first, along_second: (N, 3) unit vectors along both faces, perpendicular
+            to the edge.
         axis: (N, 3) unit vectors along the edges.
         is_single: (N,) whether an edge has only one face.
     """

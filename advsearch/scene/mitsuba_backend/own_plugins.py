@@ -174,6 +174,12 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
     ) -> Any:
         """Sample paths, or in the adjoint modes replay them and backpropagate.
 
+        Each round of the loop is one event: the path meets a surface, leaves the scene,
+        or is scattered in the haze. β is the throughput up to it, Le its emission, and
+        Lr_dir the light of emitters that it reflects or scatters. L adds them up; in
+        the adjoint modes it begins with the sum, so that what is left of it is the
+        light of later events, and δL is the cotangent.
+
         Arguments and results are those of `mi.ad.integrators.common.RBIntegrator`; the
         names are those of Mitsuba's `prb`.
         """

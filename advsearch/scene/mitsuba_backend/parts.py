@@ -245,7 +245,11 @@ def _make_principled_inputs(name: str) -> list[SceneInput]:
 def _make_light_input(name: str, parameter: str, key: str) -> SceneInput:
     """Return the input of a part's light, a color."""
     return SceneInput(
-        f"{name}.{parameter}", f"{name}.{key}.value", to_color, True, (3,)
+        f"{name}.{parameter}",
+        f"{name}.{key}.value",
+        write=to_color,
+        is_interior=True,
+        shape=(3,),
     )
 
 
@@ -422,10 +426,18 @@ def _translate_haze(part: parts.HazePart) -> Translation:
     population.add(population, media=(medium,))
     inputs = (
         SceneInput(
-            f"{name}.density", f"{name}.sigma_t.value.value", to_flat_array, True, (1,)
+            f"{name}.density",
+            f"{name}.sigma_t.value.value",
+            write=to_flat_array,
+            is_interior=True,
+            shape=(1,),
         ),
         SceneInput(
-            f"{name}.albedo", f"{name}.albedo.value.value", to_color, True, (3,)
+            f"{name}.albedo",
+            f"{name}.albedo.value.value",
+            write=to_color,
+            is_interior=True,
+            shape=(3,),
         ),
     )
     return Translation(

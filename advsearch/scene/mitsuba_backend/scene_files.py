@@ -375,12 +375,13 @@ def _find_surface(
     It is the shape's first entry that is neither a light nor a medium, or Mitsuba's
     default. Raises UnknownNameError: a reference leads nowhere, or round in a circle.
     """
-    count = 0
+    n_plugins = 0
 
     def resolve(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
-        nonlocal count
-        count += 1
-        if count > MAX_PLUGINS:
+        """Return a plugin, which `depth` references lead to, with its own resolved."""
+        nonlocal n_plugins
+        n_plugins += 1
+        if n_plugins > MAX_PLUGINS:
             raise InputError(
                 f"object: expected a surface of at most {MAX_PLUGINS} "
                 "plugins, got more; make it simpler"
@@ -402,7 +403,11 @@ def _find_surface(
 
 
 def _find_radiance(shape: Mapping[str, object]) -> Float32Array | None:
-    """Return the radiance (1, 1, 3) of a shape that emits evenly; None of any other."""
+    """Return the radiance (1, 1, 3) of a shape that emits evenly; None of any other.
+
+    It emits evenly if its light has a constant radiance, of at most `MAX_RADIANCE`, and
+    no other entries.
+    """
     for inner in shape.values():
         if not isinstance(inner, Mapping) or inner["type"] != "area":
             continue

@@ -548,6 +548,7 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
     base: _Color | None = None
 
     def replace_color(plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin whose base color, if it is the first, is stored and replaced."""
         nonlocal base
         key = BASE_COLOR_KEYS.get(str(plugin["type"]))
         if key is not None and base is None:

@@ -593,7 +593,7 @@ def _look_up_bilinear(
 
     Args:
         values: flat array with three numbers for each cell.
-        first: index of the grid's first cell in it.
+        first_cell: index of the grid's first cell in it.
         n_rows, n_columns: of the grid.
         y, x: row and column, integers at the centers of cells.
         wraps: columns go round; otherwise the grid ends at its border.

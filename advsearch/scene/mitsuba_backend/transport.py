@@ -338,6 +338,7 @@ class _FirstHit:
     """What the camera sees first of each path: reflectance and shading normal."""
 
     def __init__(self, count: int) -> None:
+        """Start with black, and no normal, for `count` paths."""
         self.albedo = dr.zeros(mi.Color3f, count)
         self.normal = dr.zeros(mi.Normal3f, count)
 

@@ -329,7 +329,10 @@ def _read_pieces(
             material = _select_material(file.path, header, primitive, variant)
             variant_primitive = primitive.model_copy(update={"material": material})
             piece = read_primitive(
-                file, variant_primitive, header.meshes[mesh].extras, False
+                file,
+                variant_primitive,
+                extras=header.meshes[mesh].extras,
+                is_skinned=False,
             )
             if piece is not None and len(piece.part.faces):
                 pieces[mesh, index] = piece

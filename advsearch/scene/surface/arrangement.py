@@ -461,7 +461,11 @@ class Arrangement:
             return ArrangementLight(torch.cat(side_irradiances), light_maps)
 
     def _find_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
-        """Return the visible cosines (n, k) towards what is hot; None if nothing is."""
+        """Return the visible cosines (n, k) towards what is hot; None if nothing is.
+
+        Its k directions are sampled where the map is far brighter than its mean, see
+        `texels.HOT_FACTOR`. The cosine is 0 where something hides one.
+        """
         hot_directions = sky.hot[0]
         if not len(hot_directions):
             return None

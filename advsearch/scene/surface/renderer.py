@@ -72,7 +72,7 @@ class MapFingerprint:
         None if it differs in more than that.
         """
         if self.texels.shape != other.texels.shape or not torch.allclose(
-            self.texels, other.texels, 1e-5, 1e-6
+            self.texels, other.texels, rtol=1e-5, atol=1e-6
         ):
             return None
         return torch.where(self.mean > 0.0, other.mean / self.mean, 1.0)

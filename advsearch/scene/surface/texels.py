@@ -207,6 +207,7 @@ def _weigh_neighbours(
         offset = texels.positions[texel] - points
         distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
         cosine = (texels.normals[texel] * normals).sum(axis=1)
+        # a neighbour that faces elsewhere, round an edge, has other light
         similarity = np.clip(cosine, 0.0, 1.0) ** 8
         weight = np.exp(-grid_distance - distance) * similarity
         is_used = (texel >= 0) & ~buried[texel]

@@ -341,6 +341,7 @@ class LightBasis:
         # In the inputs of a light all others are dark.
         dark = {name: torch.zeros_like(value) for name, value in values.items()}
         changed_names = lighting.changed_inputs
+        # The patterns of projectors are in the first light, whether they change or not.
         fixed_values = {
             name: value
             for name, value in values.items()
@@ -349,6 +350,7 @@ class LightBasis:
         }
         self._lamps = sorted(changed_names & names - {ENVIRONMENT_INPUT})
         changes_environment = ENVIRONMENT_INPUT in changed_names
+        # Without any light at all there is one, which is dark.
         self._has_fixed_light = bool(fixed_values) or not (
             self._lamps or changes_environment
         )
@@ -402,6 +404,9 @@ class BasisRenderer(Predictor):
         traced, seed, tick: as for `LinearRenderer`.
         u: (d,) configuration; what does not change is as it is there.
         changing: what changes; None finds it.
+
+    Attributes:
+        non_finite: numbers that were not finite, and were replaced by 0.
     """
 
     def __init__(

@@ -92,6 +92,9 @@ class ColoredRows:
         rows, columns: its size.
         small: store it in 16 bits per fraction, and as many per column where there are
             no more than 65,536, and unpack it for each product.
+
+    Attributes:
+        entries: how many fractions are stored.
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
@@ -488,6 +491,10 @@ class LinearRenderer(Predictor):
         collected: what was collected elsewhere with the same arguments; then nothing is
             traced.
 
+    Attributes:
+        linearized_at: the inputs where it is linearised, by name.
+        non_finite: numbers that were not finite, and were replaced by 0.
+
     Raises:
         TransportTooLargeError: a matrix would take more than `MAX_BYTES`.
     """
@@ -559,7 +566,7 @@ class LinearRenderer(Predictor):
         for name, transport in self.collected.transports.items():
             change = transport(inputs[name] - self.linearized_at[name])
             if crop is not None:
-                change = crop.window.pad(change, base.shape[:2])
+                change = crop.window.pad(change, (base.shape[0], base.shape[1]))
             radiance = radiance + change
         if base.shape[-1] == 3:
             return radiance
@@ -609,31 +616,27 @@ def _collect(
     }
     transports = {
         name: TextureTransport(
-            _traced_size(renderer),
+            _get_traced_size(renderer),
             (value.shape[0], value.shape[1]),
             small=quick,
         )
         for name, value in linearized_at.items()
     }
     has_backdrop = "backdrop.color" in image_inputs
-    if not transports:
+    if transports:
+        base = _trace_matrices(
+            renderer,
+            transports,
+            scene_inputs,
+            seed=seed,
+            tick=tick,
+            spp=spp,
+            quick=quick,
+            has_backdrop=has_backdrop,
+        )
+    else:
         base = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
         tick(spp)
-    else:
-        with renderer.scene.limit_window(renderer.window):
-            paths = _fill_transports(
-                renderer, transports, scene_inputs, seed, tick, spp
-            )
-        radiance = paths.radiance - paths.background if has_backdrop else paths.radiance
-        radiance = renderer.replace_non_finite(radiance)
-        base, smooth = _make_smooth(renderer, radiance, paths, quick)
-        for transport in transports.values():
-            transport.finish(smooth)
-        if has_backdrop:
-            base = torch.cat([base, paths.coverage], dim=-1)
-            base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
-        if renderer.crop is not None:
-            base = renderer.crop.window.paste(base, renderer.crop.surroundings)
     return LinearizedScene(
         transports=transports,
         linearized_at=linearized_at,
@@ -641,6 +644,38 @@ def _collect(
         base_image=PackedImage(base, is_small=quick),
         non_finite=renderer.non_finite - non_finite_before,
     )
+
+
+def _trace_matrices(
+    renderer: Renderer,
+    transports: Mapping[str, TextureTransport],
+    scene_inputs: Inputs,
+    *,
+    seed: int,
+    tick: ProgressCallback,
+    spp: int,
+    quick: bool,
+    has_backdrop: bool,
+) -> Tensor:
+    """Fill and finish empty matrices, and return the base image of the same paths.
+
+    A renderer that has a crop traces its window only; the rest is pasted. Other
+    arguments are those of `LinearRenderer`, and of `_collect`.
+    """
+    window = renderer.crop.window if renderer.crop else None
+    with renderer.scene.limit_window(window):
+        paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
+    radiance = paths.radiance - paths.background if has_backdrop else paths.radiance
+    radiance = renderer.replace_non_finite(radiance)
+    base, smooth = _make_smooth(renderer, radiance, paths, quick)
+    for transport in transports.values():
+        transport.finish(smooth)
+    if has_backdrop:
+        base = torch.cat([base, paths.coverage], dim=-1)
+        base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
+    if renderer.crop is not None:
+        base = renderer.crop.window.paste(base, renderer.crop.surroundings)
+    return base
 
 
 def _append_plane_change(
@@ -672,7 +707,7 @@ def _fill_transports(
     `TransportTooLargeError` as soon as all matrices take more than `MAX_BYTES`.
     """
     samples, n_passes = plan_passes(renderer, spp)
-    height, width = _traced_size(renderer)
+    height, width = _get_traced_size(renderer)
     images: list[Paths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
@@ -725,7 +760,7 @@ def find_linear_inputs(renderer: Renderer) -> frozenset[str]:
     )
 
 
-def _traced_size(renderer: Renderer) -> tuple[int, int]:
+def _get_traced_size(renderer: Renderer) -> tuple[int, int]:
     """Return height and width of what is traced of an image, in pixels."""
     if renderer.crop is None:
         return renderer.formation.resolution
@@ -734,6 +769,6 @@ def _traced_size(renderer: Renderer) -> tuple[int, int]:
 
 def plan_passes(renderer: Renderer, spp: int) -> tuple[int, int]:
     """Return the samples per pixel of a pass, and the number of passes."""
-    height, width = _traced_size(renderer)
+    height, width = _get_traced_size(renderer)
     samples = max(1, min(spp, SAMPLES_PER_PASS // (height * width)))
     return samples, -(-spp // samples)

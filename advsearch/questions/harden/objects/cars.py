@@ -74,7 +74,9 @@ def _shell(
             charts are cut.
     """
     angle = _outline_angles(rows, power, middle)
-    points = _shell_points(rows, power, middle, height, angle)
+    points = _shell_points(
+        rows=rows, power=power, middle=middle, height=height, angle=angle
+    )
     normals = _shell_normals(points)
     opposite = COLUMNS // 2
     cut = int(COLUMNS * corner)
@@ -106,7 +108,14 @@ def _outline_angles(rows: Array, power: float, middle: float) -> Array:
     # rear's middle
     _, half, front, rear = rows[np.argmax(rows[:, 1])]
     fine = np.linspace(-np.pi, np.pi, 8001)
-    x, y = _outline(fine, front - middle, rear - middle, half, power, 0.0)
+    x, y = _outline(
+        fine,
+        front=front - middle,
+        rear=rear - middle,
+        half=half,
+        power=power,
+        middle=0.0,
+    )
     arc_length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     return np.interp(np.linspace(0.0, arc_length[-1], COLUMNS + 1), arc_length, fine)
 
@@ -119,7 +128,9 @@ def _shell_points(
     """
     points = np.empty((len(rows), COLUMNS + 1, 3))
     for row, (share, half, front, rear) in zip(points, rows, strict=True):
-        x, y = _outline(angle, front, rear, half, power, middle)
+        x, y = _outline(
+            angle, front=front, rear=rear, half=half, power=power, middle=middle
+        )
         row[:, 0] = x
         row[:, 1] = y
         row[:, 2] = height(np.full_like(x, share), x, y)
@@ -135,7 +146,7 @@ def _shell_normals(points: Array) -> Array:
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
     """Return the function of x that a spline through knots (x, z) is."""
-    curve = shapes.spline(knots, 200)
+    curve = shapes.spline(knots, count=200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
 
@@ -311,11 +322,15 @@ def _body_and_cabin() -> list[Patch]:
         (1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8)
         for s in (0.75, 0.45, 0.15, 0.002)
     ]
-    body = np.array([*shapes.spline(_BODY, 23), *deck])
-    cabin = np.array([*shapes.spline(_CABIN, 16), *roof])
+    body = np.array([*shapes.spline(_BODY, count=23), *deck])
+    cabin = np.array([*shapes.spline(_CABIN, count=16), *roof])
     parts = {
-        "body": _shell(body, _BODY_POWER, 0.0, _body_height, 0.085),
-        "cabin": _shell(cabin, _CABIN_POWER, MIDDLE, _cabin_height, 0.1),
+        "body": _shell(
+            body, power=_BODY_POWER, middle=0.0, height=_body_height, corner=0.085
+        ),
+        "cabin": _shell(
+            cabin, power=_CABIN_POWER, middle=MIDDLE, height=_cabin_height, corner=0.1
+        ),
     }
     for part, openings in OPENINGS.items():
         for name, tag in openings.items():
@@ -329,7 +344,7 @@ def _wheels() -> list[Patch]:
     rim = 0.212
     tyre = _tyre_profile(rim, half)
     deep = half - 0.06
-    wheel = shapes.lathe([("rubber", tyre)], 28)
+    wheel = shapes.lathe([("rubber", tyre)], columns=28)
     wheel += shapes.lathe(
         [
             (
@@ -337,9 +352,9 @@ def _wheels() -> list[Patch]:
                 [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)],
             )
         ],
-        28,
+        columns=28,
     )
-    wheel += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
+    wheel += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], columns=24)
     spoke = np.array(
         [
             (0.03, 0.0, half - 0.035),
@@ -347,7 +362,7 @@ def _wheels() -> list[Patch]:
             (rim - 0.012, 0.0, half - 0.018),
         ]
     )
-    section = shapes.rectangle(0.03, 0.03, 0.008, 1)
+    section = shapes.rectangle(0.03, 0.03, bevel=0.008, steps=1)
     for number, side in product(range(5), (-1.0, 1.0)):
         spoke[:, 1] = side * np.array([0.012, 0.018, 0.04])
         turn = shapes.rotation("z", 72.0 * number)
@@ -355,7 +370,9 @@ def _wheels() -> list[Patch]:
             shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), turn
         )
     hub = [(0.052, deep), (0.05, half - 0.02), (0.03, half - 0.01), (0.0, half - 0.008)]
-    wheel += shapes.lathe([("rim", shapes.round_corners(hub, 0.008, 2))], 20)
+    wheel += shapes.lathe(
+        [("rim", shapes.round_corners(hub, radius=0.008, steps=2))], columns=20
+    )
     patches = []
     for axle, side in WHEELS:
         turn = shapes.rotation("y", 17.0 * axle) @ shapes.rotation("x", -90.0 * side)
@@ -400,7 +417,12 @@ def _wells() -> list[Patch]:
         )
         patches.append(shapes.cap("well", ring, np.array([0.0, side, 0.0])))
     x, y = _outline(
-        np.linspace(np.pi, -np.pi, 41)[:-1], 1.97, -1.99, 0.79, _BODY_POWER, 0.0
+        np.linspace(np.pi, -np.pi, 41)[:-1],
+        front=1.97,
+        rear=-1.99,
+        half=0.79,
+        power=_BODY_POWER,
+        middle=0.0,
     )
     return [
         *patches,
@@ -416,16 +438,23 @@ def _fittings() -> list[Patch]:
     """Create mirrors, plates, badges, door handles and other fittings."""
     patches = []
     for side in (1.0, -1.0):  # mirrors
-        shell = shapes.box("paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), 0.055, 3)
+        shell = shapes.box(
+            "paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), bevel=0.055, steps=3
+        )
         patches += shapes.transform_patches(
             shell, shapes.rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005)
         )
         patches += shapes.box(
-            "trim", (0.58, side * 0.83, 0.955), (0.06, 0.14, 0.035), 0.012, 1
+            "trim",
+            (0.58, side * 0.83, 0.955),
+            (0.06, 0.14, 0.035),
+            bevel=0.012,
+            steps=1,
         )
-    plate = shapes.box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1)
+    plate = shapes.box("plate", (0, 0, 0), (0.014, 0.52, 0.112), bevel=0.004, steps=1)
     badge = shapes.lathe(
-        [("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])], 24
+        [("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])],
+        columns=24,
     )
     for fitting, tilt, position in (
         (plate, -4.0, (2.146, 0.0, 0.428)),
@@ -438,9 +467,11 @@ def _fittings() -> list[Patch]:
         )
     for side, x in product((1.0, -1.0), (0.05, -0.92)):  # handles of the doors
         patches += shapes.box(
-            "paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1
+            "paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), bevel=0.011, steps=1
         )
-    spoiler = shapes.box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2)
+    spoiler = shapes.box(
+        "paint", (0, 0, 0), (0.2, 1.04, 0.035), bevel=0.015, steps=2, cells=2
+    )
     return [
         *patches,
         *shapes.transform_patches(
@@ -492,7 +523,7 @@ def _lacquer(t: Texels, color: Array) -> Array:
     )
     shaded = mix(color, 0.75 * color, 0.4 * np.where((x > 0.8) & (z > 0.7), fold, 0.0))
     return mix(
-        shaded, 0.12 * color, 0.9 * step(0.005 - np.min(gaps, axis=0), 0.0, 0.011)
+        shaded, 0.12 * color, 0.9 * step(0.005 - np.min(gaps, axis=0), 0.0, soft=0.011)
     )
 
 
@@ -511,8 +542,8 @@ def _panes(t: Texels) -> Array:
         np.hypot((out - 0.36) / 0.24, (z - 1.0) / 0.2),
         np.hypot((out - 0.36) / 0.11, (z - 1.23) / 0.055),
     )
-    ahead = np.where(x > 0.0, step(1.0 - seat, 0.0, 0.15), 0.0)
-    pillar = np.where(out > 0.55, step(0.035 - np.abs(x + 0.25), 0.0, 0.01), 0.0)
+    ahead = np.where(x > 0.0, step(1.0 - seat, 0.0, soft=0.15), 0.0)
+    pillar = np.where(out > 0.55, step(0.035 - np.abs(x + 0.25), 0.0, soft=0.01), 0.0)
     return mix(color, parse_hex_color("0b0c0d"), np.maximum(pillar, ahead))
 
 
@@ -524,10 +555,12 @@ def _lamps(t: Texels) -> Array:
     base = mix(
         parse_hex_color("9aa4ab"),
         parse_hex_color("f4f7f8"),
-        step(0.032 - lamp, 0.0, 0.01),
+        step(0.032 - lamp, 0.0, soft=0.01),
     )
     return mix(
-        base, parse_hex_color("3a4045"), step(0.01 - np.abs(lamp - 0.039), 0.0, 0.008)
+        base,
+        parse_hex_color("3a4045"),
+        step(0.01 - np.abs(lamp - 0.039), 0.0, soft=0.008),
     )
 
 
@@ -537,7 +570,7 @@ def _tail(t: Texels) -> Array:
     return mix(
         parse_hex_color("8e0d12"),
         parse_hex_color("d8392f"),
-        step(0.018 - np.abs(z - 0.87), 0.0, 0.01),
+        step(0.018 - np.abs(z - 0.87), 0.0, soft=0.01),
     )
 
 
@@ -546,7 +579,7 @@ def _slats(t: Texels) -> Array:
     x, _, z = t.xyz.T
     slat = np.where(
         (x > 1.9) & (z > 0.48),
-        step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, 0.006),
+        step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, soft=0.006),
         0.0,
     )
     return mix(parse_hex_color("17181a"), parse_hex_color("8b9095"), slat)

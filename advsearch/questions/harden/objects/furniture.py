@@ -34,63 +34,97 @@ Point = tuple[float, float, float]
 def _post(
     tag: str, low: Point, high: Point, section: Array, ends: tuple[float, float]
 ) -> list[Patch]:
-    """Create a straight post between two points, scaled from one end to the other."""
+    """Create a straight post between two points.
+
+    Args:
+        tag: of its paint.
+        low, high: its ends.
+        section: (M, 2).
+        ends: scales of the section at both ends.
+    """
     t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
     scale = (ends[0] + (ends[1] - ends[0]) * t) * np.array([0.9, 1.0, 1.0, 1.0, 0.9])
-    lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
+    is_lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
     return shapes.sweep(
         tag,
         path,
         section,
         scale,
-        first=(0.0, 0.0, 1.0) if lying else (1.0, 0.0, 0.0),
+        first=(0.0, 0.0, 1.0) if is_lying else (1.0, 0.0, 0.0),
         caps=True,
     )
 
 
 @family(metres=0.01)
 def chair(draw: ParameterSampler) -> Instance:
-    """Faces +x; the back stands at -x."""
-    wide = draw(43.0, low=36.0, high=50.0)
-    deep = draw(42.0, low=36.0, high=48.0)
-    seat = draw(45.0, low=40.0, high=50.0)
-    total = draw(92.0, low=78.0, high=108.0)
-    thick = draw(3.6, low=2.4, high=5.5)
-    leg = draw(2.1, low=1.5, high=3.0)
+    """Make a chair that faces +x, with its back at -x."""
+    width = draw(43.0, low=36.0, high=50.0)
+    depth = draw(42.0, low=36.0, high=48.0)
+    seat_height = draw(45.0, low=40.0, high=50.0)
+    total_height = draw(92.0, low=78.0, high=108.0)
+    seat_thickness = draw(3.6, low=2.4, high=5.5)
+    leg_radius = draw(2.1, low=1.5, high=3.0)
     splay = draw(1.5, low=0.0, high=6.0)
     lean = draw(5.0, low=1.0, high=11.0)
     section = _leg_section(draw)
-    taper = (leg * draw(0.75, low=0.55, high=1.0), leg)
-    x = deep / 2 - leg - 0.4
-    y = wide / 2 - leg - 0.4
+    taper = (leg_radius * draw(0.75, low=0.55, high=1.0), leg_radius)
+    x = depth / 2 - leg_radius - 0.4
+    y = width / 2 - leg_radius - 0.4
     patches: list[Patch] = []
-    patches += _chair_legs(x, splay, y, seat, thick, section, taper)
+    patches += _chair_legs(
+        x=x,
+        splay=splay,
+        y=y,
+        seat_height=seat_height,
+        seat_thickness=seat_thickness,
+        section=section,
+        taper=taper,
+    )
     patches += shapes.box(
         "seat",
-        (0.0, 0.0, seat - thick / 2),
-        (deep, wide, thick),
-        0.45 * thick,
+        (0.0, 0.0, seat_height - seat_thickness / 2),
+        (depth, width, seat_thickness),
+        bevel=0.45 * seat_thickness,
         steps=3,
         cells=2,
     )
     if draw.chance(0.35):
         patches += shapes.box(
             "cushion",
-            (0.5, 0.0, seat + 1.4),
-            (deep - 4.0, wide - 4.0, 4.4),
-            2.1,
+            (0.5, 0.0, seat_height + 1.4),
+            (depth - 4.0, width - 4.0, 4.4),
+            bevel=2.1,
             steps=3,
             cells=2,
         )
     if draw.chance(0.55, canonical=True):
-        patches += _chair_rungs(draw, seat, splay, x, y, leg, section)
-    patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
+        patches += _chair_rungs(
+            draw,
+            seat_height=seat_height,
+            splay=splay,
+            x=x,
+            y=y,
+            leg_radius=leg_radius,
+            section=section,
+        )
+    patches += _chair_back(
+        draw,
+        x=x,
+        y=y,
+        seat_height=seat_height,
+        total_height=total_height,
+        lean=lean,
+        leg_radius=leg_radius,
+        section=section,
+    )
     rotated = shapes.transform_patches(
         patches, shapes.rotation("z", draw(8.0, low=-25.0, high=25.0))
     )
     return Instance(
-        rotated, _chair_paints(draw, total), sample_material(draw, 0.45, 0.2)
+        rotated,
+        _chair_paints(draw, total_height),
+        sample_material(draw, roughness=0.45, clearcoat=0.2),
     )
 
 
@@ -98,7 +132,9 @@ def _leg_section(draw: ParameterSampler) -> Array:
     """Sample the section (M, 2) of the legs of a chair: square or round."""
     square = draw.chance(0.5, canonical=True)
     return (
-        shapes.rectangle(2.0, 2.0, 0.5, 2) if square else shapes.ellipse(1.0, 1.0, 16)
+        shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
+        if square
+        else shapes.ellipse(1.0, 1.0, count=16)
     )
 
 
@@ -106,43 +142,47 @@ def _chair_legs(
     x: float,
     splay: float,
     y: float,
-    seat: float,
-    thick: float,
+    seat_height: float,
+    seat_thickness: float,
     section: Array,
     taper: tuple[float, float],
 ) -> list[Patch]:
     """Create the four legs of a chair."""
     patches = list[Patch]()
-    for sx, sy in product((-1.0, 1.0), repeat=2):
-        foot = (sx * (x + splay), sy * (y + splay), 0.0)
+    for sign_x, sign_y in product((-1.0, 1.0), repeat=2):
+        foot = (sign_x * (x + splay), sign_y * (y + splay), 0.0)
         patches += _post(
-            "up", foot, (sx * x, sy * y, seat - thick + 0.5), section, taper
+            "up",
+            foot,
+            (sign_x * x, sign_y * y, seat_height - seat_thickness + 0.5),
+            section,
+            taper,
         )
     return patches
 
 
 def _chair_rungs(
     draw: ParameterSampler,
-    seat: float,
+    seat_height: float,
     splay: float,
     x: float,
     y: float,
-    leg: float,
+    leg_radius: float,
     section: Array,
 ) -> list[Patch]:
     """Create the rungs between the legs of a chair."""
     patches = list[Patch]()
-    low = seat * draw(0.36, low=0.25, high=0.6)
-    spread = splay * (1.0 - low / seat)
+    low = seat_height * draw(0.36, low=0.25, high=0.6)
+    spread = splay * (1.0 - low / seat_height)
     front_x = x + spread
     side_y = y + spread
-    thin = (0.55 * leg, 0.55 * leg)
-    thinner = (0.5 * leg, 0.5 * leg)
-    for sy in (-1.0, 1.0):
+    thin = (0.55 * leg_radius, 0.55 * leg_radius)
+    thinner = (0.5 * leg_radius, 0.5 * leg_radius)
+    for sign_y in (-1.0, 1.0):
         patches += _post(
             "along",
-            (-front_x, sy * side_y, low),
-            (front_x, sy * side_y, low),
+            (-front_x, sign_y * side_y, low),
+            (front_x, sign_y * side_y, low),
             section,
             thin,
         )
@@ -150,7 +190,7 @@ def _chair_rungs(
     return patches
 
 
-def _chair_paints(draw: ParameterSampler, total: float) -> dict[str, Paint]:
+def _chair_paints(draw: ParameterSampler, total_height: float) -> dict[str, Paint]:
     """Sample the paints of a chair of a height."""
     offset = draw.offset()
     timber = draw.sample_color(
@@ -160,17 +200,22 @@ def _chair_paints(draw: ParameterSampler, total: float) -> dict[str, Paint]:
         "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040"
     )
     painted = draw.chance(0.4)
-    wild = paint_or_random(draw, total, solid(paint_color), 0.5)
+    wild = paint_or_random(draw, total_height, solid(paint_color), wild=0.5)
 
     def grain(axis: int) -> Paint:
-        return wild if painted else wood(timber, 3.2, offset, axis=axis, contrast=0.36)
+        """Return the paint of a part whose grain runs along an axis."""
+        return (
+            wild
+            if painted
+            else wood(timber, scale=3.2, offset=offset, axis=axis, contrast=0.36)
+        )
 
     fabric = draw.sample_color("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
     cover = draw.pick(
-        clouded(fabric, 0.8, 1.5, offset),
-        stripes(fabric, shade(fabric, 1.5), 6.0),
-        checks(fabric, parse_hex_color("efe6d4"), 4.0),
-        dots(solid(fabric), parse_hex_color("f4efe4"), 6.0),
+        clouded(fabric, factor=0.8, scale=1.5, offset=offset),
+        stripes(fabric, shade(fabric, 1.5), cell=6.0),
+        checks(fabric, parse_hex_color("efe6d4"), cell=4.0),
+        dots(solid(fabric), parse_hex_color("f4efe4"), cell=6.0),
     )
     seat_paint = cover if draw.chance(0.25) else grain(0)
     return {
@@ -186,113 +231,147 @@ def _chair_back(
     draw: ParameterSampler,
     x: float,
     y: float,
-    seat: float,
-    total: float,
+    seat_height: float,
+    total_height: float,
     lean: float,
-    leg: float,
+    leg_radius: float,
     section: Array,
 ) -> list[Patch]:
     """Create the back of a chair of one of several kinds."""
     style = draw.pick("slats", "ladder", "panel", "arch")
     patches: list[Patch] = []
-    foot = seat - 2.0
+    foot = seat_height - 2.0
 
-    def at(z: float) -> float:
-        return -x - lean * (z - seat) / (total - seat)
+    def back_x(z: float) -> float:
+        """Return the x of the leaning back at a height."""
+        return -x - lean * (z - seat_height) / (total_height - seat_height)
 
-    for sy in (-1.0, 1.0):
+    for sign_y in (-1.0, 1.0):
         patches += _post(
             "up",
-            (at(foot), sy * y, foot),
-            (at(total), sy * y, total),
+            (back_x(foot), sign_y * y, foot),
+            (back_x(total_height), sign_y * y, total_height),
             section,
-            (leg, 0.85 * leg),
+            (leg_radius, 0.85 * leg_radius),
         )
-    tilt = shapes.rotation("y", -float(np.degrees(np.arctan2(lean, total - seat))))
+    tilt = shapes.rotation(
+        "y", -float(np.degrees(np.arctan2(lean, total_height - seat_height)))
+    )
     depth = draw(1.6, low=1.2, high=2.4)
 
     def slat(
-        tag: str, z: float, width: float, height: float, shift: float = 0.0
+        tag: str, z: float, width: float, height: float, center_y: float = 0.0
     ) -> list[Patch]:
+        """Create a part of the back around a height, in its plane."""
         return shapes.transform_patches(
-            shapes.box(tag, (0.0, 0.0, 0.0), (depth, width, height), 0.5),
+            shapes.box(tag, (0.0, 0.0, 0.0), (depth, width, height), bevel=0.5),
             tilt,
-            (at(z), shift, z),
+            (back_x(z), center_y, z),
         )
 
-    inner = 2 * (y - 0.3 * leg)
-    high = total - seat
+    inner_width = 2 * (y - 0.3 * leg_radius)
+    back_height = total_height - seat_height
     if style in ("slats", "arch"):
-        patches += slat("cross", total - 0.09 * high, inner, 0.14 * high)
+        patches += slat(
+            "cross", total_height - 0.09 * back_height, inner_width, 0.14 * back_height
+        )
         if style == "slats":
-            patches += slat("cross", seat + 0.2 * high, inner, 0.09 * high)
+            patches += slat(
+                "cross",
+                seat_height + 0.2 * back_height,
+                inner_width,
+                0.09 * back_height,
+            )
         count = int(draw.pick(5, 3, 4, 6))
-        low = seat + 0.22 * high if style == "slats" else seat - 1.0
+        low = (
+            seat_height + 0.22 * back_height if style == "slats" else seat_height - 1.0
+        )
         for i in range(count):
-            top = total - 0.15 * high
+            top = total_height - 0.15 * back_height
             patches += slat(
                 "up",
                 (low + top) / 2,
-                inner * draw(0.075, low=0.05, high=0.11),
+                inner_width * draw(0.075, low=0.05, high=0.11),
                 top - low + 1.0,
-                inner * ((i + 1) / (count + 1) - 0.5),
+                inner_width * ((i + 1) / (count + 1) - 0.5),
             )
     elif style == "ladder":
         count = int(draw.pick(3, 2, 4))
         for i in range(count):
-            z = seat + high * (0.28 + 0.66 * i / max(1, count - 1))
-            patches += slat("cross", z, inner, high * draw(0.15, low=0.1, high=0.2))
+            z = seat_height + back_height * (0.28 + 0.66 * i / max(1, count - 1))
+            patches += slat(
+                "cross", z, inner_width, back_height * draw(0.15, low=0.1, high=0.2)
+            )
     else:
-        tall = draw(0.6, low=0.35, high=0.75) * high
+        tall = draw(0.6, low=0.35, high=0.75) * back_height
         patches += slat(
             "cushion" if draw.chance(0.3) else "up",
-            total - tall / 2 - 0.04 * high,
-            inner,
+            total_height - tall / 2 - 0.04 * back_height,
+            inner_width,
             tall,
         )
     return patches
 
 
 def _shade(
-    draw: ParameterSampler, low: float, high: float, wide: float, narrow: float
+    draw: ParameterSampler,
+    low: float,
+    high: float,
+    bottom_radius: float,
+    top_radius: float,
 ) -> list[Patch]:
-    """An open lampshade with a thin wall, standing free from `low` to `high`."""
+    """Create an open lampshade with a thin wall, from a height to another."""
     wall = 0.25
-    belly = draw(0.0, low=-0.1, high=0.12) * wide
+    belly = draw(0.0, low=-0.1, high=0.12) * bottom_radius
     outer = shapes.spline(
-        [(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)],
-        14,
+        [
+            (bottom_radius, low),
+            ((bottom_radius + top_radius) / 2 + belly, (low + high) / 2),
+            (top_radius, high),
+        ],
+        count=14,
     )
     inner = (outer - np.array([wall, 0.0]))[::-1]
     pieces = [
-        ("shade", shapes.subdivide(outer, 2.0)),
+        ("shade", shapes.subdivide(outer, longest=2.0)),
         ("rim", [outer[-1], inner[0]]),
         ("lining", inner),
         ("rim", [inner[-1], outer[0]]),
     ]
-    return shapes.lathe(pieces, 56)
+    return shapes.lathe(pieces, columns=56)
 
 
 def _lamp_base(
-    draw: ParameterSampler, style: str, low: float, radius: float, stem: float
+    draw: ParameterSampler, style: str, low: float, radius: float, stem_radius: float
 ) -> list[Patch]:
-    """Create the base of a lamp of one of several kinds."""
+    """Create the base of a lamp.
+
+    Args:
+        draw: samples its proportions.
+        style: "disc", "body" or "gourd", which has a waist.
+        low: height of its top.
+        radius: of the foot.
+        stem_radius: of the top.
+    """
     under = [(0.0, 0.0), (radius - 0.4, 0.0)]
-    top = [(stem, low), (0.0, low)]
+    top = [(stem_radius, low), (0.0, low)]
     if style == "disc":
         thick = draw(2.0, low=1.2, high=3.2)
         corners = [
             under[-1],
             (radius, 0.4),
             (radius * 0.96, thick),
-            (stem * 2.0, thick * 1.4),
-            (stem, thick * 2.2),
+            (stem_radius * 2.0, thick * 1.4),
+            (stem_radius, thick * 2.2),
             top[0],
         ]
         side = shapes.subdivide(
-            shapes.round_corners(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6
+            shapes.round_corners(corners, radius=[0.3, 0.5, 1.0, 1.2], steps=5),
+            longest=1.6,
         )
-        return shapes.lathe([("base", under), ("base", side), ("base", top)], 44)
+        return shapes.lathe(
+            [("base", under), ("base", side), ("base", top)], columns=44
+        )
     belly = radius * draw(1.12, low=0.95, high=1.4)
     at = draw(0.38, low=0.28, high=0.6) * low
     waist = [(0.45 * belly, 0.72 * low)]
@@ -303,12 +382,12 @@ def _lamp_base(
         (radius * 0.8, 2.4),
         (belly, at),
         *waist,
-        (stem * 1.5, 0.86 * low),
-        (stem, 0.93 * low),
+        (stem_radius * 1.5, 0.86 * low),
+        (stem_radius, 0.93 * low),
     ]
-    body = shapes.spline(knots, 34)
+    body = shapes.spline(knots, count=34)
     ring = shapes.round_corners(
-        [under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3
+        [under[-1], (radius, 0.2), (radius, 1.2), knots[0]], radius=[0.15, 0.3], steps=3
     )
     neck = [knots[-1], top[0]]
     return shapes.lathe(
@@ -319,76 +398,119 @@ def _lamp_base(
             ("base", neck),
             ("base", top),
         ],
-        44,
+        columns=44,
     )
 
 
 def _shade_paint(
-    draw: ParameterSampler, linen: Color, offset: Array, low: float, total: float
+    draw: ParameterSampler, linen: Color, offset: Array, low: float, total_height: float
 ) -> Paint:
     """Sample the paint of a lamp's shade between two heights."""
-    weave = clouded(linen, 0.93, 1.2, offset)
+    weave = clouded(linen, factor=0.93, scale=1.2, offset=offset)
     kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
     accent = draw.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
     if kind == "band":
-        for band in (between(0.0, low + 1.4), between(total - 1.4, 2 * total)):
+        for band in (
+            between(0.0, low + 1.4),
+            between(total_height - 1.4, 2 * total_height),
+        ):
             weave = over(weave, band, solid(accent))
     elif kind == "stripes":
         weave = stripes(
-            linen, accent, draw(5.0, low=3.0, high=9.0), draw(0.4, low=0.2, high=0.6)
+            linen,
+            accent,
+            cell=draw(5.0, low=3.0, high=9.0),
+            share=draw(0.4, low=0.2, high=0.6),
         )
     elif kind == "dots":
-        weave = dots(weave, accent, draw(6.0, low=4.0, high=9.0))
+        weave = dots(weave, accent, cell=draw(6.0, low=4.0, high=9.0))
     elif kind == "rings":
-        weave = rings(linen, accent, draw(6.0, low=3.0, high=10.0))
+        weave = rings(linen, accent, period=draw(6.0, low=3.0, high=10.0))
     elif kind == "gradient":
-        weave = gradient(linen, shade(linen, 0.6), low, total)
+        weave = gradient(linen, shade(linen, 0.6), low=low, high=total_height)
     else:
-        for hem in (between(0.0, low + 0.5), between(total - 0.5, 2 * total)):
+        for hem in (
+            between(0.0, low + 0.5),
+            between(total_height - 0.5, 2 * total_height),
+        ):
             weave = over(weave, hem, solid(shade(linen, 0.75)))
-    return paint_or_random(draw, total, weave, 0.3)
+    return paint_or_random(draw, total_height, weave, wild=0.3)
 
 
 @family(metres=0.01)
 def lamp(draw: ParameterSampler) -> Instance:
     """Make a table lamp of random proportions, shade and base."""
-    total = draw(48.0, low=42.0, high=58.0)
-    tall = draw(20.0, low=14.0, high=24.0)
-    wide = draw(16.5, low=12.0, high=19.0)
-    narrow = wide * draw(0.6, low=0.35, high=1.0)
-    low = total - tall
+    total_height = draw(48.0, low=42.0, high=58.0)
+    shade_height = draw(20.0, low=14.0, high=24.0)
+    bottom_radius = draw(16.5, low=12.0, high=19.0)
+    top_radius = bottom_radius * draw(0.6, low=0.35, high=1.0)
+    low = total_height - shade_height
     radius = draw(7.4, low=6.0, high=9.5)
-    stem = draw(0.8, low=0.6, high=1.3)
+    stem_radius = draw(0.8, low=0.6, high=1.3)
     style = draw.pick("body", "disc", "gourd")
-    base = _lamp_base(draw, style, low + 0.25 * tall, radius, stem)
-    patches = base + _shade(draw, low, total, wide, narrow)
-    patches += shapes.sphere(
-        "bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20
+    base = _lamp_base(
+        draw,
+        style=style,
+        low=low + 0.25 * shade_height,
+        radius=radius,
+        stem_radius=stem_radius,
     )
-    patches += _lamp_frame(total, tall, narrow, wide, low)
-    paints = _lamp_paints(draw, low, total, style)
-    return Instance(patches, paints, sample_material(draw, 0.4, 0.3), {"lining": 0.6})
+    patches = base + _shade(
+        draw,
+        low=low,
+        high=total_height,
+        bottom_radius=bottom_radius,
+        top_radius=top_radius,
+    )
+    patches += shapes.sphere(
+        "bulb",
+        min(3.0, 0.4 * top_radius),
+        centre=(0.0, 0.0, low + 0.42 * shade_height),
+        rows=12,
+        columns=20,
+    )
+    patches += _lamp_frame(
+        total_height=total_height,
+        shade_height=shade_height,
+        top_radius=top_radius,
+        bottom_radius=bottom_radius,
+        low=low,
+    )
+    paints = _lamp_paints(draw, low, total_height, style)
+    return Instance(
+        patches,
+        paints,
+        sample_material(draw, roughness=0.4, clearcoat=0.3),
+        detail={"lining": 0.6},
+    )
 
 
 def _lamp_frame(
-    total: float, tall: float, narrow: float, wide: float, low: float
+    total_height: float,
+    shade_height: float,
+    top_radius: float,
+    bottom_radius: float,
+    low: float,
 ) -> list[Patch]:
     """Create the rod of a lamp, and the spokes that hold its shade."""
     patches = list[Patch]()
-    ring_z = total - 0.12 * tall
-    inside = narrow + (wide - narrow) * 0.12
+    ring_z = total_height - 0.12 * shade_height
+    inside = top_radius + (bottom_radius - top_radius) * 0.12
     for angle in (20.0, 140.0, 260.0):
         spoke = shapes.sweep(
             "base",
             [(0.0, 0.0, ring_z), (inside, 0.0, ring_z)],
-            shapes.ellipse(0.22, 0.22, 8),
+            shapes.ellipse(0.22, 0.22, count=8),
         )
         patches += shapes.transform_patches(spoke, shapes.rotation("z", angle))
-    rod = [(0, 0, z) for z in (low + 0.2 * tall, ring_z, ring_z + 0.8, ring_z + 1.0)]
+    rod = [
+        (0, 0, z)
+        for z in (low + 0.2 * shade_height, ring_z, ring_z + 0.8, ring_z + 1.0)
+    ]
     patches += shapes.sweep(
         "base",
         rod,
-        shapes.ellipse(0.35, 0.35, 10),
+        shapes.ellipse(0.35, 0.35, count=10),
         (1.0, 1.0, 1.6, 0.0),
         first=(1.0, 0.0, 0.0),
     )
@@ -396,18 +518,25 @@ def _lamp_frame(
 
 
 def _lamp_paints(
-    draw: ParameterSampler, low: float, total: float, style: str
+    draw: ParameterSampler, low: float, total_height: float, style: str
 ) -> dict[str, Paint]:
     """Sample the paints of a lamp."""
     offset = draw.offset()
     linen = draw.sample_color(
         "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25
     )
-    cloth = _shade_paint(draw, linen, offset, low, total)
+    cloth = _shade_paint(
+        draw, linen=linen, offset=offset, low=low, total_height=total_height
+    )
     clay = draw.sample_color(
         "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
     )
-    body = paint_or_random(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
+    body = paint_or_random(
+        draw,
+        total_height,
+        clouded(clay, factor=1.3, scale=4.0, offset=offset),
+        wild=0.35,
+    )
     metal = draw.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     return {
         "shade": cloth,

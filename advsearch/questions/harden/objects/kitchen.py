@@ -27,12 +27,13 @@ from advsearch.questions.harden.objects.textures import (
 
 
 def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
-    """A spout along +x with an open, hollow end."""
+    """Create a spout along +x with an open, hollow end."""
     path = _spout_path(draw, radius, height)
     root = draw(1.75, low=1.3, high=2.2)
     end = draw(0.72, low=0.55, high=0.95)
     scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
     tangent, first, second = shapes.compute_frames(path, (0.0, 1.0, 0.0))
+    # over the lip at the tip and back down inside
     order = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
     inner = scale[[17, 16, 15, 14, 13]] - 0.24
     radii = np.concatenate(
@@ -44,7 +45,7 @@ def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     return shapes.sweep(
         "spout",
         path[order] + push[:, None] * tangent[order],
-        shapes.ellipse(1.0, 1.0, 20),
+        shapes.ellipse(1.0, 1.0, count=20),
         radii,
         frame=frame,
     )
@@ -66,7 +67,7 @@ def _spout_path(draw: ParameterSampler, radius: float, height: float) -> Array:
     above = (
         start + (tip - start) * 0.8 + np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
     )
-    return shapes.spline([start, middle, above, tip], 18)
+    return shapes.spline([start, middle, above, tip], count=18)
 
 
 @family(metres=0.01)
@@ -83,13 +84,18 @@ def teapot(draw: ParameterSampler) -> Instance:
     ]
     patches = shapes.transform_patches(patches, shapes.rotation("z", 118.0))
     paints = _teapot_paints(draw, height)
-    return Instance(patches, paints, sample_material(draw, 0.25, 0.7), {"base": 0.6})
+    return Instance(
+        patches,
+        paints,
+        sample_material(draw, roughness=0.25, clearcoat=0.7),
+        detail={"base": 0.6},
+    )
 
 
 def _teapot_body(
     draw: ParameterSampler, radius: float, height: float
 ) -> tuple[Array, list[Patch]]:
-    """Return the profile of the side, and the body with its lid and knob."""
+    """Return the profile (K, 2) of the side, and the body with its lid and knob."""
     foot = radius * draw(0.58, low=0.5, high=0.75)
     mouth = radius * draw(0.48, low=0.42, high=0.6)
     belly_height = draw(0.45, low=0.35, high=0.58)
@@ -101,7 +107,7 @@ def _teapot_body(
         (radius * (0.97 * fullness), (0.42 * belly_height + 0.58) * height),
         (mouth, height),
     ]
-    side = shapes.spline(knots, 26)
+    side = shapes.spline(knots, count=26)
     dome = draw(1.5, low=0.7, high=2.4)
     knob_radius = draw(1.0, low=0.7, high=1.4)
     top = height + dome + 0.2
@@ -119,7 +125,7 @@ def _teapot_body(
             (mouth * 0.55, height + 0.75 * dome + 0.2),
             (0.35, top),
         ],
-        10,
+        count=10,
     )
     knob = shapes.spline(
         [
@@ -129,7 +135,7 @@ def _teapot_body(
             (0.7 * knob_radius, top + 0.45 + 1.35 * knob_radius),
             (0.0, top + 0.45 + 1.6 * knob_radius),
         ],
-        12,
+        count=12,
     )
     profile: list[tuple[str, Points]] = [
         (
@@ -141,7 +147,7 @@ def _teapot_body(
         ("lid", lid),
         ("knob", [lid[-1], *knob]),
     ]
-    return side, shapes.lathe(profile, 56)
+    return side, shapes.lathe(profile, columns=56)
 
 
 def _teapot_handle(
@@ -163,11 +169,11 @@ def _teapot_handle(
         (low_root, low),
     ]
     section = shapes.ellipse(
-        draw(0.5, low=0.4, high=0.7), draw(0.62, low=0.45, high=0.85), 16
+        draw(0.5, low=0.4, high=0.7), draw(0.62, low=0.45, high=0.85), count=16
     )
     return shapes.sweep(
         "handle",
-        shapes.to_xz_plane(shapes.spline(knots, 26)),
+        shapes.to_xz_plane(shapes.spline(knots, count=26)),
         section,
         1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3,
     )
@@ -179,7 +185,7 @@ def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
     clay = draw.sample_color(
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
     )
-    glaze = clouded(clay, 1.25, 3.5, offset, 1.6)
+    glaze = clouded(clay, factor=1.25, scale=3.5, offset=offset, contrast=1.6)
     second = draw.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
     kind = draw.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
     if kind == "bands":
@@ -191,16 +197,22 @@ def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
         )
     elif kind == "dots":
         paint = dots(
-            glaze, second, draw(2.6, low=1.6, high=4.0), draw(0.28, low=0.18, high=0.4)
+            glaze,
+            second,
+            cell=draw(2.6, low=1.6, high=4.0),
+            radius=draw(0.28, low=0.18, high=0.4),
         )
     elif kind == "stripes":
         paint = stripes(
-            clay, second, draw(3.0, low=1.5, high=5.0), draw(0.4, low=0.2, high=0.6)
+            clay,
+            second,
+            cell=draw(3.0, low=1.5, high=5.0),
+            share=draw(0.4, low=0.2, high=0.6),
         )
     elif kind == "rings":
-        paint = rings(clay, second, draw(2.0, low=1.0, high=4.0))
+        paint = rings(clay, second, period=draw(2.0, low=1.0, high=4.0))
     elif kind == "speckle":
-        paint = speckled(glaze, second, 0.5, offset)
+        paint = speckled(glaze, second, scale=0.5, offset=offset)
     else:
         paint = glaze
     paint = paint_or_random(draw, height + 4.0, paint)
@@ -229,9 +241,9 @@ def frying_pan(draw: ParameterSampler) -> Instance:
             (base + 0.55 * (rim - base), 0.5 * depth),
             (rim, depth),
         ],
-        14,
+        count=14,
     )
-    body = shapes.vessel(side, wall, 0.5, columns=64, step=1.6)
+    body = shapes.vessel(side, wall=wall, floor=0.5, columns=64, step=1.6)
 
     length = draw(18.0, low=14.0, high=21.0)
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
@@ -243,7 +255,12 @@ def frying_pan(draw: ParameterSampler) -> Instance:
         [*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0)
     )
     paints = _pan_paints(draw, rim, depth)
-    return Instance(patches, paints, sample_material(draw, 0.38, 0.3), {"base": 0.5})
+    return Instance(
+        patches,
+        paints,
+        sample_material(draw, roughness=0.38, clearcoat=0.3),
+        detail={"base": 0.5},
+    )
 
 
 def _wall_rivets(side: Array, depth: float, wall: float) -> list[Patch]:
@@ -262,7 +279,7 @@ def _pan_bracket(rim: float, depth: float, length: float, rise: float) -> list[P
     return shapes.sweep(
         "bracket",
         shapes.to_xz_plane(np.array(spine)),
-        shapes.rectangle(0.7, 3.0, 0.25),
+        shapes.rectangle(0.7, 3.0, bevel=0.25),
         (1.0, 1.0, 0.62),
         caps=True,
     )
@@ -278,7 +295,7 @@ def _pan_handle(
         (0.6 * length, rise),
         (length, rise * draw(1.05, low=0.8, high=1.2)),
     ]
-    path = shapes.spline(root + shapes.to_xz_plane(np.array(knots)), 26)
+    path = shapes.spline(root + shapes.to_xz_plane(np.array(knots)), count=26)
     t = np.linspace(0.0, 1.0, 26)
     width = draw(1.15, low=0.85, high=1.5)
     thick = draw(0.62, low=0.45, high=0.9)
@@ -291,16 +308,16 @@ def _pan_handle(
     thickness = thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0))
     scale = np.stack([thickness, width * shape], axis=1) * round_end[:, None]
     if draw.chance(0.5, canonical=True):
-        section = shapes.ellipse(1.0, 1.0, 20)
+        section = shapes.ellipse(1.0, 1.0, count=20)
     else:
-        section = shapes.rectangle(2.0, 2.0, 0.7)
+        section = shapes.rectangle(2.0, 2.0, bevel=0.7)
     return shapes.sweep("handle", path, section, scale)
 
 
 def _pan_rivets(radius: float, height: float) -> list[Patch]:
     """Create the two rivets of the bracket on the inside of a pan."""
     center = (radius + 0.02, 0.0, height)
-    rivet = shapes.sphere("rivet", 0.38, center, rows=8, columns=12)
+    rivet = shapes.sphere("rivet", 0.38, centre=center, rows=8, columns=12)
     left = shapes.transform_patches(rivet, offset=(0.0, -1.1, 0.0))
     right = shapes.transform_patches(rivet, offset=(0.0, 1.1, 0.0))
     return left + right
@@ -314,12 +331,20 @@ def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, P
     def turned(t: Texels) -> Array:
         """Return the mask of faint rings, as turning leaves."""
         return (
-            step(np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9), 0.6, 0.8)
+            step(
+                np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9),
+                0.6,
+                soft=0.8,
+            )
             * 0.35
         )
 
     inside = speckled(
-        clouded(coat, 1.2, 5.0, offset), shade(coat, 1.7), 0.5, offset, 0.06
+        clouded(coat, factor=1.2, scale=5.0, offset=offset),
+        shade(coat, 1.7),
+        scale=0.5,
+        offset=offset,
+        amount=0.06,
     )
     if draw.chance(0.4, canonical=True):
         inside = over(inside, turned, solid(shade(coat, 1.6)))
@@ -327,18 +352,21 @@ def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, P
         "a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b"
     )
     # darker towards the bottom, with a dark line at the rim
-    enamel = clouded(outer, 0.85, 5.0, offset)
+    enamel = clouded(outer, factor=0.85, scale=5.0, offset=offset)
     enamel = over(
         enamel, between(-1.0, 0.25 * depth, soft=0.6 * depth), solid(shade(outer, 0.6))
     )
     enamel = over(enamel, between(depth - 0.1, 2 * depth, soft=0.15), solid("2b2c2e"))
-    outside = paint_or_random(draw, 2 * rim, enamel, 0.3)
-    inside = paint_or_random(draw, 2 * rim, inside, 0.2)
+    outside = paint_or_random(draw, 2 * rim, enamel, wild=0.3)
+    inside = paint_or_random(draw, 2 * rim, inside, wild=0.2)
     style = draw.pick("black", "wood", "wild")
     handle_paints = {
         "black": solid(draw.sample_color("1b1b1d", "2a2a2c", wild=0.1)),
         "wood": wood(
-            draw.sample_color("8a5a32", "b98550", wild=0.0), 1.4, offset, axis=0
+            draw.sample_color("8a5a32", "b98550", wild=0.0),
+            scale=1.4,
+            offset=offset,
+            axis=0,
         ),
         "wild": solid(draw.sample_color("a9231f")),
     }

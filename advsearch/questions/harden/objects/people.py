@@ -61,7 +61,13 @@ def _patches(person: Any) -> list[Patch]:
     first_vertex = np.cumsum([0, *data["points"]])
     first_face = np.cumsum([0, *data["triangles"]])
     faces = data["faces"].astype(np.int64)
-    normals = _smooth_normals(vertices, index, faces, first_vertex, first_face)
+    normals = _smooth_normals(
+        vertices=vertices,
+        index=index,
+        faces=faces,
+        first_vertex=first_vertex,
+        first_face=first_face,
+    )
     patches = []
     for number, tag in enumerate(data["tags"]):
         chart_vertices = slice(first_vertex[number], first_vertex[number + 1])
@@ -129,9 +135,9 @@ def _jeans(t: Texels, color: Array) -> Array:
     seam = np.where((z < 0.88) & (z > 0.08), np.minimum(np.abs(x - 0.005), 9.0), 9.0)
     hem = np.abs(z - 0.085)
     return mix(
-        _woven(color, 0.25)(t),
+        _woven(color, depth=0.25)(t),
         0.6 * color,
-        0.8 * step(0.004 - np.minimum(seam, hem), 0.0, 0.003),
+        0.8 * step(0.004 - np.minimum(seam, hem), 0.0, soft=0.003),
     )
 
 
@@ -143,16 +149,20 @@ def _face(t: Texels, color: Array, hair: Array) -> Array:
     is_front = x > 0.1
     skin = np.clip(color * (1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5))[:, None], 0.0, 1.0)
     lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
-    skin = mix(skin, color * np.array([0.86, 0.62, 0.6]), 0.75 * step(lips, 0.0, 0.25))
+    skin = mix(
+        skin, color * np.array([0.86, 0.62, 0.6]), 0.75 * step(lips, 0.0, soft=0.25)
+    )
     cheeks = np.where(
         is_front, 1.0 - np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
     )
-    skin = mix(skin, color * np.array([1.0, 0.84, 0.8]), 0.5 * step(cheeks, 0.0, 0.6))
+    skin = mix(
+        skin, color * np.array([1.0, 0.84, 0.8]), 0.5 * step(cheeks, 0.0, soft=0.6)
+    )
     arch = 1.659 - 14.0 * (abs_y - 0.034) ** 2
     brow = np.where(
         is_front & (np.abs(abs_y - 0.034) < 0.021), 0.0038 - np.abs(z - arch), -1.0
     )
-    return mix(skin, hair, 0.8 * step(brow, 0.0, 0.0015))
+    return mix(skin, hair, 0.8 * step(brow, 0.0, soft=0.0015))
 
 
 @painter
@@ -163,23 +173,26 @@ def _strands(t: Texels, color: Array) -> Array:
 
 @painter
 def _leather(t: Texels, color: Array) -> Array:
-    return mix(color, parse_hex_color("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, 0.004))
+    return mix(
+        color, parse_hex_color("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, soft=0.004)
+    )
 
 
 @painter
 def _irises(t: Texels, color: Array) -> Array:
     """Paint eyes that look ahead: white, iris and pupil."""
     x, y, z = t.xyz.T
+    # from the nearest pupil; all that is not at the front is white
     pupil_distance = np.where(
         x > 0.128,
         np.hypot(np.abs(y) - 0.031, z - float(0.5 * (z.min() + z.max()))),
         1.0,
     )
     iris = mix(
-        parse_hex_color("e6e2dc"), color, step(0.0065 - pupil_distance, 0.0, 0.001)
+        parse_hex_color("e6e2dc"), color, step(0.0065 - pupil_distance, 0.0, soft=0.001)
     )
     return mix(
-        iris, parse_hex_color("101010"), step(0.003 - pupil_distance, 0.0, 0.001)
+        iris, parse_hex_color("101010"), step(0.003 - pupil_distance, 0.0, soft=0.001)
     )
 
 
@@ -207,7 +220,7 @@ def person(draw: ParameterSampler) -> Instance:
             draw.sample_color(
                 "5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"
             ),
-            0.16,
+            depth=0.16,
         ),
         "trousers": _jeans(
             draw.sample_color(

@@ -153,7 +153,7 @@ def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
     """
     angle = 2 * np.pi * (np.arange(sides + 2) - 0.5) / sides - np.pi / 2
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return round_corners(ring, bevel, steps)[1:-1]
+    return round_corners(ring, radius=bevel, steps=steps)[1:-1]
 
 
 def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Array:
@@ -170,7 +170,7 @@ def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Arra
         (half_width, -half_height),
         (half_width, half_height),
     ]
-    return round_corners(corners, bevel, steps)[1:-1]
+    return round_corners(corners, radius=bevel, steps=steps)[1:-1]
 
 
 def ellipse(half_width: float, half_height: float, count: int = 20) -> Array:
@@ -527,12 +527,12 @@ def vessel(
     inset = min(0.35 * wall, 0.3 * floor)
     base = [(0.0, inset), (0.86 * foot[0], inset), (0.9 * foot[0], foot[1]), foot]
     pieces = [
-        ("base", subdivide(base, 3 * step)),
-        ("outside", subdivide(np.concatenate([outside, lip, inner[:1]]), step)),
-        ("inside", subdivide(inside, step)),
-        ("inside", subdivide([fillet_end, (0.0, floor)], 3 * step)),
+        ("base", subdivide(base, longest=3 * step)),
+        ("outside", subdivide(np.concatenate([outside, lip, inner[:1]]), longest=step)),
+        ("inside", subdivide(inside, longest=step)),
+        ("inside", subdivide([fillet_end, (0.0, floor)], longest=3 * step)),
     ]
-    return lathe(pieces, columns)
+    return lathe(pieces, columns=columns)
 
 
 def _bezier(start: Array, control: Array, end: Array) -> Array:
@@ -594,7 +594,7 @@ def sphere(
         (tag, curve[cut : rows - cut + 1]),
         (tag, curve[rows - cut :]),
     ]
-    return transform_patches(lathe(pieces, columns), offset=centre)
+    return transform_patches(lathe(pieces, columns=columns), offset=centre)
 
 
 def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
@@ -646,7 +646,13 @@ def sweep(
     if scales.ndim < 2:
         scales = scales.reshape(-1, 1)
     scales = np.broadcast_to(scales, (len(centres), 2))
-    points = _sweep_points(section, scales, centres, first_normal, second_normal)
+    points = _sweep_points(
+        section=section,
+        scales=scales,
+        centres=centres,
+        first_normal=first_normal,
+        second_normal=second_normal,
+    )
     normals = _sweep_normals(points, tangent)
     ring_fraction, ring_length = _along(np.concatenate([section, section[:1]]))
     closed = np.concatenate([points, points[:, :1]], axis=1)
@@ -774,7 +780,9 @@ def box(
         for side in (1.0, -1.0):
             u = _edge_coordinates(float(core[i]), bevel, steps, cells)
             v = _edge_coordinates(float(core[j]), bevel, steps, cells)
-            normal, points = _rounded_face(axis, side, u, v, half, bevel)
+            normal, points = _rounded_face(
+                axis=axis, side=side, u=u, v=v, half=half, bevel=bevel
+            )
             down = (v + half[j]) / (2 * half[j])
             across = (u + half[i]) / (2 * half[i])
             if side < 0:

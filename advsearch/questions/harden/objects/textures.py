@@ -153,7 +153,7 @@ def mix(a: Array, b: Array, weight: Array) -> Array:
 
 def band_mask(value: Array, low: float, high: float, soft: float) -> Array:
     """Return 1 between two values and 0 outside, with ramps `soft` wide."""
-    return step(value, low, soft) * step(-value, -high, soft)
+    return step(value, low, soft=soft) * step(-value, -high, soft=soft)
 
 
 def step(value: Array, edge: float, soft: float) -> Array:
@@ -183,7 +183,9 @@ def clouded(
     color: Color, factor: float, scale: float, offset: Array, contrast: float = 2.0
 ) -> Paint:
     """Paint clouds of a color and a shade of it, `scale` wide."""
-    return mottled(color, shade(color, factor), scale, offset, contrast)
+    return mottled(
+        color, shade(color, factor), scale=scale, offset=offset, contrast=contrast
+    )
 
 
 def speckled(
@@ -192,7 +194,7 @@ def speckled(
     """Paint small irregular specks over another paint; `amount` is about their area."""
     return over(
         base,
-        lambda t: step(noise(t.xyz / scale + offset), 1.0 - 1.1 * amount, 0.12),
+        lambda t: step(noise(t.xyz / scale + offset), 1.0 - 1.1 * amount, soft=0.12),
         solid(color),
     )
 
@@ -236,7 +238,9 @@ def rings(
 ) -> Array:
     """Paint stripes across an axis; color b takes `share` of every period."""
     return mix(
-        a, b, step(share / 2 - np.abs(t.xyz[:, axis] / period % 1.0 - 0.5), 0.0, 0.06)
+        a,
+        b,
+        step(share / 2 - np.abs(t.xyz[:, axis] / period % 1.0 - 0.5), 0.0, soft=0.06),
     )
 
 
@@ -256,7 +260,9 @@ def stripes(
     """
     across, _ = _cells(t, cell)
     return mix(
-        a, b, step(share / 2 - np.abs((across + slant * t.v) % 1.0 - 0.5), 0.0, 0.08)
+        a,
+        b,
+        step(share / 2 - np.abs((across + slant * t.v) % 1.0 - 0.5), 0.0, soft=0.08),
     )
 
 
@@ -274,7 +280,9 @@ def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
         """Return the mask of the dots; every other row is shifted by half a cell."""
         across, up = _cells(t, cell)
         across = across + 0.5 * (np.floor(up) % 2.0)
-        return step(radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, 0.1)
+        return step(
+            radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, soft=0.1
+        )
 
     return over(base, staggered, solid(color))
 
@@ -286,7 +294,9 @@ def zigzag(t: Texels, a: Color, b: Color, cell: float) -> Array:
     return mix(
         a,
         b,
-        step(0.25 - np.abs((up + np.abs(across % 1.0 - 0.5)) % 1.0 - 0.5), 0.0, 0.1),
+        step(
+            0.25 - np.abs((up + np.abs(across % 1.0 - 0.5)) % 1.0 - 0.5), 0.0, soft=0.1
+        ),
     )
 
 
@@ -309,7 +319,7 @@ def between(
     """Return the mask of texels between two values of a coordinate, with edges `soft`
     wide.
     """
-    return band_mask(t.xyz[:, axis], low, high, soft)
+    return band_mask(t.xyz[:, axis], low, high, soft=soft)
 
 
 @painter
@@ -325,11 +335,11 @@ def facing(
 
     It is within `half_width` degrees of the azimuth `degrees` about z.
     """
-    weight = band_mask(t.xyz[:, 2], low, high, soft)
+    weight = band_mask(t.xyz[:, 2], low, high, soft=soft)
     in_band = np.nonzero(weight)[0]
     angle = np.degrees(np.arctan2(t.xyz[in_band, 1], t.xyz[in_band, 0]))
     angle_distance = np.abs((angle - degrees + 180.0) % 360.0 - 180.0)
-    weight[in_band] *= step(half_width - angle_distance, 0.0, 2.0)
+    weight[in_band] *= step(half_width - angle_distance, 0.0, soft=2.0)
     return weight
 
 
@@ -361,51 +371,54 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
         return rings(
             first_color,
             second_color,
-            cell,
-            draw(0.5, low=0.2, high=0.8),
+            period=cell,
+            share=draw(0.5, low=0.2, high=0.8),
             axis=int(draw.pick(0, 1, 2)),
         )
     if kind == "stripes":
         return stripes(
             first_color,
             second_color,
-            cell,
-            draw(0.5, low=0.2, high=0.8),
-            int(draw.pick(0, 1, 3)),
+            cell=cell,
+            share=draw(0.5, low=0.2, high=0.8),
+            slant=int(draw.pick(0, 1, 3)),
         )
     if kind == "checks":
-        return checks(first_color, second_color, cell)
+        return checks(first_color, second_color, cell=cell)
     if kind == "dots":
         return dots(
-            solid(first_color), second_color, cell, draw(0.3, low=0.18, high=0.42)
+            solid(first_color),
+            second_color,
+            cell=cell,
+            radius=draw(0.3, low=0.18, high=0.42),
         )
     if kind == "zigzag":
-        return zigzag(first_color, second_color, cell)
+        return zigzag(first_color, second_color, cell=cell)
     if kind == "mottled":
         return mottled(
             first_color,
             second_color,
-            1.5 * cell,
-            noise_offset,
-            draw(2.0, low=1.0, high=4.0),
+            scale=1.5 * cell,
+            offset=noise_offset,
+            contrast=draw(2.0, low=1.0, high=4.0),
         )
     if kind == "speckled":
         return speckled(
             solid(first_color),
             second_color,
-            0.4 * cell,
-            noise_offset,
-            draw(0.2, low=0.1, high=0.4),
+            scale=0.4 * cell,
+            offset=noise_offset,
+            amount=draw(0.2, low=0.1, high=0.4),
         )
     if kind == "gradient":
         return gradient(
-            first_color, second_color, 0.0, size, axis=int(draw.pick(0, 1, 2))
+            first_color, second_color, low=0.0, high=size, axis=int(draw.pick(0, 1, 2))
         )
     if kind == "wood":
         return wood(
             draw.sample_color("9a6a3c", "c89b62", "5b3a22"),
-            0.5 * cell,
-            noise_offset,
+            scale=0.5 * cell,
+            offset=noise_offset,
             axis=int(draw.pick(0, 1, 2)),
         )
     return solid(first_color)

@@ -123,7 +123,7 @@ def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
         mix(light, dark, pentagon.astype(np.float64))
         * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
     )
-    return mix(parse_hex_color("3a3a3a"), base, step(seam_distance, 0.012, 0.016))
+    return mix(parse_hex_color("3a3a3a"), base, step(seam_distance, 0.012, soft=0.016))
 
 
 @painter
@@ -138,7 +138,7 @@ def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array
 @painter
 def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
     """Return the mask of texels of a sphere that are within `reach` of a seam."""
-    return step(-seam(shapes.normalize(t.xyz)), -reach, 0.02)
+    return step(-seam(shapes.normalize(t.xyz)), -reach, soft=0.02)
 
 
 @painter
@@ -147,7 +147,7 @@ def _star(t: Texels, radius: float) -> Array:
     x = t.xyz[:, 0]
     y = t.xyz[:, 1]
     return step(
-        np.cos(5 * np.arctan2(y, x)) * 0.25 - np.hypot(x, y) / radius, -0.55, 0.04
+        np.cos(5 * np.arctan2(y, x)) * 0.25 - np.hypot(x, y) / radius, -0.55, soft=0.04
     )
 
 
@@ -166,12 +166,22 @@ def ball(draw: ParameterSampler) -> Instance:
     offset = draw.offset()
     light = draw.sample_color("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
     dark = draw.sample_color("1d1f22", "23395d", "b5442e", wild=0.3)
-    paint, patches = _ball_surface(draw, style, light, radius, offset, patches, dark)
+    paint, patches = _ball_surface(
+        draw,
+        style=style,
+        light=light,
+        radius=radius,
+        offset=offset,
+        patches=patches,
+        dark=dark,
+    )
     shaped = [
         replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash]))
         for p in shapes.transform_patches(patches, turn)
     ]
-    return Instance(shaped, {"ball": paint}, sample_material(draw, 0.4, 0.3))
+    return Instance(
+        shaped, {"ball": paint}, sample_material(draw, roughness=0.4, clearcoat=0.3)
+    )
 
 
 def _ball_surface(
@@ -195,22 +205,22 @@ def _ball_surface(
     elif style == "basket":
         skin = draw.sample_color("c8642b", "b5532a", "7a3b22", wild=0.2)
         paint = over(
-            clouded(skin, 0.85, 0.7, offset),
-            _near_to(basketball_seams, 0.03),
+            clouded(skin, factor=0.85, scale=0.7, offset=offset),
+            _near_to(basketball_seams, reach=0.03),
             solid("1b1715"),
         )
         patches = _press_seams(patches, radius, 0.015, basketball_seams)
     elif style == "tennis":
         felt = draw.sample_color("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
         paint = over(
-            clouded(felt, 0.85, 0.6, offset),
-            _near_to(tennis_seam, 0.045),
+            clouded(felt, factor=0.85, scale=0.6, offset=offset),
+            _near_to(tennis_seam, reach=0.045),
             solid("eeeee6"),
         )
     elif style == "star":
         paint = over(solid(dark), _star(radius), solid(light))
     elif style == "plain":
-        paint = clouded(dark, 1.2, 3.0, offset)
+        paint = clouded(dark, factor=1.2, scale=3.0, offset=offset)
     elif style == "wild":
         paint = sample_paint(draw, 2 * radius)
     else:
@@ -231,7 +241,7 @@ def banana(draw: ParameterSampler) -> Instance:
     bend = draw(105.0, low=65.0, high=130.0)
     thick = draw(1.65, low=1.45, high=2.1)
     stem = draw(2.4, low=1.6, high=3.6)
-    path, radius = _banana_shape(draw, bend, length, stem, thick)
+    path, radius = _banana_shape(draw, bend=bend, length=length, stem=stem, thick=thick)
     section = _banana_section(draw)
     patches = shapes.sweep(
         "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
@@ -247,8 +257,8 @@ def banana(draw: ParameterSampler) -> Instance:
 
     return Instance(
         patches,
-        {"banana": paint_or_random(draw, length, paint, 0.4)},
-        sample_material(draw, 0.45, 0.1),
+        {"banana": paint_or_random(draw, length, paint, wild=0.4)},
+        sample_material(draw, roughness=0.45, clearcoat=0.1),
     )
 
 
@@ -310,13 +320,15 @@ def _banana_paint(draw: ParameterSampler, path: Array, stem: float) -> Paint:
         color = mix(color, green, stem_green * 0.75)
         color = mix(color, green, np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0) * 0.5)
         fleck = step(
-            noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, 0.08
+            noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, soft=0.08
         )
-        fleck = np.maximum(fleck, step(noise(xyz * 3.7 + offset), 1.02 - amount, 0.08))
+        fleck = np.maximum(
+            fleck, step(noise(xyz * 3.7 + offset), 1.02 - amount, soft=0.08)
+        )
         color = mix(color, brown, fleck * 0.85)
-        color = mix(color, brown, step(-stem_distance, -0.5 * stem, 1.3) * 0.5)
-        color = mix(color, tip, step(-stem_distance, -0.45, 0.5))
-        return mix(color, tip, step(-tip_distance, -0.75, 0.5))
+        color = mix(color, brown, step(-stem_distance, -0.5 * stem, soft=1.3) * 0.5)
+        color = mix(color, tip, step(-stem_distance, -0.45, soft=0.5))
+        return mix(color, tip, step(-tip_distance, -0.75, soft=0.5))
 
     return paint
 
@@ -335,10 +347,16 @@ def book(draw: ParameterSampler) -> Instance:
     bulge = draw(0.35, low=0.0, high=0.7)
     patches: list[Patch] = []
     for z in (board / 2, thick - board / 2):
-        patches += shapes.box("cover", (0.25, 0.0, z), (width, height, board), 0.12)
+        patches += shapes.box(
+            "cover", (0.25, 0.0, z), (width, height, board), bevel=0.12
+        )
     size = (width - lip - 0.5, height - 2 * lip, thick - 2 * board + 0.04)
-    patches += shapes.box("pages", (0.3 - lip / 2, 0.0, thick / 2), size, 0.05, steps=1)
-    patches += _round_spine(thick, width, bulge, board, height)
+    patches += shapes.box(
+        "pages", (0.3 - lip / 2, 0.0, thick / 2), size, bevel=0.05, steps=1
+    )
+    patches += _round_spine(
+        thick=thick, width=width, bulge=bulge, board=board, height=height
+    )
     turned = shapes.transform_patches(
         patches, shapes.rotation("z", draw(-122.0, low=-150.0, high=-100.0))
     )
@@ -348,7 +366,7 @@ def book(draw: ParameterSampler) -> Instance:
     return Instance(
         turned,
         {"cover": front, "pages": pages_paint, "spine": spine},
-        sample_material(draw, 0.55, 0.0),
+        sample_material(draw, roughness=0.55, clearcoat=0.0),
     )
 
 
@@ -379,9 +397,16 @@ def _book_paints(
         "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
     )
     gold = draw.sample_color("d8b45a", "efe6cf", "1d1f22", wild=0.25)
-    base = paint_or_random(draw, height, clouded(cloth, 0.85, 0.6, offset, 1.2), 0.3)
+    base = paint_or_random(
+        draw,
+        height,
+        clouded(cloth, factor=0.85, scale=0.6, offset=offset, contrast=1.2),
+        wild=0.3,
+    )
     title = draw.pick("frame", "blocks", "picture", "plain")
-    front = _front(draw, base, gold, title, width, height, thick)
+    front = _front(
+        draw, base=base, gold=gold, title=title, width=width, height=height, thick=thick
+    )
     paper = parse_hex_color("f4f2ea")
     if draw.chance(0.7, canonical=True):
         paper = parse_hex_color("ece2c8")
@@ -400,18 +425,18 @@ def _book_paints(
         """Paint two bands at each end, and words in a block in the middle."""
         y = np.abs(t.xyz[:, 1]) / height
         band = np.maximum(
-            step(0.008 - np.abs(y - 0.36), 0.0, 0.006),
-            step(0.008 - np.abs(y - 0.42), 0.0, 0.006),
+            step(0.008 - np.abs(y - 0.36), 0.0, soft=0.006),
+            step(0.008 - np.abs(y - 0.42), 0.0, soft=0.006),
         )
-        block = step(0.16 - y, 0.0, 0.01) * step(
-            0.22 * thick - np.abs(t.xyz[:, 2] - thick / 2), 0.0, 0.05
+        block = step(0.16 - y, 0.0, soft=0.01) * step(
+            0.22 * thick - np.abs(t.xyz[:, 2] - thick / 2), 0.0, soft=0.05
         )
         words = step(
             noise(
                 np.stack([t.xyz[:, 1] * 1.8, t.xyz[:, 2] * 0.2, 0 * y], axis=1) + 3.0
             ),
             0.36,
-            0.1,
+            soft=0.1,
         )
         return mix(base(t), gold, np.maximum(band, block * words))
 
@@ -475,8 +500,8 @@ def _front(
 
     def inside(x: Array, y: Array, half_width: float, half_height: float) -> Array:
         """Return the mask of a rectangle around the origin."""
-        in_width = step(half_width - np.abs(x), 0.0, 0.12)
-        return in_width * step(half_height - np.abs(y), 0.0, 0.12)
+        in_width = step(half_width - np.abs(x), 0.0, soft=0.12)
+        return in_width * step(half_height - np.abs(y), 0.0, soft=0.12)
 
     def paint(t: Texels) -> Array:
         """Paint the base, and on the upper side the decoration and the words."""
@@ -493,7 +518,7 @@ def _front(
                 color,
                 gold,
                 picture
-                * step(0.16 * width - np.hypot(x, y + 0.12 * height), 0.0, 0.15),
+                * step(0.16 * width - np.hypot(x, y + 0.12 * height), 0.0, soft=0.15),
             )
         if title == "frame":
             frame = inside(x, y, 0.43 * width, 0.45 * height) - inside(
@@ -503,15 +528,15 @@ def _front(
         words = step(
             noise(np.stack([x * 1.5, 0 * x, np.floor(y / 2.0)], axis=1) + 7.0),
             0.3,
-            0.08,
+            soft=0.08,
         )
-        rows = step(np.abs((y / 2.0) % 1.0 - 0.5), 0.22, 0.1) * words
+        rows = step(np.abs((y / 2.0) % 1.0 - 0.5), 0.22, soft=0.1) * words
         lines = inside(x, y - 0.24 * height, 0.32 * width, 0.09 * height) * rows
         color = mix(color, gold, np.clip(lines, 0.0, 1.0) * top)
         if title != "picture":
             center_distance = np.hypot(x, y + 0.16 * height)
-            seal = step(0.14 * width - center_distance, 0.0, 0.12) - step(
-                0.1 * width - center_distance, 0.0, 0.12
+            seal = step(0.14 * width - center_distance, 0.0, soft=0.12) - step(
+                0.1 * width - center_distance, 0.0, soft=0.12
             )
             color = mix(color, gold, seal * top)
         return color
@@ -599,12 +624,12 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
     z = t.xyz[:, 2]
     # of the octagon through each texel, the apothem
     out = np.max([y * np.cos(a) + z * np.sin(a) for a in side_angles], axis=0)
-    rim = step(out - 0.915 * apothem, 0.0, 0.006)
-    rim = rim * step(0.985 * apothem - out, 0.0, 0.006)
+    rim = step(out - 0.915 * apothem, 0.0, soft=0.006)
+    rim = rim * step(0.985 * apothem - out, 0.0, soft=0.006)
 
     strokes = _word_strokes("STOP", 0.52 * apothem)
     stroke_distance = shapes.distance_to_polylines(y, z, *strokes)
-    word = step(0.05 * apothem - stroke_distance, 0.0, 0.006)
+    word = step(0.05 * apothem - stroke_distance, 0.0, soft=0.006)
     return mix(red, parse_hex_color("f3f2ee"), np.maximum(rim, word))
 
 
@@ -616,13 +641,17 @@ def stop_sign(draw: ParameterSampler) -> Instance:
     red = draw.sample_color("b3121d", "a8161f", "c0202a", wild=0.0)
     plate = _sign_plate(radius, height)
     post = _sign_post(height, radius)
-    foot = shapes.box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2)
-    foot += shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1)
+    foot = shapes.box(
+        "rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), bevel=0.02, steps=2
+    )
+    foot += shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), bevel=0.01, steps=1)
     heights = (height - 0.5 * radius, height + 0.5 * radius)
     clamps = [
         patch
         for z in heights
-        for patch in shapes.box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)
+        for patch in shapes.box(
+            "post", (0.008, 0.0, z), (0.05, 0.09, 0.03), bevel=0.006, steps=1
+        )
     ]
     grey = draw.sample_color("9a9da0", "7d8083", wild=0.0)
     paints = {
@@ -639,14 +668,14 @@ def stop_sign(draw: ParameterSampler) -> Instance:
         turned,
         paints,
         FINISHES["face"],
-        {"metal": 0.25, "post": 0.18, "rubber": 0.3},
-        FINISHES,
+        detail={"metal": 0.25, "post": 0.18, "rubber": 0.3},
+        finishes=FINISHES,
     )
 
 
 def _sign_plate(radius: float, height: float) -> list[Patch]:
     """Create the octagonal plate of a stop sign."""
-    ring = shapes.polygon(8, 0.02, 2) * radius
+    ring = shapes.polygon(8, bevel=0.02, steps=2) * radius
     ahead = np.array([1.0, 0.0, 0.0])
     # an octagon that looks along +x, its middle at the origin
     back = np.insert(ring, 0, 0.0, axis=1)
@@ -669,10 +698,10 @@ def _sign_post(height: float, radius: float) -> list[Patch]:
             (0.03, height + 0.7 * radius),
             (0.0, height + 0.7 * radius + 0.004),
         ],
-        0.004,
-        2,
+        radius=0.004,
+        steps=2,
     )
     return shapes.lathe(
         [("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])],
-        20,
+        columns=20,
     )

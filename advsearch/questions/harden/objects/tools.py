@@ -42,7 +42,7 @@ def _claw(
     half_thickness = half * (0.72 * (1 - t) + 0.1)
     half_width = half * 0.47 * (1.0 - 0.25 * t)
     scale = np.stack([half_thickness, half_width], axis=1)
-    section = shapes.rectangle(2.0, 2.0, 0.5, 2)
+    section = shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
     patches = []
     for side in (-1.0, 1.0):
         x = 0.25 * half - drop * t**1.8
@@ -75,9 +75,11 @@ def _peen(
         neck = _points_on_y(start - 0.3, start + 0.5 * length)
         center = (0.0, start + 0.75 * length, 0.0)
         stem = shapes.sweep(
-            "head", neck, shapes.ellipse(1, 1, 20), np.array([0.75, 0.6]) * half
+            "head", neck, shapes.ellipse(1, 1, count=20), np.array([0.75, 0.6]) * half
         )
-        return stem + shapes.sphere("head", 0.95 * half, center, rows=16, columns=24)
+        return stem + shapes.sphere(
+            "head", 0.95 * half, centre=center, rows=16, columns=24
+        )
     path = _points_on_y(
         start, start + 0.3 * length, start + 0.9 * length, start + length
     )
@@ -85,7 +87,7 @@ def _peen(
     return shapes.sweep(
         "head",
         path,
-        shapes.rectangle(2.0, 2.0, 0.4),
+        shapes.rectangle(2.0, 2.0, bevel=0.4),
         scale,
         first=(1.0, 0.0, 0.0),
         caps=True,
@@ -106,7 +108,7 @@ def hammer(draw: ParameterSampler) -> Instance:
     eye = half * draw(1.25, low=1.1, high=1.5)
     front = max(front, 2.2 * eye)
 
-    head = _hammer_head(draw, half, eye, style, front, face)
+    head = _hammer_head(draw, half=half, eye=eye, style=style, front=front, face=face)
 
     swelling, half_thickness, handle = _hammer_handle(draw, half, length)
 
@@ -121,7 +123,9 @@ def hammer(draw: ParameterSampler) -> Instance:
     )
 
     paints = _hammer_paints(draw, front, length)
-    return Instance(patches, paints, sample_material(draw, 0.38, 0.2))
+    return Instance(
+        patches, paints, sample_material(draw, roughness=0.38, clearcoat=0.2)
+    )
 
 
 def _hammer_head(
@@ -151,7 +155,7 @@ def _hammer_head(
     head = shapes.sweep(
         "head",
         path,
-        shapes.rectangle(2.0, 2.0, 0.45),
+        shapes.rectangle(2.0, 2.0, bevel=0.45),
         scale,
         first=(1.0, 0.0, 0.0),
         caps=True,
@@ -159,9 +163,9 @@ def _hammer_head(
     if style == "sledge":
         path = _points_on_y(-front, -front + 0.3, front - 0.3, front)
         section = (
-            shapes.polygon(8, 0.1)
+            shapes.polygon(8, bevel=0.1)
             if draw.chance(0.5)
-            else shapes.rectangle(1.8, 1.8, 0.4)
+            else shapes.rectangle(1.8, 1.8, bevel=0.4)
         )
         scale = np.array([0.85, 1.0, 1.0, 0.85]) * face * 1.25
         head = shapes.sweep(
@@ -183,7 +187,7 @@ def _hammer_head(
         head += shapes.sweep(
             "head",
             path,
-            shapes.ellipse(1.0, 1.0, 28),
+            shapes.ellipse(1.0, 1.0, count=28),
             scale,
             first=(1.0, 0.0, 0.0),
             caps=True,
@@ -191,10 +195,10 @@ def _hammer_head(
         if style == "claw":
             head += _claw(
                 draw,
-                half,
-                eye * 0.95,
-                draw(6.4, low=5.0, high=7.5),
-                draw(2.6, low=1.2, high=3.6),
+                half=half,
+                start=eye * 0.95,
+                length=draw(6.4, low=5.0, high=7.5),
+                drop=draw(2.6, low=1.2, high=3.6),
             )
         else:
             head += _peen(draw, half, eye, draw(4.0, low=3.0, high=5.0))
@@ -238,9 +242,9 @@ def _hammer_handle(
     )
     scale[0] *= 0.9  # a bevel at the head
     if draw.chance(0.6, canonical=True):
-        section = shapes.ellipse(1.0, 1.0, 24)
+        section = shapes.ellipse(1.0, 1.0, count=24)
     else:
-        section = shapes.rectangle(2.0, 2.0, 0.7)
+        section = shapes.rectangle(2.0, 2.0, bevel=0.7)
     handle = shapes.sweep("handle", path, section, scale, first=(0.0, 1.0, 0.0))
     return swelling, half_thickness, handle
 
@@ -252,14 +256,14 @@ def _hammer_paints(
     offset = draw.offset()
     steel = draw.sample_color("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
     metal = over(
-        clouded(steel, 0.8, 1.6, offset, 2.4),
-        lambda t: step(-t.xyz[:, 1], 0.86 * front, 0.3),
+        clouded(steel, factor=0.8, scale=1.6, offset=offset, contrast=2.4),
+        lambda t: step(-t.xyz[:, 1], 0.86 * front, soft=0.3),
         solid(shade(steel, 1.7)),
     )
     timber = wood(
         draw.sample_color("c48f55", "a8743f", "d9b27c", "7a4f2a", wild=0.05),
-        0.9,
-        offset,
+        scale=0.9,
+        offset=offset,
         axis=0,
     )
     stain = draw.sample_color("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
@@ -274,15 +278,15 @@ def _hammer_paints(
             solid(stain),
         )
     elif kind == "rubber":
-        ribs = rings(stain, shade(stain, 0.7), 1.1, 0.2, axis=0)
+        ribs = rings(stain, shade(stain, 0.7), period=1.1, share=0.2, axis=0)
         hold = over(
             solid(shade(stain, 0.5)),
             between(-2 * length, -0.45 * length, axis=0, soft=0.05),
             ribs,
         )
     return {
-        "head": paint_or_random(draw, length, metal, 0.3),
-        "handle": paint_or_random(draw, length, hold, 0.3),
+        "head": paint_or_random(draw, length, metal, wild=0.3),
+        "handle": paint_or_random(draw, length, hold, wild=0.3),
     }
 
 
@@ -309,13 +313,15 @@ def _weights(
         return shapes.sweep(
             "weight",
             path,
-            shapes.polygon(6, 0.14, 3),
+            shapes.polygon(6, bevel=0.14, steps=3),
             scale,
             first=(0.0, 1.0, 0.0),
             caps=True,
         )
     if style == "globe":
-        return shapes.sphere("weight", radius * 0.95, (0.0, 0.0, at + 0.8 * radius))
+        return shapes.sphere(
+            "weight", radius * 0.95, centre=(0.0, 0.0, at + 0.8 * radius)
+        )
     n_plates = 3 if style == "plates" else 1
     patches = []
     z = at
@@ -331,24 +337,24 @@ def _weights(
                 (plate_radius, z + thickness),
                 (hub_radius, z + thickness),
             ],
-            bevel,
-            4,
+            radius=bevel,
+            steps=4,
         )
         under = [(0.0, z), (hub_radius, z)]
         top = [(hub_radius, z + thickness), (0.0, z + thickness)]
         patches += shapes.lathe(
             [
                 ("weight", under),
-                ("weight", shapes.subdivide(side, 1.2)),
+                ("weight", shapes.subdivide(side, longest=1.2)),
                 ("weight", top),
             ],
-            44,
+            columns=44,
         )
         z += length / n_plates
     if style == "plates":
-        nut = shapes.ellipse(1.0, 1.0, 24)
+        nut = shapes.ellipse(1.0, 1.0, count=24)
         if draw.chance(0.5):
-            nut = shapes.polygon(6, 0.1)
+            nut = shapes.polygon(6, bevel=0.1)
         path = [(0, 0, z - 0.1), (0, 0, z + 0.6), (0, 0, z + 0.75)]
         scale = np.array([1.0, 1.0, 0.85]) * 0.42 * radius
         patches += shapes.sweep(
@@ -370,9 +376,9 @@ def dumbbell(draw: ParameterSampler) -> Instance:
     profile = np.stack(
         [bar * (1.0 + swell * np.cos(np.pi * z / (2 * grip + 1.2)) ** 2), z], axis=1
     )
-    weights = _weights(draw, style, grip, length, radius)
+    weights = _weights(draw, style=style, at=grip, length=length, radius=radius)
     patches = (
-        shapes.lathe([("bar", profile)], 28)
+        shapes.lathe([("bar", profile)], columns=28)
         + weights
         + shapes.transform_patches(weights, shapes.rotation("y", 180.0))
     )
@@ -380,8 +386,10 @@ def dumbbell(draw: ParameterSampler) -> Instance:
         shapes.transform_patches(patches, shapes.rotation("y", 90.0)),
         shapes.rotation("z", draw(118.0, low=90.0, high=150.0)),
     )
-    paints = _dumbbell_paints(draw, grip, style, length, radius)
-    return Instance(laid, paints, sample_material(draw, 0.42, 0.2))
+    paints = _dumbbell_paints(
+        draw, grip=grip, style=style, length=length, radius=radius
+    )
+    return Instance(laid, paints, sample_material(draw, roughness=0.42, clearcoat=0.2))
 
 
 def _dumbbell_paints(
@@ -393,21 +401,25 @@ def _dumbbell_paints(
         "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", wild=0.25
     )
     weight = speckled(
-        clouded(iron, 1.25, 2.5, offset),
+        clouded(iron, factor=1.25, scale=2.5, offset=offset),
         shade(iron, 1.9),
-        0.35,
-        offset,
-        draw(0.08, low=0.0, high=0.2),
+        scale=0.35,
+        offset=offset,
+        amount=draw(0.08, low=0.0, high=0.2),
     )
     tip = grip + (length if style != "globe" else 1.75 * radius)
     accent = draw.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
     if draw.chance(0.5, canonical=True):
 
         def on_both_ends(t: Texels) -> Array:
+            """Return the mask of a ring on the outer side of each weight."""
             ring = band_mask(
-                np.hypot(t.xyz[:, 0], t.xyz[:, 1]), 0.34 * radius, 0.44 * radius, 0.12
+                np.hypot(t.xyz[:, 0], t.xyz[:, 1]),
+                0.34 * radius,
+                0.44 * radius,
+                soft=0.12,
             )
-            return step(np.abs(t.xyz[:, 2]), tip - 0.6, 0.05) * ring
+            return step(np.abs(t.xyz[:, 2]), tip - 0.6, soft=0.05) * ring
 
         weight = over(weight, on_both_ends, solid(accent))
     steel = draw.sample_color("b4b8bd", "8d9298", "2b2d30", wild=0.2)
@@ -415,11 +427,11 @@ def _dumbbell_paints(
         solid(steel),
         lambda t: (
             (
-                step(np.sin(90 * t.u + 60 * t.v), 0.3, 0.6)
+                step(np.sin(90 * t.u + 60 * t.v), 0.3, soft=0.6)
                 * between(-0.75 * grip, 0.75 * grip)(t)
             )
             * 0.6
         ),
         solid(shade(steel, 0.55)),
     )
-    return {"weight": paint_or_random(draw, 2 * tip, weight, 0.35), "bar": knurl}
+    return {"weight": paint_or_random(draw, 2 * tip, weight, wild=0.35), "bar": knurl}

@@ -68,7 +68,7 @@ def make_handle(
     half_thickness = draw(0.42, low=0.32, high=0.6)
     half_width = draw(0.62, low=0.4, high=0.95)
     if draw.chance(0.7, canonical=True):
-        section = shapes.ellipse(half_thickness, half_width, 16)
+        section = shapes.ellipse(half_thickness, half_width, count=16)
     else:
         section = shapes.rectangle(
             2 * half_thickness, 2 * half_width, bevel=0.6 * half_thickness
@@ -97,8 +97,10 @@ def _handle_curve(
     edge = max(low_root[0], high_root[0])
     if style == "square":
         corners = [high_root, (edge + reach, high), (edge + reach, low), low_root]
-        rounded = shapes.round_corners(corners, 0.45 * reach, 6)
-        return shapes.spline(shapes.subdivide(rounded, 0.8), HANDLE_POINTS)
+        rounded = shapes.round_corners(corners, radius=0.45 * reach, steps=6)
+        return shapes.spline(
+            shapes.subdivide(rounded, longest=0.8), count=HANDLE_POINTS
+        )
     # how far it extends at the top, the middle and the bottom, in units of `reach`
     top, middle, bottom = {
         "round": (0.82, 0.98, 0.82),
@@ -115,7 +117,7 @@ def _handle_curve(
         (edge + 0.3 * reach, low + 0.03 * height),
         low_root,
     ]
-    return shapes.spline(knots, HANDLE_POINTS)
+    return shapes.spline(knots, count=HANDLE_POINTS)
 
 
 def _ceramic(
@@ -150,29 +152,34 @@ def _ceramic(
         return over(
             glaze,
             between(0.62 * height, 0.9 * height),
-            rings(parse_hex_color(pale), second, 0.13 * height),
+            rings(parse_hex_color(pale), second, period=0.13 * height),
         )
     if kind == "dots":
         return dots(
-            glaze, second, draw(2.0, low=1.2, high=3.2), draw(0.3, low=0.2, high=0.4)
+            glaze,
+            second,
+            cell=draw(2.0, low=1.2, high=3.2),
+            radius=draw(0.3, low=0.2, high=0.4),
         )
     if kind == "stripes":
         ground = draw.sample_color(pale, "f4f4f2")
         return stripes(
             ground,
             second,
-            draw(1.8, low=1.0, high=4.0),
-            draw(0.5, low=0.25, high=0.6),
-            int(draw.pick(0, 2)),
+            cell=draw(1.8, low=1.0, high=4.0),
+            share=draw(0.5, low=0.25, high=0.6),
+            slant=int(draw.pick(0, 2)),
         )
     if kind == "checks":
-        board = checks(draw.sample_color(pale), second, draw(1.4, low=0.9, high=2.2))
+        board = checks(
+            draw.sample_color(pale), second, cell=draw(1.4, low=0.9, high=2.2)
+        )
         return over(glaze, between(0.25 * height, 0.75 * height), board)
     if kind == "zigzag":
         return over(
             glaze,
             between(0.3 * height, 0.7 * height),
-            zigzag(draw.sample_color(pale), second, 2.5),
+            zigzag(draw.sample_color(pale), second, cell=2.5),
         )
     if kind == "dip":
         return over(
@@ -184,8 +191,8 @@ def _ceramic(
         return rings(
             draw.sample_color(pale),
             second,
-            height * draw(0.12, low=0.06, high=0.25),
-            draw(0.5, low=0.2, high=0.7),
+            period=height * draw(0.12, low=0.06, high=0.25),
+            share=draw(0.5, low=0.2, high=0.7),
         )
     return glaze
 
@@ -205,11 +212,11 @@ def mug(draw: ParameterSampler) -> Instance:
     grip = make_handle(
         draw,
         style,
-        grip_low,
-        grip_high,
-        draw(2.9, low=2.3, high=3.4),
-        side,
-        0.55 * wall,
+        low=grip_low,
+        high=grip_high,
+        reach=draw(2.9, low=2.3, high=3.4),
+        profile=side,
+        inset=0.55 * wall,
     )
 
     paints = _mug_paints(draw, height)
@@ -218,7 +225,10 @@ def mug(draw: ParameterSampler) -> Instance:
         SEAM_ROTATION,
     )
     return Instance(
-        patches, paints, sample_material(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6}
+        patches,
+        paints,
+        sample_material(draw, roughness=0.3, clearcoat=0.5),
+        detail={"inside": 0.8, "base": 0.6},
     )
 
 
@@ -239,9 +249,9 @@ def _mug_body(
         (0.5 * (foot + top) + belly, 0.5 * height),
         (top, height),
     ]
-    side = shapes.spline(np.array(corners[1:]), 14)
+    side = shapes.spline(np.array(corners[1:]), count=14)
     outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
-    body = shapes.vessel(outside, wall, draw(0.6, low=0.5, high=0.9))
+    body = shapes.vessel(outside, wall=wall, floor=draw(0.6, low=0.5, high=0.9))
     return wall, side, body
 
 
@@ -253,14 +263,14 @@ def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
     )
     specks = draw.sample_color("7d6247", wild=0.2)
     glaze = speckled(
-        clouded(clay, 0.93, 3.0, offset),
+        clouded(clay, factor=0.93, scale=3.0, offset=offset),
         specks,
-        0.28,
-        offset,
-        draw(0.06, low=0.0, high=0.14),
+        scale=0.28,
+        offset=offset,
+        amount=draw(0.06, low=0.0, high=0.14),
     )
     deep = draw.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
-    accent = clouded(deep, 1.35, 2.2, offset)
+    accent = clouded(deep, factor=1.35, scale=2.2, offset=offset)
     outer = paint_or_random(draw, height, _ceramic(draw, height, glaze, accent))
     inner = outer
     if not draw.chance(0.15):
@@ -287,8 +297,10 @@ def bowl(draw: ParameterSampler) -> Instance:
     body = _bowl_body(draw, radius, height)
     offset = draw.offset()
     clay = draw.sample_color("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
-    glaze = clouded(clay, 0.72, 2.6, offset)
-    accent = mottled(parse_hex_color("e8dcc0"), parse_hex_color("d6c39a"), 2.0, offset)
+    glaze = clouded(clay, factor=0.72, scale=2.6, offset=offset)
+    accent = mottled(
+        parse_hex_color("e8dcc0"), parse_hex_color("d6c39a"), scale=2.0, offset=offset
+    )
     raw = solid("9b7352")
     if draw.rng is None:
         rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
@@ -300,14 +312,14 @@ def bowl(draw: ParameterSampler) -> Instance:
         glaze,
         outer,
         solid(draw.sample_color("f3f1ec")),
-        rings(clay, shade(clay, 1.3), height * 0.2),
+        rings(clay, shade(clay, 1.3), period=height * 0.2),
     )
     paints = {"outside": outer, "inside": inner, "base": raw}
     return Instance(
         shapes.transform_patches(body, SEAM_ROTATION),
         paints,
-        sample_material(draw, 0.28, 0.5),
-        {"base": 0.6},
+        sample_material(draw, roughness=0.28, clearcoat=0.5),
+        detail={"base": 0.6},
     )
 
 
@@ -326,9 +338,9 @@ def _bowl_body(draw: ParameterSampler, radius: float, height: float) -> list[Pat
         (radius + flare, height),
     ]
     return shapes.vessel(
-        np.array([(foot, 0.0), *shapes.spline(knots, 22)]),
-        draw(0.45, low=0.32, high=0.65),
-        ring + 0.55,
+        np.array([(foot, 0.0), *shapes.spline(knots, count=22)]),
+        wall=draw(0.45, low=0.32, high=0.65),
+        floor=ring + 0.55,
         step=0.9,
     )
 
@@ -342,8 +354,8 @@ def bottle(draw: ParameterSampler) -> Instance:
     return Instance(
         shapes.transform_patches(patches, SEAM_ROTATION),
         paints,
-        sample_material(draw, 0.2, 0.6),
-        {"inside": 0.25, "base": 0.5},
+        sample_material(draw, roughness=0.2, clearcoat=0.6),
+        detail={"inside": 0.25, "base": 0.5},
     )
 
 
@@ -367,7 +379,7 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
         (neck * 0.95, height - 1.6),
     ]
     curve = shapes.round_corners(
-        corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7
+        corners, radius=[0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], steps=7
     )
     wide = neck * 0.95 + draw(0.28, low=0.1, high=0.4)
     ring = [
@@ -377,9 +389,9 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
         (neck * 0.93, height),
     ]
     capped = draw.chance(0.4)
-    outside = np.concatenate([shapes.subdivide(curve, 1.6), ring])
+    outside = np.concatenate([shapes.subdivide(curve, longest=1.6), ring])
     patches = shapes.vessel(
-        outside, draw(0.35, low=0.3, high=0.45), 0.8, step=1.6, columns=48
+        outside, wall=draw(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
     )
     if capped:
         patches += _cap(draw, wide + 0.12, height)
@@ -394,20 +406,24 @@ def _bottle_paints(
     glass = draw.sample_color(
         "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
     )
-    surface = paint_or_random(draw, height, clouded(glass, 1.25, 9.0, offset), 0.25)
+    surface = paint_or_random(
+        draw, height, clouded(glass, factor=1.25, scale=9.0, offset=offset), wild=0.25
+    )
     paper = draw.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
     ink = draw.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
     low = 0.14 * height
     high = min(draw(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
     outer = (
-        surface if draw.chance(0.2) else _labelled(draw, surface, paper, ink, low, high)
+        surface
+        if draw.chance(0.2)
+        else _labelled(draw, surface=surface, paper=paper, ink=ink, low=low, high=high)
     )
     foil = draw.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
     if draw.chance(0.5, canonical=True):
         outer = over(
             outer,
             between(height * 0.8, 2 * height),
-            speckled(solid(foil), shade(foil, 1.3), 0.5, offset),
+            speckled(solid(foil), shade(foil, 1.3), scale=0.5, offset=offset),
         )
     return {
         "outside": outer,
@@ -423,15 +439,15 @@ def _cap(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     top = height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
     side = shapes.round_corners(
-        [(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4
+        [(radius, low), (radius, top), (0.6 * radius, top)], radius=0.3, steps=4
     )
     return shapes.lathe(
         [
             ("cap", under),
-            ("cap", shapes.subdivide(side, 0.8)),
+            ("cap", shapes.subdivide(side, longest=0.8)),
             ("cap", [[0.6 * radius, top], [0.0, top]]),
         ],
-        40,
+        columns=40,
     )
 
 
@@ -446,41 +462,75 @@ def _labelled(
     """Paint a paper label opposite the texture's seam.
 
     It has a frame, a title bar, lines of text and a round seal.
+
+    Args:
+        draw: samples its width.
+        surface: of the bottle.
+        paper, ink: colors.
+        low, high: heights of its edges.
     """
-    at = 180.0
-    half = draw(95.0, low=60.0, high=180.0)
+    azimuth = 180.0
+    half_angle = draw(95.0, low=60.0, high=180.0)
     span = high - low
-    label = over(surface, facing(at, half, low, high, 0.08), solid(paper))
+    label = over(
+        surface,
+        facing(azimuth, half_width=half_angle, low=low, high=high, soft=0.08),
+        solid(paper),
+    )
     label = over(
         label,
-        facing(at, half - 6.0, high - 0.12 * span, high - 0.07 * span, 0.05),
+        facing(
+            azimuth,
+            half_width=half_angle - 6.0,
+            low=high - 0.12 * span,
+            high=high - 0.07 * span,
+            soft=0.05,
+        ),
         solid(ink),
     )
     label = over(
         label,
-        facing(at, half - 6.0, low + 0.06 * span, low + 0.1 * span, 0.05),
+        facing(
+            azimuth,
+            half_width=half_angle - 6.0,
+            low=low + 0.06 * span,
+            high=low + 0.1 * span,
+            soft=0.05,
+        ),
         solid(ink),
     )
     title = facing(
-        at, 0.42 * min(half, 95.0), low + 0.6 * span, low + 0.76 * span, 0.05
+        azimuth,
+        half_width=0.42 * min(half_angle, 95.0),
+        low=low + 0.6 * span,
+        high=low + 0.76 * span,
+        soft=0.05,
     )
     label = over(label, title, solid(shade(ink, 0.8)))
     for i, share in enumerate((0.5, 0.36, 0.44)):
         z = low + (0.5 - 0.1 * i) * span
         label = over(
             label,
-            facing(at, share * min(half, 95.0), z, z + 0.035 * span, 0.05),
+            facing(
+                azimuth,
+                half_width=share * min(half_angle, 95.0),
+                low=z,
+                high=z + 0.035 * span,
+                soft=0.05,
+            ),
             solid(ink),
         )
 
     def seal(texels: Texels) -> Array:
+        """Return the mask of a disc at the lower end of the label."""
         xyz = texels.xyz
         angle = np.radians(
-            (np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) - at + 180.0) % 360.0 - 180.0
+            (np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) - azimuth + 180.0) % 360.0
+            - 180.0
         )
         radius = float(np.hypot(xyz[:, 0], xyz[:, 1]).max())
         center_distance = np.hypot(angle * radius, xyz[:, 2] - (low + 0.2 * span))
-        return step(0.09 * span - center_distance, 0.0, 0.08)
+        return step(0.09 * span - center_distance, 0.0, soft=0.08)
 
     return over(label, seal, solid("b08d3c"))
 
@@ -493,7 +543,7 @@ def vase(draw: ParameterSampler) -> Instance:
     patches += _vase_handles(draw, belly_at, neck_at, profile)
     offset = draw.offset()
     clay = draw.sample_color("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
-    glaze = clouded(clay, 0.95, 4.0, offset)
+    glaze = clouded(clay, factor=0.95, scale=4.0, offset=offset)
     outer = paint_or_random(draw, height, _vase_paint(draw, glaze, height, offset))
     paints = {
         "outside": outer,
@@ -504,8 +554,8 @@ def vase(draw: ParameterSampler) -> Instance:
     return Instance(
         shapes.transform_patches(patches, SEAM_ROTATION),
         paints,
-        sample_material(draw, 0.25, 0.6),
-        {"inside": 0.35, "base": 0.5},
+        sample_material(draw, roughness=0.25, clearcoat=0.6),
+        detail={"inside": 0.35, "base": 0.5},
     )
 
 
@@ -530,8 +580,10 @@ def _vase_body(
         (neck, neck_at),
         (lip, height),
     ]
-    profile = shapes.spline(knots, 34)
-    patches = shapes.vessel(profile, draw(0.4, low=0.35, high=0.6), 0.8, step=1.2)
+    profile = shapes.spline(knots, count=34)
+    patches = shapes.vessel(
+        profile, wall=draw(0.4, low=0.35, high=0.6), floor=0.8, step=1.2
+    )
     return belly_at, neck_at, profile, patches
 
 
@@ -544,7 +596,13 @@ def _vase_handles(
         low = belly_at + 0.15 * (neck_at - belly_at)
         high = neck_at - 0.2
         ear = make_handle(
-            draw, "ear", low, high, draw(1.6, low=1.2, high=2.4), profile, 0.2
+            draw,
+            "ear",
+            low=low,
+            high=high,
+            reach=draw(1.6, low=1.2, high=2.4),
+            profile=profile,
+            inset=0.2,
         )
         patches += [
             *shapes.transform_patches(ear, shapes.rotation("z", 130.0)),
@@ -559,20 +617,24 @@ def _vase_paint(
     """Paint blue brushwork on the canonical vase; glazes, bands and drips on others."""
     ink = draw.sample_color("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
     if draw.rng is not None and draw.chance(0.6):
-        return _ceramic(draw, height, glaze, clouded(ink, 1.3, 3.0, offset))
+        return _ceramic(
+            draw, height, glaze, clouded(ink, factor=1.3, scale=3.0, offset=offset)
+        )
 
     def scroll(texels: Texels) -> Array:
+        """Return the mask of curling petals around the belly."""
         angle = np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])
         z = texels.xyz[:, 2] / height
         curl = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
         petal = curl * (0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle)))
-        return step(petal, 0.55, 0.16) * between(
+        return step(petal, 0.55, soft=0.16) * between(
             0.24 * height, 0.74 * height, soft=0.1
         )(texels)
 
     def frieze(texels: Texels) -> Array:
+        """Return the mask of a band of 16 teeth above the foot."""
         teeth = step(
-            np.sin(16 * np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])), 0.0, 0.5
+            np.sin(16 * np.arctan2(texels.xyz[:, 1], texels.xyz[:, 0])), 0.0, soft=0.5
         )
         return between(0.09 * height, 0.17 * height, soft=0.1)(texels) * teeth
 
@@ -595,15 +657,23 @@ def wine_glass(draw: ParameterSampler) -> Instance:
     foot = draw(3.5, low=2.9, high=4.2)
     stem = draw(0.42, low=0.32, high=0.6)
     stem_top = draw(9.5, low=6.0, high=12.0)
-    deep, wall, outer = _glass_bowl(draw, stem, stem_top)
-    inner, lip = _glass_lip(outer, wall, stem_top, deep)
-    profile = _glass_profile(stem_top, deep, inner, foot, stem, outer, lip)
-    body = shapes.lathe(profile, 52)
-    paints = _glass_paints(draw, stem_top, deep)
+    depth, wall, outer = _glass_bowl(draw, stem, stem_top)
+    inner, lip = _glass_lip(outer, wall, stem_top, depth)
+    profile = _glass_profile(
+        stem_top=stem_top,
+        depth=depth,
+        inner=inner,
+        foot=foot,
+        stem=stem,
+        outer=outer,
+        lip=lip,
+    )
+    body = shapes.lathe(profile, columns=52)
+    paints = _glass_paints(draw, stem_top, depth)
     return Instance(
         shapes.transform_patches(body, SEAM_ROTATION),
         paints,
-        sample_material(draw, 0.18, 0.8, spread=0.12),
+        sample_material(draw, roughness=0.18, clearcoat=0.8, spread=0.12),
     )
 
 
@@ -614,7 +684,7 @@ def _glass_bowl(
     profile.
     """
     bowl = draw(4.1, low=3.2, high=5.0)
-    deep = draw(9.8, low=6.5, high=11.5)
+    depth = draw(9.8, low=6.5, high=11.5)
     mouth = bowl * draw(0.8, low=0.7, high=1.12)
     wide_at = draw(0.42, low=0.3, high=0.55)
     wall = draw(0.24, low=0.2, high=0.3)
@@ -624,18 +694,18 @@ def _glass_bowl(
         (stem * 1.1, 0.92 * stem_top),
     ]
     cup = [
-        (0.5 * bowl, stem_top + 0.07 * deep),
-        (0.86 * bowl, stem_top + 0.2 * deep),
-        (bowl, stem_top + wide_at * deep),
-        (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * deep),
-        (mouth, stem_top + deep),
+        (0.5 * bowl, stem_top + 0.07 * depth),
+        (0.86 * bowl, stem_top + 0.2 * depth),
+        (bowl, stem_top + wide_at * depth),
+        (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * depth),
+        (mouth, stem_top + depth),
     ]
-    outer = shapes.spline([(stem, 0.6 * stem_top), *neck, *cup], 36)
-    return deep, wall, outer
+    outer = shapes.spline([(stem, 0.6 * stem_top), *neck, *cup], count=36)
+    return depth, wall, outer
 
 
 def _glass_lip(
-    outer: Array, wall: float, stem_top: float, deep: float
+    outer: Array, wall: float, stem_top: float, depth: float
 ) -> tuple[Array, Array]:
     """Return the profile of the inside of a glass, and of its lip."""
     normal = np.gradient(outer, axis=0)
@@ -643,7 +713,7 @@ def _glass_lip(
         normal, axis=1, keepdims=True
     )
     inner = (outer - wall * normal)[::-1]
-    inner = inner[inner[:, 1] > stem_top + 0.11 * deep]
+    inner = inner[inner[:, 1] > stem_top + 0.11 * depth]
     angle = np.pi * np.arange(1, 4) / 4
     side = np.array([-normal[-1, 1], normal[-1, 0]])
     curl = np.cos(angle)[:, None] * normal[-1] + np.sin(angle)[:, None] * side
@@ -653,15 +723,22 @@ def _glass_lip(
 
 def _glass_profile(
     stem_top: float,
-    deep: float,
+    depth: float,
     inner: Array,
     foot: float,
     stem: float,
     outer: Array,
     lip: Array,
 ) -> list[tuple[str, Array]]:
-    """Return the tags and profiles of the parts of a wine glass."""
-    floor = stem_top + 0.08 * deep
+    """Return the tags and profiles of the parts of a wine glass.
+
+    Args:
+        stem_top: height of the top of the stem.
+        depth: of the bowl.
+        inner, outer, lip: profiles of the bowl (K, 2); `inner` leads downwards.
+        foot, stem: radii.
+    """
+    floor = stem_top + 0.08 * depth
     edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
     under = [(0.0, 0.12), (foot * 0.8, 0.12), (foot * 0.9, 0.0), (foot - 0.15, 0.0)]
     rising = [
@@ -672,8 +749,8 @@ def _glass_profile(
         (stem, 0.6 * stem_top),
     ]
     return [
-        ("foot", shapes.subdivide(under, 1.5)),
-        ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
+        ("foot", shapes.subdivide(under, longest=1.5)),
+        ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, count=14)])),
         ("bowl", np.concatenate([outer, lip, inner[:1]])),
         ("inside", inner),
         ("inside", np.array([inner[-1], edge, (0.0, floor)])),
@@ -690,13 +767,13 @@ def _glass_paints(
     )
     drink = draw.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
     level = stem_top + depth * draw(0.48, low=0.3, high=0.62)
-    plain = gradient(shade(tint, 0.86), shade(tint, 1.08), 0.0, height)
+    plain = gradient(shade(tint, 0.86), shade(tint, 1.08), low=0.0, high=height)
     outside = inside = plain
     if draw.chance(0.5, canonical=True):
-        wine = clouded(drink, 0.8, 3.0, draw.offset())
+        wine = clouded(drink, factor=0.8, scale=3.0, offset=draw.offset())
         outside = over(plain, between(stem_top + 0.06 * depth, level, soft=0.1), wine)
         inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
-    outside = paint_or_random(draw, height, outside, 0.3)
+    outside = paint_or_random(draw, height, outside, wild=0.3)
     if draw.chance(0.2, canonical=True):
         outside = over(
             outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b")

@@ -287,7 +287,10 @@ class UsdSurfaces:
         return self._find_or_add("materials", entry)
 
     def _convert(self, material: Any) -> BoundMaterial:
-        """Convert a material; one that is no preview surface becomes grey, with a note."""
+        """Convert a material; one that is no preview surface becomes grey, with a note.
+
+        The decoded images of the material before it are released.
+        """
         name = str(material.GetPrim().GetName())
         self._texels.clear()  # they take memory
         shader = material.ComputeSurfaceSource()[0]
@@ -635,7 +638,7 @@ class PreviewSurface:
                     "has a texture that is looked up by "
                     f"{node.kind[:100]}; st is taken for it"
                 )
-                return TextureLayout("st", None, rows)
+                return TextureLayout("st", fallback=None, matrix=rows)
         raise errors.FileFormatError(
             f"the material {self.name}: expected at most {MAX_SHADERS} shaders in a "
             "row, got more"
@@ -798,32 +801,15 @@ class PreviewSurface:
         primvar by its fallback, with a note. A number without an image fills its
         channel.
         """
-        factor_by_name = {
-            "roughness": self.shader.get_number("roughness", DEFAULT_ROUGHNESS),
-            "metallic": self.shader.get_number("metallic", 0.0),
-        }
+        factor_by_name: dict[str, float] = {}
         plane_by_name: dict[str, Array] = {}
-        first_use: UsdTextureUse | None = None
-        for name in factor_by_name:
-            primvar = self._find_primvar(name, (READER_OF_NUMBERS,), (0.0,))
-            if primvar is not None:
-                factor_by_name[name] = primvar.fallback[0]
-                self.surfaces.note(
-                    f"has a {name} of the primvar "
-                    f"{primvar.name[:50]!r}, of which the fallback is "
-                    "read"
-                )
+        packed_use: UsdTextureUse | None = None
+        for name, default in (("roughness", DEFAULT_ROUGHNESS), ("metallic", 0.0)):
+            factor_by_name[name], image = self._read_number_or_image(name, default)
+            if image is None:
                 continue
-            use = self._find_texture(name)
-            if isinstance(use, tuple):
-                factor_by_name[name] = use[0]
-                continue
-            values = None if use is None else self.surfaces.compute_values(use)
-            if use is None or values is None:
-                continue
-            self._note_srgb(name, use)
-            plane = np.clip(values[:, :, 0], 0.0, 1.0)
-            if first_use is not None and use.layout != first_use.layout:
+            use, plane = image
+            if packed_use is not None and use.layout != packed_use.layout:
                 factor_by_name[name] = float(plane.mean())
                 self.surfaces.note(
                     f"has a {name} with other texture coordinates, "
@@ -831,20 +817,48 @@ class PreviewSurface:
                 )
             else:
                 plane_by_name[name] = plane
-                first_use = use
+                packed_use = use
         if is_specular:  # this workflow has no metals
             factor_by_name["metallic"] = 0.0
             plane_by_name.pop("metallic", None)
-        if not plane_by_name or first_use is None:
+        if not plane_by_name or packed_use is None:
             surface["metallicFactor"] = factor_by_name["metallic"]
             surface["roughnessFactor"] = factor_by_name["roughness"]
             return
         texture = self.surfaces.add_image(
-            _pack_planes(plane_by_name, factor_by_name), first_use.sampler
+            _pack_planes(plane_by_name, factor_by_name), packed_use.sampler
         )
         surface["metallicFactor"] = 1.0
         surface["roughnessFactor"] = 1.0
-        surface["metallicRoughnessTexture"] = self._make_slot(texture, first_use.layout)
+        surface["metallicRoughnessTexture"] = self._make_slot(
+            texture, packed_use.layout
+        )
+
+    def _read_number_or_image(
+        self, name: str, default: float
+    ) -> tuple[float, tuple[UsdTextureUse, Array] | None]:
+        """Return the number of an input, and the image that it is connected to, if any.
+
+        The number is the fallback of a primvar, with a note, or of a missing image; or
+        else that of the input. The image is its texture and values (H, W) in [0, 1].
+        """
+        number = self.shader.get_number(name, default)
+        primvar = self._find_primvar(name, (READER_OF_NUMBERS,), (0.0,))
+        if primvar is not None:
+            self.surfaces.note(
+                f"has a {name} of the primvar "
+                f"{primvar.name[:50]!r}, of which the fallback is "
+                "read"
+            )
+            return primvar.fallback[0], None
+        use = self._find_texture(name)
+        if isinstance(use, tuple):
+            return use[0], None
+        values = None if use is None else self.surfaces.compute_values(use)
+        if use is None or values is None:
+            return number, None
+        self._note_srgb(name, use)
+        return number, (use, np.clip(values[:, :, 0], 0.0, 1.0))
 
     def _note_srgb(self, name: str, use: UsdTextureUse) -> None:
         """Note that numbers are decoded from sRGB; an alpha never is."""

@@ -1,0 +1,465 @@
+"""Render the twins of photographs, show all to a model, and count.
+
+The rows are stored one by one, so that a run that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import gc
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+from advsearch.extend import (
+    InputError,
+    Model,
+    RunContext,
+    Task,
+    tasks,
+    workbench,
+)
+from advsearch.questions.twins import counting, rendering
+from advsearch.questions.twins.listing import PhotographedObject, read_photographs
+from advsearch.questions.twins.result import (
+    CLASSIFIER_MARGIN,
+    COMPOSED,
+    DETECTOR_MARGIN,
+    HOLE,
+    PHOTOGRAPH,
+    TwinPair,
+    TwinPrediction,
+    TwinRow,
+    TwinsConfig,
+    TwinsResult,
+)
+
+LOW_OVERLAP = 0.8  # of silhouettes: below it a pose is doubted
+IMAGE_SIZE = 160  # longer side, pixels, of images on the page
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The objects in photographs that a run compares.
+
+    Attributes:
+        windows: of the rows that are used, by their number.
+        objects: of all rows.
+        warnings: about what was left out.
+    """
+
+    objects: Sequence[PhotographedObject]
+    windows: Mapping[int, rendering.Window]
+    warnings: list[str]
+
+
+def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> TwinsResult:
+    """Compare photographs with their twins.
+
+    Args:
+        context: of the run.
+        network: the model, where a Python caller passes one; or a mapping from the
+            names of frames to models, each of which has not seen its frames.
+    """
+    config = context.config
+    context.progress.stage("loading")
+    listing = read_photographs(Path(config.photographs).expanduser())
+    task = workbench.make_task(config.task)
+    settings: Any = config
+    by_frame = network if isinstance(network, Mapping) else {}
+    networks = list(dict.fromkeys(by_frame.values())) or [network or config.model]
+    models, warnings = workbench.load_models(networks, task, settings)
+    model_of_frame = {
+        frame: models[networks.index(model)] for frame, model in by_frame.items()
+    }
+    task = task.on(models[0])
+    comparison = Comparison(context, task, models[0], model_of_frame)
+    selection = comparison.select(listing.objects)
+    if listing.n_missing:
+        warnings.append(
+            f"{listing.n_missing} objects are in photographs that are not there; they "
+            "are left out."
+        )
+    warnings += selection.warnings
+    measurements = context.open_measurements()
+
+    def make_result(rows: list[TwinRow]) -> TwinsResult:
+        return comparison.make_result(rows, [*warnings, *task.remarks])
+
+    return measurements.collect(
+        comparison.compare(selection, measurements), make_result
+    )
+
+
+class Comparison:
+    """Compares photographs with their twins for one model and task.
+
+    Args:
+        context: of the run.
+        task: judges the predictions of the model.
+        model: predicts.
+        model_of_frame: models that predict some frames instead.
+    """
+
+    def __init__(
+        self,
+        context: RunContext[TwinsConfig],
+        task: Task,
+        model: Model,
+        model_of_frame: Mapping[str, Model],
+    ) -> None:
+        self._context = context
+        self._config = context.config
+        self._task = task
+        self._model = model
+        self._model_of_frame = model_of_frame
+        self._size = model.input_size
+        self.n_renders = 0
+        self._is_calibrated = False
+        self._load_photograph = lru_cache(maxsize=4)(rendering.load_photograph)
+
+    @property
+    def surroundings(self) -> tuple[str, ...]:
+        """What surrounds the object in the twins."""
+        return COMPOSED, self._config.environment_name, HOLE
+
+    @property
+    def margin(self) -> float:
+        """How far a window reaches beyond the object's box, in its longer sides."""
+        if self._config.margin is not None:
+            return self._config.margin
+        return DETECTOR_MARGIN if self._task.varies else CLASSIFIER_MARGIN
+
+    def select(self, objects: Sequence[PhotographedObject]) -> Selection:
+        """Choose the rows that are used, and their windows.
+
+        Raises:
+            InputError: none is left, or the model does not know a label.
+        """
+        is_frame = parse_frames(self._config.frames)
+        assets: dict[Path, Any] = {}
+        windows: dict[int, rendering.Window] = {}
+        n_hidden = 0
+        n_outside = 0
+        for number, item in enumerate(objects):
+            if not is_frame(item.frame):
+                continue
+            if item.visible is not None and item.visible < self._config.visible:
+                n_hidden += 1
+                continue
+            if item.mesh not in assets:
+                self._task.check(self._make_facts(item))
+                self._context.progress.stage(f"reading {item.object}")
+                assets[item.mesh] = self._load_asset(item)
+            positions = rendering.project_object(item, assets[item.mesh])
+            height, width = self._load_photo(item).shape[:2]
+            window = rendering.choose_window(
+                positions, (height, width), self._size, self.margin
+            )
+            if window is None:
+                n_outside += 1
+            else:
+                windows[number] = window
+        if not windows:
+            raise InputError(
+                "photographs: no object is left; check `frames` and `visible`"
+            )
+        warnings = []
+        if n_hidden:
+            warnings.append(
+                f"{n_hidden} objects are hidden by more than "
+                f"{1.0 - self._config.visible:.0%} and left out (`visible`)."
+            )
+        if n_outside:
+            warnings.append(
+                f"{n_outside} objects are out of view or smaller than "
+                f"{rendering.MIN_SILHOUETTE:g} pixels and left out."
+            )
+        return Selection(objects, windows, warnings)
+
+    def _load_asset(self, item: PhotographedObject) -> Any:
+        return rendering.load_object(item.mesh, item.unit)
+
+    def _load_photo(self, item: PhotographedObject) -> Tensor:
+        return self._load_photograph(item.photograph)
+
+    def compare(self, selection: Selection, measurements: Any) -> Iterator[TwinRow]:
+        """Yield the rows, object by object, so that each mesh is loaded once."""
+        context = self._context
+        context.progress.stage("twins", len(selection.windows))
+        groups: dict[tuple[Path, float], list[int]] = {}
+        for number in selection.windows:
+            item = selection.objects[number]
+            key = (item.mesh, round(item.camera.pixel_aspect, 3))
+            groups.setdefault(key, []).append(number)
+        for numbers in groups.values():
+            missing = [
+                number
+                for number in numbers
+                if measurements.read(make_row_name(number)) is None
+            ]
+            # Mitsuba can't record renders of one scene while another one lives.
+            layers = self._render_layers(selection, missing)
+            gc.collect()
+            renderer = None
+            if missing:
+                renderer = self._make_renderer(
+                    rendering.SurroundedRenderer,
+                    self._config.environment_name,
+                    selection,
+                    missing,
+                )
+            for number in numbers:
+                layer = layers.pop(number, None)
+                yield measurements.get_row(
+                    make_row_name(number),
+                    TwinRow,
+                    partial(self._compare_object, number, selection, layer, renderer),
+                )
+                context.progress.advance(1)
+            renderer = None
+            gc.collect()
+
+    def _render_layers(
+        self, selection: Selection, numbers: Sequence[int]
+    ) -> dict[int, rendering.Layer]:
+        """Render the objects of some rows, which have one mesh, alone."""
+        if not numbers:
+            return {}
+        renderer = self._make_renderer(
+            rendering.LayerRenderer, self._config.light, selection, numbers
+        )
+        layers = {}
+        for number in numbers:
+            item = selection.objects[number]
+            window = selection.windows[number]
+            layers[number] = renderer.render(item, window, self._size, number)
+            self.n_renders += 1
+        return layers
+
+    def _make_renderer(
+        self,
+        renderer_type: Any,
+        environment: str,
+        selection: Selection,
+        numbers: Sequence[int],
+    ) -> Any:
+        item = selection.objects[numbers[0]]
+        film = rendering.choose_film(
+            [selection.windows[number] for number in numbers], item.camera.pixel_aspect
+        )
+        return renderer_type(
+            self._load_asset(item),
+            item.unit,
+            environment,
+            film,
+            spp=self._config.spp,
+            seed=self._config.seed,
+        )
+
+    def _compare_object(
+        self,
+        number: int,
+        selection: Selection,
+        layer: rendering.Layer,
+        renderer: rendering.SurroundedRenderer,
+    ) -> TwinRow:
+        """Render an object's twin, and return what the model says of all images."""
+        item = selection.objects[number]
+        window = selection.windows[number]
+        environment = self._config.environment_name
+        surrounded = {environment: renderer.render(item, window, number)}
+        self.n_renders += 1
+        twin = rendering.make_twin(
+            item, self._load_photo(item), window, layer, surrounded, self._size
+        )
+        facts = self._make_facts(item, twin)
+        self._save_images(number, twin)
+        return TwinRow(
+            number=number,
+            photograph=item.photograph.name,
+            frame=item.frame,
+            object=item.object,
+            label=self._find_label(item),
+            condition=item.condition,
+            window=window,
+            size=twin.size,
+            brightness=twin.brightness,
+            contrast=twin.contrast,
+            visible=item.visible,
+            overlap=rendering.measure_pose(item, twin, window),
+            predictions=list(
+                self._predict(
+                    self._model_of_frame.get(item.frame, self._model), twin, facts
+                )
+            ),
+        )
+
+    def _predict(
+        self, model: Model, twin: rendering.Twin, facts: Any
+    ) -> Iterator[TwinPrediction]:
+        """Yield the predictions about the photograph and its twins."""
+        truth = self._task.truth(facts)
+        self._calibrate_once(twin, truth)
+        for name, image in twin.images.items():
+            rounded = round_to_levels(image)
+            output = model(rounded)
+            (judgement,) = workbench.judge_images(
+                self._task, output, rounded[None], [truth]
+            )
+            yield TwinPrediction(
+                surroundings=name,
+                label=judgement.prediction.label,
+                probability=judgement.prediction.probability,
+                right=judgement.right,
+                margin=judgement.margin,
+                payload=judgement.payload,
+            )
+
+    def _calibrate_once(self, twin: rendering.Twin, truth: Any) -> None:
+        """Let a task that needs it look at the first photograph.
+
+        Raises:
+            InputError: the user has to state how the outputs are read.
+        """
+        if self._is_calibrated:
+            return
+        self._is_calibrated = True
+        if self._task.calibrates:
+            output = self._model(round_to_levels(twin.images[PHOTOGRAPH]))
+            self._task = self._task.after_calibration(output, truth)
+        if self._task.ambiguities:
+            raise InputError(f"task {self._task.name}: {self._task.ambiguities}")
+
+    def _make_facts(
+        self, item: PhotographedObject, twin: rendering.Twin | None = None
+    ) -> Any:
+        """Return what a task takes the truth from."""
+        return tasks.Facts(
+            item.object,
+            self._find_label(item),
+            compute_sight=None if twin is None else lambda: twin.sight,
+        )
+
+    def _find_label(self, item: PhotographedObject) -> str:
+        """Return the right label: by `names`, by the list, or the object's name."""
+        return self._config.names.get(item.object) or item.label or item.object
+
+    def _save_images(self, number: int, twin: rendering.Twin) -> None:
+        """Store small images of the photograph and its twins."""
+        for index, name in enumerate(list(twin.images)[:3]):
+            file = make_image_name(number, index)
+            self._context.run.write_file(file, encode_jpeg(twin.images[name]))
+
+    def make_result(
+        self, rows: Sequence[TwinRow], warnings: Sequence[str]
+    ) -> TwinsResult:
+        """Count rows; the worst disagreements come first."""
+        table = []
+        factors = []
+        if rows:
+            table = counting.make_table(
+                rows, self.surroundings, self._model.name, self._task.title
+            )
+            factors = counting.explain_disagreement(rows, COMPOSED)
+        overlaps = [row.overlap for row in rows if row.overlap is not None]
+        worst = sorted(rows, key=rank_disagreement)[: self._config.pictures]
+        return self._context.result(
+            TwinsResult,
+            photographs=self._config.photographs,
+            model=self._model.name,
+            task=self._task.title,
+            table=table,
+            overlap=float(np.median(overlaps)) if overlaps else None,
+            low_overlaps=sum(overlap < LOW_OVERLAP for overlap in overlaps),
+            factors=factors,
+            pairs=[
+                TwinPair(
+                    row=row,
+                    pictures=[make_image_name(row.number, index) for index in range(3)],
+                )
+                for row in worst
+            ],
+            renders=self.n_renders,
+            warnings=list(dict.fromkeys(warnings)),
+        )
+
+
+def round_to_levels(image: Tensor) -> Tensor:
+    """Return an image (H, W, 3) with values of 8 bits, in [0, 1]."""
+    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
+
+
+def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
+    """Return a key that sorts rows: who disagree first, by how much margins differ."""
+    twin = row.twin(COMPOSED)
+    difference = abs(row.photo.margin - twin.margin)
+    if not math.isfinite(difference):
+        difference = math.inf
+    return row.photo.right == twin.right, -difference
+
+
+def parse_frames(text: str | None) -> Any:
+    """Return a function that states whether a frame is used, by its name.
+
+    Args:
+        text: names and ranges FIRST:LAST of the numbers that names end in, both
+            included, separated by commas; None for all frames.
+
+    Raises:
+        InputError: a range is none.
+    """
+    if text is None:
+        return lambda frame: True
+    names = set()
+    ranges = []
+    for entry in filter(None, (part.strip() for part in text.split(","))):
+        first, colon, last = entry.partition(":")
+        if not colon:
+            names.add(entry)
+        elif first.isdecimal() and last.isdecimal():
+            ranges.append((int(first), int(last)))
+        else:
+            raise InputError(
+                f"frames: expected a name or a range such as 0:600, got {entry[:40]}"
+            )
+
+    def is_used(frame: str) -> bool:
+        number = frame.rpartition("/")[2].partition(".")[0]
+        if frame in names or number in names:
+            return True
+        return number.isdecimal() and any(
+            first <= int(number) <= last for first, last in ranges
+        )
+
+    return is_used
+
+
+def make_row_name(number: int) -> str:
+    """Return the key of a stored row."""
+    return f"twin {number}"
+
+
+def make_image_name(number: int, index: int) -> str:
+    """Return the file of an image of a row in the run's folder."""
+    return f"images/twin-{number:06d}-{index}.jpg"
+
+
+def encode_jpeg(image: Tensor) -> bytes:
+    """Return an image (H, W, 3) sRGB as a JPEG, `IMAGE_SIZE` pixels at its longer
+    side.
+    """
+    levels = (image.clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+    picture = Image.fromarray(levels)
+    scale = IMAGE_SIZE / max(picture.size)
+    size = (round(picture.width * scale), round(picture.height * scale))
+    buffer = io.BytesIO()
+    picture.resize(size, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=88)
+    return buffer.getvalue()

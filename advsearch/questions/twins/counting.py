@@ -1,0 +1,209 @@
+"""Count how far the predictions of twins hold for photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.extend import results, statistics
+from advsearch.questions.twins.result import FactorPart, TwinPrediction, TwinRow
+
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+N_PARTS = 3  # parts of equal size that a factor is cut into
+MIN_ROWS_PER_PART = 10
+
+
+def make_table(
+    rows: Sequence[TwinRow], surroundings: Sequence[str], model: str, task: str
+) -> list[results.TwinAgreement]:
+    """Return the agreement by surroundings: of all rows, by object and by condition."""
+    objects = sorted({row.object for row in rows})
+    conditions = sorted({row.condition for row in rows if row.condition})
+    groups: list[tuple[str, str, Sequence[TwinRow]]] = [("", "", rows)]
+    if len(objects) > 1:
+        for name in objects:
+            groups.append((name, "", [row for row in rows if row.object == name]))
+    for name in conditions:
+        groups.append(("", name, [row for row in rows if row.condition == name]))
+    return [
+        count_agreement(
+            group,
+            name,
+            model=model,
+            task=task,
+            object_name=object_name,
+            condition=condition,
+        )
+        for name in surroundings
+        for object_name, condition, group in groups
+        if group
+    ]
+
+
+def count_agreement(
+    rows: Sequence[TwinRow],
+    surroundings: str,
+    *,
+    model: str,
+    task: str,
+    object_name: str = "",
+    condition: str = "",
+) -> results.TwinAgreement:
+    """Return how far photographs and twins agree, with intervals over frames.
+
+    Args:
+        rows: at least one.
+        surroundings: of the twins.
+        model, task: as in results.
+        object_name, condition: of the rows; empty for all.
+    """
+    units = number_units(rows)
+    photos = [row.photo for row in rows]
+    twins = [row.twin(surroundings) for row in rows]
+    photo_wrong = np.array([not photo.right for photo in photos])
+    twin_wrong = np.array([not twin.right for twin in twins])
+    agrees = photo_wrong == twin_wrong
+    return results.TwinAgreement(
+        model=model,
+        task=task,
+        surroundings=surroundings,
+        object=object_name,
+        condition=condition,
+        pairs=len(rows),
+        frames=len(np.unique(units)),
+        wrong_photos=int(photo_wrong.sum()),
+        wrong_twins=int(twin_wrong.sum()),
+        both_wrong=int((photo_wrong & twin_wrong).sum()),
+        photo_right=estimate_rate(~photo_wrong, units),
+        twin_right=estimate_rate(~twin_wrong, units),
+        agreement=estimate_rate(agrees, units),
+        kappa=estimate_kappa(photo_wrong, twin_wrong, units),
+        margins=estimate_margin_correlation(photos, twins, units),
+        photo_wrong=estimate_rate(photo_wrong, units),
+        wrong_where_twin_wrong=estimate_conditional(photo_wrong, twin_wrong, units),
+    )
+
+
+def number_units(rows: Sequence[TwinRow]) -> IntArray:
+    """Return the unit (n,) of each row: frames that share a name are one."""
+    names = [row.frame for row in rows]
+    return np.unique(names, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def estimate_rate(happens: BoolArray, units: IntArray) -> results.Estimate:
+    """Return the mean rate of an event over units, with its interval."""
+    value, interval = statistics.agreement.estimate_rate(happens, units)
+    return results.Estimate(value=value, interval=interval)
+
+
+def estimate_conditional(
+    event: BoolArray, condition: BoolArray, units: IntArray
+) -> results.Estimate | None:
+    """Return the rate of an event where another happens; None in too few units."""
+    n_units = statistics.agreement.count_units(condition, units)
+    if n_units < statistics.agreement.MIN_UNITS:
+        return None
+    return estimate_rate(event[condition], units[condition])
+
+
+def estimate_kappa(
+    photo_wrong: BoolArray, twin_wrong: BoolArray, units: IntArray
+) -> results.Estimate | None:
+    """Return Cohen's kappa; None where either is wrong in too few units."""
+    agreement = statistics.agreement
+    for wrong in (photo_wrong, twin_wrong):
+        if agreement.count_units(wrong, units) < agreement.MIN_UNITS:
+            return None
+    return _estimate_coefficient(
+        agreement.compute_kappa, photo_wrong, twin_wrong, units
+    )
+
+
+def estimate_margin_correlation(
+    photos: Sequence[TwinPrediction], twins: Sequence[TwinPrediction], units: IntArray
+) -> results.Estimate | None:
+    """Return the rank correlation of margins; None where it has no interval."""
+    first = np.array([photo.margin for photo in photos])
+    second = np.array([twin.margin for twin in twins])
+    is_known = np.isfinite(first) & np.isfinite(second)
+    return _estimate_coefficient(
+        statistics.agreement.compute_rank_correlation,
+        first[is_known],
+        second[is_known],
+        units[is_known],
+    )
+
+
+def _estimate_coefficient(
+    statistic: Callable[..., float],
+    first: npt.NDArray[np.generic],
+    second: npt.NDArray[np.generic],
+    units: IntArray,
+) -> results.Estimate | None:
+    interval = statistics.agreement.correlation_interval(
+        statistic, first, second, units
+    )
+    if interval is None:
+        return None
+    return results.Estimate(value=statistic(first, second), interval=interval)
+
+
+FACTORS: dict[str, tuple[str, Callable[[TwinRow], float | None]]] = {
+    "size of the object": ("pixels", lambda row: row.size),
+    "twin brighter than the photograph": ("", lambda row: row.brightness),
+    "contrast of the background": ("", lambda row: row.contrast),
+    "visible fraction": ("", lambda row: row.visible),
+    "overlap of the silhouettes": ("", lambda row: row.overlap),
+}
+"""What may explain disagreement: unit, and how a row has it."""
+
+
+def explain_disagreement(
+    rows: Sequence[TwinRow], surroundings: str
+) -> list[FactorPart]:
+    """Return how often photograph and twin disagree by parts of each factor.
+
+    Each has `N_PARTS` parts with about as many rows; a factor that is constant, or of
+    which too few rows are known, is left out.
+    """
+    parts: list[FactorPart] = []
+    for name, (unit, get) in FACTORS.items():
+        known = [(value, row) for row in rows if (value := get(row)) is not None]
+        if len(known) >= N_PARTS * MIN_ROWS_PER_PART:
+            values = np.array([value for value, _ in known])
+            known_rows = [row for _, row in known]
+            parts += _cut_factor(name, unit, values, known_rows, surroundings)
+    return parts
+
+
+def _cut_factor(
+    name: str,
+    unit: str,
+    values: npt.NDArray[np.float64],
+    rows: Sequence[TwinRow],
+    surroundings: str,
+) -> Iterator[FactorPart]:
+    """Yield the parts of a factor with values (n,) of its rows."""
+    edges = np.quantile(values, np.linspace(0.0, 1.0, N_PARTS + 1))
+    if len(np.unique(edges)) <= N_PARTS:
+        return
+    index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, N_PARTS - 1)
+    units = number_units(rows)
+    disagrees = np.array(
+        [row.photo.right != row.twin(surroundings).right for row in rows]
+    )
+    for part in range(N_PARTS):
+        inside = index == part
+        yield FactorPart(
+            factor=name,
+            unit=unit,
+            lower=float(edges[part]),
+            upper=float(edges[part + 1]),
+            pairs=int(inside.sum()),
+            disagreeing=int(disagrees[inside].sum()),
+            rate=estimate_rate(disagrees[inside], units[inside]),
+        )

@@ -1,0 +1,459 @@
+"""Read which objects photographs show, and where: folders in BOP's form, and lists.
+
+BOP's form (Hodan et al. 2018, "BOP: Benchmark for 6D object pose estimation") has
+`scene_gt.json`, `scene_camera.json`, `rgb/`, and meshes in millimetres in `models/`. A
+list (CSV, JSON or YAML) has a row for each object in a photograph; docs/twins.md says
+what is in it. Poses lead from the coordinates of the mesh's file to the camera's, which
+are x to the right, y down and z forwards, as OpenCV has them.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.extend import InputError, errors, reading, stored_files
+
+Float64Array = npt.NDArray[np.float64]
+
+MAX_JSON_BYTES = 1 << 26  # of a file with all poses of a scene
+MAX_YAML_BYTES = 1 << 17  # of a list in YAML, which is slow to read
+MAX_VIEWS = 100_000  # objects in photographs of one run
+MAX_ROTATION_ERROR = 0.02  # of an entry of R R^T against the identity
+PINHOLE_KIND = "brown-conrady"  # of camera models, with distortion 0
+MAX_SKEW = 1e-6  # of a camera's focal length; a larger one is refused
+GROUND_TRUTH = "scene_gt.json"
+PHOTO_FOLDERS = ("rgb", "gray")
+PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".webp")
+LIST_SUFFIXES = (".csv", ".json", ".yaml", ".yml")
+LIST_KEYS = (
+    "photograph",
+    "object",
+    "pose",
+    "camera",
+    "K",
+    "unit",
+    "label",
+    "condition",
+    "frame",
+    "mask",
+)
+"""What a row of a list may have; the first three it must."""
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera without distortion, in pixels from the corner of the photograph."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def pixel_aspect(self) -> float:
+        """Height of a pixel over its width, in angles: fx / fy."""
+        return self.fx / self.fy
+
+
+@dataclass(frozen=True, eq=False)
+class PhotographedObject:
+    """An object as a photograph shows it.
+
+    Attributes:
+        photograph: the file.
+        frame: name of the independent unit that it is of: a photograph, or a scene.
+        object: its name.
+        mesh: its file.
+        unit: of the coordinates of the mesh and of the pose.
+        pose: (4, 4) from the coordinates of the mesh's file to the camera's.
+        camera: that took the photograph.
+        label: the right label; empty: the object's name.
+        condition: of the photograph, such as "dim"; empty where there is none.
+        mask: file of the full silhouette; None without.
+        visible_mask: file of what is visible of it; None without.
+        visible: fraction of the silhouette that is visible; None if it is not known.
+        box: x, y, width and height of the silhouette in pixels, by the data set.
+    """
+
+    photograph: Path
+    frame: str
+    object: str
+    mesh: Path
+    unit: str
+    pose: Float64Array
+    camera: Pinhole
+    label: str = ""
+    condition: str = ""
+    mask: Path | None = None
+    visible_mask: Path | None = None
+    visible: float | None = None
+    box: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What was read of a folder or a list.
+
+    Attributes:
+        objects: in photographs, in the order of the files.
+        n_missing: entries whose photograph is not there.
+    """
+
+    objects: list[PhotographedObject]
+    n_missing: int = 0
+
+
+def read_photographs(path: Path) -> Listing:
+    """Read a BOP folder or a list.
+
+    Raises:
+        InputError: there is neither, or something in it cannot be used; the message
+            names the file and the entry.
+    """
+    if path.suffix.lower() in LIST_SUFFIXES:
+        listing = Listing(list(_read_list(path)))
+    else:
+        listing = _read_bop(path)
+    if not listing.objects:
+        raise InputError(
+            f"photographs: {path} names {listing.n_missing} photographs, and none of "
+            "them is in it; copy them, or name another folder"
+        )
+    stored_files.check_most(
+        path, len(listing.objects), MAX_VIEWS, "at most {} objects in photographs"
+    )
+    return listing
+
+
+# ---- BOP
+
+
+def _read_bop(folder: Path) -> Listing:
+    """Read all scenes of a data set, of a split or of one scene."""
+    patterns = (GROUND_TRUTH, f"*/{GROUND_TRUTH}", f"*/*/{GROUND_TRUTH}")
+    scenes: list[Path] = []
+    for pattern in patterns:
+        scenes = scenes or sorted(file.parent for file in folder.glob(pattern))
+    if not scenes:
+        raise InputError(
+            f"photographs: expected a folder in BOP's form, with {GROUND_TRUTH} in it "
+            f"or in its scenes, or a list ({', '.join(LIST_SUFFIXES)}), got {folder}"
+        )
+    models = _find_models(folder)
+    objects: list[PhotographedObject] = []
+    n_missing = 0
+    for scene in scenes:
+        listing = _read_scene(scene, models)
+        objects += listing.objects
+        n_missing += listing.n_missing
+    return Listing(objects, n_missing)
+
+
+def _find_models(folder: Path) -> Path:
+    """Return the folder of meshes: in the folder, or in one of the two above it."""
+    resolved = folder.resolve()
+    for parent in (resolved, *resolved.parents[:2]):
+        if (parent / "models").is_dir():
+            return parent / "models"
+    raise InputError(
+        f"photographs: expected the meshes of {folder} in a folder models in it or "
+        "above it, got none"
+    )
+
+
+def _read_scene(scene: Path, models: Path) -> Listing:
+    """Read one scene of a BOP data set."""
+    truths = _read_json(scene / GROUND_TRUTH)
+    cameras = _read_json(scene / "scene_camera.json")
+    infos: Mapping[str, Any] = {}
+    if (scene / "scene_gt_info.json").is_file():
+        infos = _read_json(scene / "scene_gt_info.json")
+    objects: list[PhotographedObject] = []
+    n_missing = 0
+    for image, entries in truths.items():
+        where = f"{scene / GROUND_TRUTH}: image {image[:20]}"
+        if not (image.isdecimal() and len(image) <= 12) or not _is_rows(entries):
+            raise errors.FileFormatError(f"{where}: expected a list of objects")
+        photograph = _find_photograph(scene, int(image))
+        if photograph is None:
+            n_missing += len(entries)
+            continue
+        camera = _read_bop_camera(scene, cameras, image)
+        rows = infos.get(image)
+        for index, entry in enumerate(entries):
+            info: Mapping[str, Any] = {}
+            if _is_rows(rows) and index < len(rows):
+                info = rows[index]
+            objects.append(
+                PhotographedObject(
+                    photograph=photograph,
+                    frame=f"{scene.name}/{image}",
+                    camera=camera,
+                    unit="mm",
+                    mask=_find_mask(scene, "mask", image, index),
+                    visible_mask=_find_mask(scene, "mask_visib", image, index),
+                    visible=_get_fraction(info),
+                    box=_get_box(info),
+                    **_read_bop_object(where, entry, models),
+                )
+            )
+    return Listing(objects, n_missing)
+
+
+def _read_bop_object(
+    where: str, entry: Mapping[str, Any], models: Path
+) -> dict[str, Any]:
+    """Return object, mesh and pose of an entry of the ground truth."""
+    number = entry.get("obj_id")
+    if not isinstance(number, int) or not 0 <= number < 10**6:
+        raise errors.FileFormatError(f"{where}: expected obj_id, a whole number")
+    name = f"obj_{number:06d}"
+    mesh = models / f"{name}.ply"
+    if not mesh.is_file():
+        raise errors.FileFormatError(f"{where}: expected the mesh {mesh}, got none")
+    rotation = _to_numbers(entry.get("cam_R_m2c"), f"{where}: cam_R_m2c", 9)
+    translation = _to_numbers(entry.get("cam_t_m2c"), f"{where}: cam_t_m2c", 3)
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation.reshape(3, 3)
+    matrix[:3, 3] = translation
+    return {"object": name, "mesh": mesh, "pose": _check_pose(matrix, where)}
+
+
+def _read_bop_camera(scene: Path, cameras: Mapping[str, Any], image: str) -> Pinhole:
+    """Return the camera of an image; in its file, pixel centers are whole numbers."""
+    where = f"{scene / 'scene_camera.json'}: image {image[:20]}"
+    entry = cameras.get(image)
+    if not isinstance(entry, dict):
+        raise errors.FileFormatError(f"{where}: expected its camera, got none")
+    return _make_pinhole(_to_numbers(entry.get("cam_K"), f"{where}: cam_K", 9), where)
+
+
+def _find_photograph(scene: Path, image: int) -> Path | None:
+    for folder in PHOTO_FOLDERS:
+        for suffix in PHOTO_SUFFIXES:
+            file = scene / folder / f"{image:06d}{suffix}"
+            if file.is_file():
+                return file
+    return None
+
+
+def _find_mask(scene: Path, folder: str, image: str, index: int) -> Path | None:
+    file = scene / folder / f"{int(image):06d}_{index:06d}.png"
+    return file if file.is_file() else None
+
+
+def _get_fraction(info: Mapping[str, Any]) -> float | None:
+    """Return the visible fraction that BOP states; None if it is no such number."""
+    value = info.get("visib_fract")
+    if not isinstance(value, (int, float)) or not 0.0 <= value <= 1.0:
+        return None
+    return float(value)
+
+
+def _get_box(info: Mapping[str, Any]) -> tuple[float, float, float, float] | None:
+    """Return the box of the silhouette that BOP states; None if there is none."""
+    numbers = info.get("bbox_obj")
+    if not isinstance(numbers, list) or len(numbers) != 4:
+        return None
+    if not all(isinstance(number, (int, float)) for number in numbers):
+        return None
+    x, y, width, height = map(float, numbers)
+    return (x, y, width, height) if width > 0.0 and height > 0.0 else None
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file with an entry for each image."""
+    text = stored_files.read_existing_text(
+        path, "a JSON file of a scene", MAX_JSON_BYTES
+    )
+    content = stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
+    if not isinstance(content, dict):
+        raise errors.FileFormatError(f"{path}: expected an object with the images")
+    return content
+
+
+def _is_rows(value: object) -> TypeGuard[list[dict[str, Any]]]:
+    return isinstance(value, list) and all(isinstance(row, dict) for row in value)
+
+
+# ---- lists
+
+
+def _read_list(path: Path) -> Iterator[PhotographedObject]:
+    """Yield the rows of a list of photographs."""
+    for number, row in enumerate(_read_rows(path), start=1):
+        yield _read_row(row, path, f"{path}: row {number}")
+
+
+def _read_rows(path: Path) -> list[dict[str, Any]]:
+    """Read a list as mappings; those of CSV have texts."""
+    if path.suffix.lower() == ".csv":
+        text = stored_files.read_existing_text(
+            path, "a list of photographs", MAX_JSON_BYTES
+        )
+        rows: Any = [
+            {key: value for key, value in row.items() if value}
+            for row in csv.DictReader(io.StringIO(text))
+        ]
+    elif path.suffix.lower() == ".json":
+        text = stored_files.read_existing_text(
+            path, "a list of photographs", MAX_JSON_BYTES
+        )
+        rows = stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
+    else:
+        # imports torch
+        from advsearch.extend import workbench
+
+        text = stored_files.read_existing_text(
+            path, "a list of photographs", MAX_YAML_BYTES
+        )
+        rows = stored_files.parse_text(path, text, "YAML", workbench.parse_yaml)
+    if isinstance(rows, dict):
+        rows = rows.get("photographs")
+    if not _is_rows(rows):
+        raise errors.FileFormatError(
+            f"{path}: expected a list with a row for each object in a photograph"
+        )
+    return list(rows)
+
+
+def _read_row(row: Mapping[str, Any], path: Path, where: str) -> PhotographedObject:
+    unknown = sorted(map(str, set(row) - set(LIST_KEYS)))
+    if unknown:
+        raise errors.FileFormatError(
+            f"{where}: expected some of {', '.join(LIST_KEYS)}, got {unknown[0][:40]}"
+        )
+    for key in LIST_KEYS[:3]:
+        if key not in row:
+            raise errors.FileFormatError(f"{where}: expected {key}, got none")
+    photograph = _get_file(row, "photograph", path, where)
+    mesh = _get_file(row, "object", path, where)
+    numbers = _to_numbers(row["pose"], f"{where}: pose", 12, 16)
+    matrix = np.eye(4)
+    matrix[:3] = numbers[:12].reshape(3, 4)
+    unit = str(row.get("unit", "m"))
+    if unit not in ("mm", "cm", "m", "in"):
+        raise errors.FileFormatError(f"{where}: unit: expected mm, cm, m or in")
+    return PhotographedObject(
+        photograph=photograph,
+        frame=str(row.get("frame") or photograph.name)[:200],
+        object=mesh.stem,
+        mesh=mesh,
+        unit=unit,
+        pose=_check_pose(matrix, where),
+        camera=_read_row_camera(row, path, photograph, where),
+        label=str(row.get("label") or "")[:200],
+        condition=str(row.get("condition") or "")[:200],
+        mask=_get_file(row, "mask", path, where) if "mask" in row else None,
+    )
+
+
+def _get_file(row: Mapping[str, Any], key: str, path: Path, where: str) -> Path:
+    """Return a file that a row names, which lies in the list's folder or below."""
+    name = str(row[key])
+    file = path.parent / name
+    if "\0" in name or not reading.is_inside(file, path.parent):
+        raise errors.FileFormatError(
+            f"{where}: {key}: expected a file in the folder of the list or below, got "
+            f"{name[:80]}"
+        )
+    if not file.is_file():
+        raise errors.FileFormatError(f"{where}: {key}: there is no file {name[:80]}")
+    return file
+
+
+def _read_row_camera(
+    row: Mapping[str, Any], path: Path, photograph: Path, where: str
+) -> Pinhole:
+    """Return the camera of a row: its `K`, or that of a camera file."""
+    if ("K" in row) == ("camera" in row):
+        raise errors.FileFormatError(
+            f"{where}: expected either K, nine numbers in pixels, or camera, a file"
+        )
+    if "K" in row:
+        return _make_pinhole(_to_numbers(row["K"], f"{where}: K", 9), where)
+    # imports torch
+    from advsearch.extend import workbench
+
+    file = _get_file({"camera": str(row["camera"])}, "camera", path, where)
+    model = workbench.read_camera(str(file))
+    values = dict(model.values)
+    lens = {key: values.pop(key) for key in ("fx", "fy", "cx", "cy")}
+    if any(values.values()) or model.kind != PINHOLE_KIND:
+        raise InputError(
+            f"{where}: camera: expected a pinhole, got a lens with distortion; "
+            "undistort the photographs first"
+        )
+    height, width = _measure(photograph)
+    return Pinhole(
+        lens["fx"] * width, lens["fy"] * height, lens["cx"] * width, lens["cy"] * height
+    )
+
+
+@lru_cache(maxsize=1)
+def _measure(photograph: Path) -> tuple[int, int]:
+    """Return height and width of a photograph in pixels."""
+    height, width = reading.pictures.read_image(photograph, None).shape[:2]
+    return height, width
+
+
+# ---- numbers
+
+
+def _to_numbers(value: Any, where: str, *counts: int) -> Float64Array:
+    """Return finite numbers of a list, or of a text with blanks between them."""
+    words: Sequence[Any] = value.split() if isinstance(value, str) else value
+    expected = " or ".join(map(str, counts))
+    try:
+        if len(words) not in counts or any(isinstance(word, bool) for word in words):
+            raise ValueError
+        numbers = np.array([float(word) for word in words], np.float64)
+    except (TypeError, ValueError):
+        raise errors.FileFormatError(
+            f"{where}: expected {expected} numbers, got {str(value)[:60]}"
+        ) from None
+    if not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e9:
+        raise errors.FileFormatError(f"{where}: expected finite numbers")
+    return numbers
+
+
+def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
+    """Return a pose (4, 4) with the nearest rotation, and a shift before the camera.
+
+    Measured rotations are off by some thousandths.
+    """
+    rotation = matrix[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0.0:
+        raise errors.FileFormatError(
+            f"{where}: expected a rotation, got a matrix that stretches or mirrors"
+        )
+    if matrix[2, 3] <= 0.0:
+        raise errors.FileFormatError(
+            f"{where}: expected an object before the camera (z > 0), got z = "
+            f"{matrix[2, 3]:g}"
+        )
+    left, _, right = np.linalg.svd(rotation)
+    pose = matrix.copy()
+    pose[:3, :3] = left @ right
+    return np.asarray(pose)
+
+
+def _make_pinhole(numbers: Float64Array, where: str) -> Pinhole:
+    """Return the camera of a matrix K (9,) whose pixel centers are whole numbers."""
+    fx, skew, cx, _, fy, cy, *_ = numbers.tolist()
+    if not (fx > 0.0 and fy > 0.0 and math.isfinite(fx / fy)):
+        raise errors.FileFormatError(f"{where}: expected focal lengths over 0")
+    if abs(skew) > MAX_SKEW * fx:
+        raise errors.FileFormatError(f"{where}: expected a camera without skew")
+    return Pinhole(fx, fy, cx + 0.5, cy + 0.5)

@@ -1,0 +1,470 @@
+"""Settings and result of `twins`, and the view of its result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field, JsonValue, field_validator
+
+from advsearch.extend import (
+    Config,
+    ResultPart,
+    SceneConfig,
+    ShownResult,
+    results,
+    setting,
+    setting_as_in,
+    settings,
+    views,
+    wording,
+)
+
+PHOTOGRAPH = "photograph"
+COMPOSED = results.IN_PHOTOGRAPH
+HOLE = results.WITHOUT_OBJECT
+CLASSIFIER_MARGIN = 0.25
+DETECTOR_MARGIN = 1.5
+
+
+class TwinsConfig(Config):
+    """Settings of `twins`: which photographs, which model, and how twins are made."""
+
+    command: ClassVar[str] = "twins"
+    clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
+        clash for clash in SceneConfig.clashes if clash.setting == "overwrite"
+    )
+    camera: ClassVar[str | None] = None
+    controls: ClassVar[tuple[str, ...]] = ()
+
+    photographs: str = setting(
+        ...,
+        "twins",
+        "photographs with the objects in them, where they stand, and their meshes",
+        "a folder in BOP's form, or a .csv, .json or .yaml list",
+    )
+    names: dict[str, str] = setting(
+        dict,
+        "twins",
+        "the right label of an object, such as obj_000005=can; may be repeated",
+        "OBJECT=LABEL",
+        flag="--name",
+        metavar="OBJECT=LABEL",
+    )
+    environment: str | None = setting_as_in(
+        SceneConfig,
+        "environment",
+        group="twins",
+        description="the environment that surrounds the object in the other twin",
+        otherwise="room",
+    )
+    light: str = setting(
+        "studio",
+        "twins",
+        "the environment that lights the twin in the photograph",
+        "the name of an environment, or a .hdr or .exr file",
+    )
+    margin: float | None = setting(
+        None,
+        "twins",
+        "how far the window reaches beyond the object's box, in longer sides of it",
+        otherwise=f"{CLASSIFIER_MARGIN}, or {DETECTOR_MARGIN} for tasks that look for "
+        "the object",
+        ge=0.0,
+        le=100.0,
+    )
+    visible: float = setting(
+        0.1,
+        "twins",
+        "fraction of an object that must be visible, where the data states it",
+        ge=0.0,
+        le=1.0,
+    )
+    frames: str | None = setting(
+        None,
+        "twins",
+        "which frames are used, separated by commas; FIRST:LAST is a range of numbers",
+        "names of frames, or ranges of their numbers such as 0:600",
+        otherwise="all",
+    )
+    pictures: int = setting(
+        12,
+        "twins",
+        "pairs that are displayed, the worst disagreements first",
+        unit="pairs",
+        ge=0,
+        le=1000,
+    )
+    spp: int = setting(
+        32,
+        "twins",
+        "samples per pixel of a twin",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
+    model: str = setting_as_in(SceneConfig, "model")
+    labels: str | None = setting_as_in(SceneConfig, "labels")
+    prompt: str | None = setting_as_in(SceneConfig, "prompt")
+    value_range: tuple[float, float] | None = setting_as_in(SceneConfig, "value_range")
+    ask: dict[str, float] = setting_as_in(SceneConfig, "ask")
+    task: str | dict[str, JsonValue] = setting_as_in(SceneConfig, "task")
+    seed: int = setting_as_in(SceneConfig, "seed")
+    threads: int | None = setting_as_in(SceneConfig, "threads")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/NAME-twins-NNN")
+    overwrite: bool = setting_as_in(SceneConfig, "overwrite")
+
+    _named = settings.text_validator(
+        "photographs", "model", "environment", "light", "run", "frames"
+    )
+
+    @field_validator("labels", mode="before")
+    @classmethod
+    def _labels_as_text(cls, value: Any) -> Any:
+        return settings.to_text(value, several=True)
+
+    @field_validator("names", mode="before")
+    @classmethod
+    def _names_as_texts(cls, value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {str(name): str(label) for name, label in value.items()}
+        return value
+
+    @property
+    def environment_name(self) -> str:
+        return self.environment or "room"
+
+    @property
+    def task_name(self) -> str:
+        """The name of the task."""
+        return self.task if isinstance(self.task, str) else str(self.task["name"])
+
+    @property
+    def used_threads(self) -> int | None:
+        return self.threads
+
+    @property
+    def title_words(self) -> tuple[str, ...]:
+        return Path(self.photographs).stem, self.command
+
+
+class TwinPrediction(results.Fields):
+    """What the model predicts of an image."""
+
+    surroundings: str = Field(description="which image: the photograph, or a twin")
+    label: str
+    probability: float | None
+    right: bool
+    margin: results.JsonFloat = Field(
+        description="right less best wrong, in what the task compares; under 0 if wrong"
+    )
+    payload: results.Payload = Field(
+        default=None, description="what the task stores, such as boxes; absent without"
+    )
+
+
+class TwinRow(results.Fields):
+    """An object in a photograph, and its twins."""
+
+    number: int
+    photograph: str
+    frame: str = Field(description="the independent unit that it is of")
+    object: str
+    label: str = Field(description="the right one")
+    condition: str
+    window: tuple[int, int, int, int] = Field(
+        description="x, y, width and height of what the model sees, pixels"
+    )
+    size: float = Field(description="square root of the silhouette's area, pixels")
+    brightness: float = Field(
+        description="twin less photograph where the object is, sRGB from -1 to 1"
+    )
+    contrast: float = Field(
+        description="standard deviation around the object in the photograph, sRGB"
+    )
+    visible: float | None = Field(description="fraction; null where it is not known")
+    overlap: float | None = Field(
+        description="of the twin's silhouette with the data's mask, or their boxes, "
+        "over the union; null without"
+    )
+    predictions: list[TwinPrediction]
+
+    @property
+    def photo(self) -> TwinPrediction:
+        return self.twin(PHOTOGRAPH)
+
+    def twin(self, surroundings: str) -> TwinPrediction:
+        """Return the prediction about one of the images."""
+        for prediction in self.predictions:
+            if prediction.surroundings == surroundings:
+                return prediction
+        raise KeyError(surroundings)
+
+
+class FactorPart(results.Fields):
+    """How often photograph and twin disagree in a part of the values of a factor."""
+
+    factor: str
+    unit: str
+    lower: float
+    upper: float
+    pairs: int
+    disagreeing: int
+    rate: results.Estimate
+
+
+class TwinPair(results.Fields):
+    """A pair that is displayed, with its images."""
+
+    row: TwinRow
+    pictures: list[str] = Field(description="files: photograph, then twins")
+
+
+class TwinsResult(views.InNotebook, results.RunResult):
+    """How far what a model predicts of renders holds for photographs of the same."""
+
+    command: ClassVar[str] = "twins"
+
+    photographs: str = Field(description="the folder or list")
+    model: str
+    task: str = Field(description="what judges the predictions")
+    table: list[results.TwinAgreement]
+    overlap: float | None = Field(
+        description="median overlap of silhouettes; null where the data has none"
+    )
+    low_overlaps: int = Field(description="pairs with an overlap under 0.8")
+    factors: list[FactorPart] = Field(
+        description="of the twins in the photograph, by what may explain disagreement"
+    )
+    pairs: list[TwinPair]
+    renders: int
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def brief(self) -> str:
+        row = find_row(self.table, COMPOSED)
+        return "" if row is None else f"agree {wording.percent(row.agreement.value)}"
+
+
+TABLE_NOTE = (
+    "Rates are means over frames, with 95 % intervals over frames. Kappa (Cohen's) is "
+    "of right and wrong, 0 for agreement by chance; of margins it is Spearman's rank "
+    "correlation with those of the photographs. Where a photograph or a twin is wrong "
+    "in fewer than five frames, no number is stated, only the counts."
+)
+
+
+def find_row(
+    table: Sequence[results.TwinAgreement], surroundings: str
+) -> results.TwinAgreement | None:
+    """Return the row of all objects and conditions; None if there is none."""
+    for row in table:
+        if row.surroundings == surroundings and not row.object and not row.condition:
+            return row
+    return None
+
+
+def format_conditional(row: results.TwinAgreement) -> str:
+    """Return how often the photograph is wrong where the twin is."""
+    counts = f"{row.both_wrong} of {row.wrong_twins}"
+    if row.wrong_where_twin_wrong is None:
+        return f"too few wrong: {counts}"
+    return f"{wording.format_estimate(row.wrong_where_twin_wrong)}, {counts}"
+
+
+HEADS = (
+    "model sees",
+    "pairs",
+    "right",
+    "agrees",
+    "kappa",
+    "margins",
+    "photograph wrong where this is",
+)
+
+
+def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
+    return [
+        name,
+        str(row.pairs),
+        wording.format_estimate(row.twin_right),
+        wording.format_estimate(row.agreement),
+        wording.format_estimate(row.kappa, "too few wrong"),
+        wording.format_estimate(row.margins),
+        format_conditional(row),
+    ]
+
+
+def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
+    """Return the table of all objects and conditions."""
+    total = [row for row in table if not row.object and not row.condition]
+    first = total[0]
+    photo = [
+        PHOTOGRAPH,
+        str(first.pairs),
+        wording.format_estimate(first.photo_right),
+        "",
+        "",
+        "",
+    ]
+    photo.append(f"wrong at all: {wording.format_estimate(first.photo_wrong)}")
+    rows = [photo, *(_agreement_cells(row, _name_surroundings(row)) for row in total)]
+    return ResultPart("How far twins hold", heads=HEADS, rows=rows, note=TABLE_NOTE)
+
+
+def _name_surroundings(row: results.TwinAgreement) -> str:
+    if row.surroundings in (COMPOSED, HOLE):
+        return row.surroundings
+    return f"twin in the environment {row.surroundings}"
+
+
+def _group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[ResultPart]:
+    """Yield the tables by object and by condition."""
+    surroundings = list(dict.fromkeys(row.surroundings for row in table))
+    for kind in ("object", "condition"):
+        for name in surroundings:
+            rows = [
+                _agreement_cells(row, getattr(row, kind))
+                for row in table
+                if getattr(row, kind) and row.surroundings == name
+            ]
+            title = f"By {kind}: {name}"
+            heads = (kind, *HEADS[1:])
+            yield ResultPart(title, heads=heads, rows=rows, folded=True, only="page")
+
+
+def _factor_part(result: TwinsResult) -> ResultPart:
+    rows = []
+    for part in result.factors:
+        bounds = f"{_factor_number(part.lower)} to {_factor_number(part.upper)}"
+        rows.append(
+            [
+                part.factor,
+                f"{bounds} {part.unit}".strip(),
+                f"{part.disagreeing} of {part.pairs}",
+                wording.format_estimate(part.rate),
+            ]
+        )
+    return ResultPart(
+        "What goes with disagreement",
+        heads=("", "from", "disagree", "rate"),
+        rows=rows,
+        note="Of twins in the photograph. Each factor is cut into parts with as many "
+        "pairs; a part that stands out is a hint, and no cause.",
+    )
+
+
+def _factor_number(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 10.0 else f"{value:.2f}"
+
+
+def make_twins_view(result: TwinsResult) -> ShownResult:
+    """Return the table, what explains disagreement, and the pairs."""
+    facts = {
+        "photographs": result.photographs,
+        "silhouettes": _overlap_text(result),
+    }
+    about = [result.photographs, result.model]
+    if not result.table:
+        return ShownResult(
+            "Interrupted before anything was compared.",
+            facts=facts,
+            about=about,
+            says_interrupted=True,
+        )
+    sections = [make_agreement_part(result.table), *_group_parts(result.table)]
+    sections += [_factor_part(result), *_pair_parts(result)]
+    return ShownResult(summarize_twins(result.table), sections, facts, about)
+
+
+def _overlap_text(result: TwinsResult) -> str:
+    if result.overlap is None:
+        return ""
+    text = f"median overlap {result.overlap:.2f}"
+    if result.low_overlaps:
+        text += f"; under .8 in {result.low_overlaps}"
+    return text
+
+
+def summarize_twins(table: Sequence[results.TwinAgreement]) -> str:
+    """Summarise how far twins hold in sentences."""
+    composed = find_row(table, COMPOSED)
+    if composed is None:
+        return "Nothing was compared."
+    agreement = wording.format_estimate(composed.agreement)
+    counts = (
+        f"{wording.format_count(composed.pairs, 'pair')} of "
+        f"{wording.format_count(composed.frames, 'frame')}"
+    )
+    sentences = [f"Twins in the photograph agree with it in {agreement} of {counts}."]
+    if composed.wrong_where_twin_wrong is not None:
+        sentences.append(
+            f"Where a twin is wrong, the photograph is wrong in "
+            f"{wording.format_estimate(composed.wrong_where_twin_wrong)}; at all, in "
+            f"{wording.format_estimate(composed.photo_wrong)}."
+        )
+    else:
+        sentences.append(
+            f"{composed.wrong_twins} of them are wrong, too few to state what a failing "
+            "twin says of its photograph."
+        )
+    return " ".join(sentences)
+
+
+def _pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
+    """Yield the pairs, for a terminal and for a page."""
+    title = "Worst disagreements first"
+    lines = []
+    groups = []
+    for pair in result.pairs:
+        row = pair.row
+        name = f"{row.object} in {row.frame}"
+        texts = [
+            f"{image.surroundings}: {_verdict(image)}" for image in row.predictions
+        ]
+        lines.append(f"{name}: {'; '.join(texts)}")
+        by_name = {image.surroundings: image for image in row.predictions}
+        captions = [
+            f"{surroundings}: {_verdict(by_name[surroundings])}"
+            for surroundings in list(by_name)[: len(pair.pictures)]
+        ]
+        if captions:
+            captions[0] = f"{name}, {row.size:.0f} pixels. {captions[0]}"
+        groups.append(
+            [
+                views.Picture(file, caption)
+                for file, caption in zip(pair.pictures, captions, strict=False)
+            ]
+        )
+    yield ResultPart(title, lines[:5], only="text")
+    yield ResultPart(title, pictures=groups, only="page")
+
+
+def _verdict(image: TwinPrediction) -> str:
+    verdict = "right" if image.right else "wrong"
+    return f"{image.label or 'nothing'}, {verdict}, margin {image.margin:+.1f}"
+
+
+def make_twins_claims(result: TwinsResult) -> Iterator[views.Claim]:
+    """Yield a claim for each of the surroundings."""
+    for row in result.table:
+        if row.object or row.condition:
+            continue
+        extent = results.Extent.from_count(
+            "pairs of photograph and twin that agree",
+            round(row.agreement.value * row.pairs),
+            row.pairs,
+            row.agreement.interval,
+            row.agreement.value,
+        )
+        counts = (
+            f"{wording.format_count(row.pairs, 'pair')} of "
+            f"{wording.format_count(row.frames, 'frame')}"
+        )
+        statement = (
+            f"{_name_surroundings(row)}: agrees with the photograph in "
+            f"{wording.format_estimate(row.agreement)} of {counts}; photographs wrong "
+            f"where it is wrong: {format_conditional(row)}."
+        )
+        yield views.Claim(kind="measured", statement=statement, extent=extent)

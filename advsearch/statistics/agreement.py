@@ -1,0 +1,138 @@
+"""Agreement of two measurements of the same rows, which are clustered in units.
+
+A unit may be a frame with several objects. Units are independent, their rows are not.
+Rates and their intervals are those of `clustered`: all units weigh the same. Kappa and
+the rank correlation are of all rows; their intervals leave out one unit at a time
+(jackknife, Efron and Stein 1981, "The jackknife estimate of variance") on the scale of
+Fisher's z, with a quantile of Student's t of as many degrees of freedom as there are
+units less one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import stdtrit
+from scipy.stats import rankdata
+
+from advsearch.errors import InputError
+from advsearch.statistics.clustered import mean_rate, rate_interval, sum_per_unit
+from advsearch.statistics.intervals import CONFIDENCE
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+MIN_UNITS = 5
+"""Units below which kappa, a correlation or a conditional rate has no interval, and the
+event of either side must happen in as many.
+"""
+MAX_CORRELATION = 0.9999  # up to which Fisher's z is computed
+
+
+def compute_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
+    """Compute Cohen's kappa of two outcomes (n,) bool: agreement beyond chance.
+
+    (p - e) / (1 - e) with p the rate at which they agree and e that of independent
+    outcomes (Cohen 1960, "A coefficient of agreement for nominal scales"). NaN if both
+    are constant, or there are no rows.
+    """
+    first = np.asarray(first, dtype=bool)
+    second = np.asarray(second, dtype=bool)
+    if not len(first):
+        return math.nan
+    first_rate = float(first.mean())
+    second_rate = float(second.mean())
+    expected = first_rate * second_rate + (1.0 - first_rate) * (1.0 - second_rate)
+    if expected >= 1.0:
+        return math.nan
+    return (float((first == second).mean()) - expected) / (1.0 - expected)
+
+
+def compute_rank_correlation(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
+    """Compute Spearman's rank correlation of two numbers (n,), ties by mean ranks.
+
+    Spearman 1904, "The proof and measurement of association between two things". NaN
+    with fewer than three rows, or where one of them is constant.
+    """
+    first_rank = rankdata(first)
+    second_rank = rankdata(second)
+    if len(first_rank) < 3 or not np.ptp(first_rank) or not np.ptp(second_rank):
+        return math.nan
+    return float(np.corrcoef(first_rank, second_rank)[0, 1])
+
+
+def correlation_interval(
+    statistic: Callable[[Any, Any], float],
+    first: npt.ArrayLike,
+    second: npt.ArrayLike,
+    units: IntArray,
+) -> tuple[float, float] | None:
+    """Return the 95 % interval of a coefficient in [-1, 1], by units.
+
+    Args:
+        statistic: of both measurements of some rows: `compute_kappa` or
+            `compute_rank_correlation`.
+        first, second: (n,) measurements.
+        units: (n,) unit of each row.
+
+    Returns:
+        None with fewer than `MIN_UNITS` units, or where the coefficient is not defined
+        without one of them.
+    """
+    first = np.asarray(first)
+    second = np.asarray(second)
+    names, unit_index = np.unique(units, return_inverse=True)
+    n_units = len(names)
+    if n_units < MIN_UNITS:
+        return None
+    left_out = np.array(
+        [
+            statistic(first[unit_index != unit], second[unit_index != unit])
+            for unit in range(n_units)
+        ]
+    )
+    value = statistic(first, second)
+    if not math.isfinite(value) or not np.isfinite(left_out).all():
+        return None
+    z = _to_fisher_z(left_out)
+    variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
+    tail = (1.0 + CONFIDENCE) / 2.0
+    half_width = float(stdtrit(n_units - 1, tail)) * math.sqrt(variance)
+    center = float(_to_fisher_z(np.array(value)))
+    return math.tanh(center - half_width), math.tanh(center + half_width)
+
+
+def _to_fisher_z(values: FloatArray) -> FloatArray:
+    """Return atanh of coefficients, which are cut at `MAX_CORRELATION`."""
+    z: FloatArray = np.arctanh(np.clip(values, -MAX_CORRELATION, MAX_CORRELATION))
+    return z
+
+
+def count_units(happens: npt.ArrayLike, units: IntArray) -> int:
+    """Return the number of units in which an event (n,) happens in some row."""
+    return len(np.unique(np.asarray(units)[np.asarray(happens, dtype=bool)]))
+
+
+def estimate_rate(
+    happens: npt.ArrayLike, units: IntArray
+) -> tuple[float, tuple[float, float]]:
+    """Return the mean rate of an event over units, and its 95 % interval.
+
+    See `clustered.mean_rate` and `clustered.rate_interval`.
+
+    Args:
+        happens: (n,) bool, n > 0.
+        units: (n,) unit of each row.
+
+    Raises:
+        InputError: there are no rows.
+    """
+    if not len(units):
+        raise InputError("rate: expected at least one row, got none")
+    counted = sum_per_unit(np.asarray(happens, dtype=bool), units)
+    rows = sum_per_unit(np.ones(len(units)), units)
+    return mean_rate(counted, rows), rate_interval(counted, rows)
