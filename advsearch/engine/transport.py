@@ -53,7 +53,7 @@ It costs as much as some 6 rendered evaluations with gradients
 # evaluations for each light from which on basis images pay
 MIN_STEPS_PER_LIGHT = 8
 COMPARISON_INTERVAL = 20  # evaluations from one comparison to the next
-SURROUNDINGS_SPP = 32  # samples per pixel of what is outside of a matrix's window
+SURROUNDINGS_SPP = 16  # samples per pixel of what is outside of a matrix's window
 MIN_SCORES = 4  # trials from which a standard deviation is estimated
 # standard deviations below the mean above which 19 of 20 scores lie
 LOWER_END_DEVIATIONS = 1.64
