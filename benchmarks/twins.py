@@ -104,6 +104,7 @@ def list_crops(
         positions = rendering.project_object(
             item, rendering.load_object(item.mesh, item.unit)
         )
+        photo_size = (photograph.shape[0], photograph.shape[1])
         images = []
         for copy in range(N_COPIES):
             margin = CLASSIFIER_MARGIN
@@ -114,7 +115,7 @@ def list_crops(
                 margin = float(generator.uniform(0.1, 0.5))
                 moved = positions + 0.08 * extent * generator.standard_normal(2)
                 gain = float(generator.uniform(0.6, 1.4))
-            window = rendering.choose_window(moved, photograph.shape[:2], SIZE, margin)
+            window = rendering.choose_window(moved, photo_size, SIZE, margin)
             if window is None:
                 break
             crop = rendering.resize(rendering.cut_window(photograph, window), SIZE)
@@ -144,7 +145,7 @@ def run_folds(options: argparse.Namespace) -> list[str]:
         labels += [names.index(item.object)] * len(images)
     features = torch.cat(blocks)
     targets = torch.tensor(labels)
-    model_of_frame = {}
+    model_of_frame: dict[str, advsearch.Model] = {}
     for number, block in enumerate(cut_frames(objects, options.folds)):
         is_other = torch.tensor([frame not in block for frame in frames])
         head = fit_head(backbone, features[is_other], targets[is_other], len(names))

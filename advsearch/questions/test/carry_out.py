@@ -340,7 +340,7 @@ class _SuiteRun:
 
     def _find_twins(self, configs: Sequence[SceneConfig]) -> Any:
         """Return what a run of twins measured for the claims; None without one."""
-        config = self.trial.config
+        config = self.tester.config
         return workbench.find_twin_evidence(
             config.twins,
             model=_join_distinct(claim.model for claim in configs),
