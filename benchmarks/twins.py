@@ -145,7 +145,7 @@ def run_folds(options: argparse.Namespace) -> list[str]:
         labels += [names.index(item.object)] * len(images)
     features = torch.cat(blocks)
     targets = torch.tensor(labels)
-    model_of_frame: dict[str, Any] = {}
+    model_of_frame: dict[str, advsearch.Model] = {}
     for number, block in enumerate(cut_frames(objects, options.folds)):
         is_other = torch.tensor([frame not in block for frame in frames])
         head = fit_head(backbone, features[is_other], targets[is_other], len(names))

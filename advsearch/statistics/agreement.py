@@ -1,8 +1,8 @@
 """Agreement of two measurements of the same rows, which are clustered in units.
 
 A unit may be a frame with several objects. Units are independent, their rows are not.
-Rates and their intervals are those of `clustered`: all units weigh the same. Kappa and
-the rank correlation are of all rows; their intervals leave out one unit at a time
+Rates, kappa and the rank correlation are of all rows. Intervals of kappa and the
+correlation leave out one unit at a time
 (jackknife, Efron and Stein 1981, "The jackknife estimate of variance") on the scale of
 Fisher's z, with a quantile of Student's t of as many degrees of freedom as there are
 units less one.
@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import stdtrit
+from scipy.special import betaincinv, stdtrit
 from scipy.stats import rankdata
 
 from advsearch.errors import InputError
-from advsearch.statistics.clustered import mean_rate, rate_interval, sum_per_unit
-from advsearch.statistics.intervals import CONFIDENCE
+from advsearch.statistics.clustered import sum_per_unit
+from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -120,9 +120,12 @@ def count_units(happens: npt.ArrayLike, units: IntArray) -> int:
 def estimate_rate(
     happens: npt.ArrayLike, units: IntArray
 ) -> tuple[float, tuple[float, float]]:
-    """Return the mean rate of an event over units, and its 95 % interval.
+    """Return the rate of an event over all rows, and its 95 % interval over units.
 
-    See `clustered.mean_rate` and `clustered.rate_interval`.
+    The interval is Clopper and Pearson's of as many independent rows as would have the
+    variance over units (Korn and Graubard 1998, "Confidence intervals for proportions
+    with small expected number of positive counts estimated from survey data"). Where
+    the event happens in all rows or in none, each unit counts as one row.
 
     Args:
         happens: (n,) bool, n > 0.
@@ -131,8 +134,33 @@ def estimate_rate(
     Raises:
         InputError: there are no rows.
     """
-    if not len(units):
+    n_rows = len(units)
+    if not n_rows:
         raise InputError("rate: expected at least one row, got none")
-    counted = sum_per_unit(np.asarray(happens, dtype=bool), units)
-    rows = sum_per_unit(np.ones(len(units)), units)
-    return mean_rate(counted, rows), rate_interval(counted, rows)
+    event = np.asarray(happens, dtype=bool)
+    rate = float(event.mean())
+    n_units = len(np.unique(units))
+    if n_units == n_rows:
+        return rate, clopper_pearson(int(event.sum()), n_rows)
+    unit_residual = sum_per_unit(event - rate, units)
+    variance = float((unit_residual**2).sum()) / n_rows**2
+    variance *= n_units / max(n_units - 1, 1)
+    n_effective = float(n_units)
+    if variance > 0.0 and n_units > 1:
+        tail = (1.0 + CONFIDENCE) / 2.0
+        ratio = float(stdtrit(n_rows - 1, tail) / stdtrit(n_units - 1, tail))
+        n_effective = min(rate * (1.0 - rate) / variance * ratio**2, float(n_rows))
+    return rate, _make_beta_interval(rate * n_effective, n_effective)
+
+
+def _make_beta_interval(successes: float, trials: float) -> tuple[float, float]:
+    """Return Clopper and Pearson's 95 % interval, also between whole numbers."""
+    tail = (1.0 - CONFIDENCE) / 2.0
+    failures = trials - successes
+    low = 0.0
+    if successes > 0.0:
+        low = float(betaincinv(successes, failures + 1.0, tail))
+    high = 1.0
+    if failures > 0.0:
+        high = float(betaincinv(successes + 1.0, failures, 1.0 - tail))
+    return low, high

@@ -268,8 +268,8 @@ class Comparison:
         self,
         number: int,
         selection: Selection,
-        layer: rendering.Layer,
-        renderer: rendering.SurroundedRenderer,
+        layer: Any,
+        renderer: Any,
     ) -> TwinRow:
         """Render an object's twin, and return what the model says of all images."""
         item = selection.objects[number]

@@ -189,7 +189,7 @@ def _read_scene(scene: Path, models: Path) -> Listing:
             n_missing += len(entries)
             continue
         camera = _read_bop_camera(scene, cameras, image)
-        rows = infos.get(image)
+        rows: Any = infos.get(image)
         for index, entry in enumerate(entries):
             info: Mapping[str, Any] = {}
             if _is_rows(rows) and index < len(rows):
@@ -444,7 +444,7 @@ def _check_pose(matrix: Float64Array, where: str) -> Float64Array:
             f"{matrix[2, 3]:g}"
         )
     left, _, right = np.linalg.svd(rotation)
-    pose = matrix.copy()
+    pose: Float64Array = matrix.copy()
     pose[:3, :3] = left @ right
     return np.asarray(pose)
 

@@ -248,7 +248,7 @@ class TwinsResult(views.InNotebook, results.RunResult):
 
 
 TABLE_NOTE = (
-    "Rates are means over frames, with 95 % intervals over frames. Kappa (Cohen's) is "
+    "Intervals are 95 %, over frames and not over pairs. Kappa (Cohen's) is "
     "of right and wrong, 0 for agreement by chance; of margins it is Spearman's rank "
     "correlation with those of the photographs. Where a photograph or a twin is wrong "
     "in fewer than five frames, no number is stated, only the counts."
