@@ -83,6 +83,7 @@ class SceneKeywords(TypedDict, total=False):
     verify_spp: int | None
     workers: int | None
     cluster: str | Path | None
+    twins: str | Path | None
 
 
 class _Signature(inspect.Signature):
