@@ -55,6 +55,7 @@ from advsearch.runs.results import (
     VerifiedRate,
 )
 from advsearch.runs.results import Extent as Extent
+from advsearch.settings import settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -189,6 +190,12 @@ def get_view(result: Result) -> ShownResult:
     return view
 
 
+def takes_twins(command: str) -> bool:
+    """Return whether a command has the setting `twins`."""
+    declared = settings(registry.get_experiment(command).settings)
+    return any(setting.field == "twins" for setting in declared)
+
+
 def list_remarks(result: Result, view: ShownResult) -> list[str]:
     """Return what to know of a result before it is used: its state, cautions,
     warnings.
@@ -202,6 +209,8 @@ def list_remarks(result: Result, view: ShownResult) -> list[str]:
     twins = getattr(result, "twins", None)
     if twins is not None:
         remarks.append(wording.format_twin_evidence(twins))
+    elif takes_twins(result.command):
+        remarks.append(wording.NO_TWINS)
     return [*remarks, *view.cautions, *getattr(result, "warnings", ())]
 
 

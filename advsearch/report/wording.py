@@ -599,6 +599,12 @@ def _two_decimals(value: float) -> str:
     return text.replace("0.", ".", 1) if abs(value) < 0.995 else text
 
 
+NO_TWINS = (
+    "How far this holds for photographs was not measured. advsearch twins does; name its "
+    "run in `twins`."
+)
+
+
 def format_twin_evidence(evidence: TwinEvidence) -> str:
     """Return in a sentence or two how far a verdict holds for photographs."""
     name = PurePath(evidence.run).name
