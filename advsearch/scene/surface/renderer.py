@@ -67,9 +67,9 @@ class MapFingerprint:
         return cls(mean, texels[::stride] / mean.clamp_min(1e-12))
 
     def find_factor(self, other: MapFingerprint) -> Tensor | None:
-        """Return how many times as bright (3,) another map is.
+        """Return the factor (3,), by channel, with which this map becomes another one.
 
-        None if it differs in more than that.
+        None if the other map is no multiple of it.
         """
         if self.texels.shape != other.texels.shape or not torch.allclose(
             self.texels, other.texels, rtol=1e-5, atol=1e-6
@@ -169,8 +169,8 @@ class SurfaceRenderer(Predictor):
     def n_bytes(self) -> int:
         """Memory of the arrangement and the stored lights.
 
-        With a fixed light only that counts, since the arrangement is another renderer's
-        too.
+        A renderer with a fixed light shares the arrangement with another renderer, so
+        that only its light counts.
         """
         if self.fixed_light is not None:  # the rest is shared
             return self.fixed_light.bytes
@@ -221,10 +221,11 @@ class SurfaceRenderer(Predictor):
     def trace_views(
         self, inputs: Sequence[Mapping[str, Tensor]]
     ) -> Iterator[LitCameraView]:
-        """Yield what the cameras of scene inputs see, environment by environment.
+        """Yield what each camera sees, in groups of cameras under the same environment.
 
-        Those under one environment are traced in one launch, while the results of the
-        launch before are used.
+        `inputs` are the scene inputs of each camera. A group is traced in one launch;
+        the next launch is started before the results of this one are used, so that both
+        go on at once.
         """
         lights = [self._choose_light(camera_inputs) for camera_inputs in inputs]
         cameras_of_light: dict[ArrangementLight, list[int]] = {}
@@ -233,6 +234,7 @@ class SurfaceRenderer(Predictor):
         cameras = [
             self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
         ]
+        # lazy: asking for the next element starts a launch
         launches = (
             self.arrangement.start_tracing(
                 [cameras[camera_index] for camera_index in camera_indices], light
@@ -310,14 +312,14 @@ class SurfaceRenderer(Predictor):
 
 
 def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
-    """Return why light on surfaces cannot predict images of a space; None if it may.
+    """Return why light on surfaces cannot predict a space's images; None if it may.
 
-    How far it is off is then for measurement.
+    None does not say how good the prediction is: that is measured afterwards.
 
     Args:
         renderer: of the space.
-        varying: names of the controls that vary; the others are searched, and may
-            change base colors alone.
+        varying: names of the controls that vary, which may change cameras and the
+            environment. The others are searched, and may change base colors alone.
     """
     refusal = find_scene_refusal(renderer)
     if refusal is not None:
@@ -361,9 +363,9 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
 def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     """Return the names of the scene inputs that some controls change.
 
-    Their coordinates are set to some fractions of their ranges, all at once, and the
-    inputs compared with those at the start. `varying` has the names of controls, or of
-    groups of coordinates.
+    `varying` has names of controls or of groups of coordinates. Their coordinates are
+    set to one fraction of their ranges after another, all at once, and the inputs are
+    compared with those of the start.
     """
     changed: set[str] = set()
     with torch.no_grad():
