@@ -459,7 +459,7 @@ class Arrangement:
             )
             leaving = reflectance * irradiance / math.pi
             surroundings = sky.map
-            # without a ground: an entry that no look-up finds
+            # without a ground it is read, but does not count
             far_ground = torch.ones(1, 3)
             if self._has_ground:
                 ground = self.texels.select_grid(self.n_sides)
