@@ -114,6 +114,9 @@ class BackgroundControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the linear color (3,) of the backdrop; nothing where the environment
+        is shown.
+        """
         if BACKDROPS[int(values["what"])] == "environment":
             return {}
         return {
@@ -125,6 +128,9 @@ class BackgroundControl(Control):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return the sRGB levels of the color, which is searched as hue, saturation and
+        value.
+        """
         levels = hsv_to_rgb(*(values[name] for name in COLOR_PARAMETERS))
         channels = zip(color.CHANNELS, levels, strict=True)
         return {

@@ -196,9 +196,10 @@ class Choice:
     signed: bool = False
 
     def check(self, control: str, value: object) -> None:
-        """Check what was chosen in an instance of a control.
+        """Check what was chosen; raises InputError if it cannot be chosen.
 
-        None is fine where it is the default. Raises InputError: it cannot be chosen.
+        `control` is the name of the instance, for messages. None is fine where it is
+        the default.
         """
         if value is None and self.default is None:
             return
@@ -442,6 +443,7 @@ class Control:
             value = self._settings.get(parameter.name)
             if value is None:
                 continue
+            # the full range only names the form: it cannot be narrowed
             if value not in (
                 [parameter.low, parameter.high],
                 (parameter.low, parameter.high),
@@ -539,6 +541,7 @@ class Control:
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
         counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
+        # a slot of several values has the same range for each coordinate
         self._low, self._span = low_and_span.T.repeat_interleave(counts, dim=1)
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -617,8 +620,9 @@ class Control:
     def _list_adjusted_defaults(self) -> Iterator[AdjustedDefault]:
         """Yield the values of the clean scene that the start does not have.
 
-        Values that the user fixed are not among them, nor is anything but the `amount`
-        of a control that has one, as it hides the rest.
+        Values that the user fixed are left out. A control with an `amount` yields
+        nothing but that one: at the amount of the clean scene its other parameters have
+        no effect.
 
         Raises:
             InputError: the user set one of them for the scene.

@@ -117,6 +117,7 @@ class EnvironmentControl(Control):
         return (replace(which, options=options), *others)
 
     def check_choices(self) -> None:
+        """Check that there are harmonics if a ball is set for them. Raises InputError."""
         epsilon = self.chosen["epsilon"]
         if "epsilon" in self._settings and "harmonics" not in self._settings:
             raise InputError(
@@ -306,11 +307,10 @@ def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor
 
 
 def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
-    """Rotate a map (H, W, 3) about the vertical by linear resampling of its columns.
+    """Rotate a map (H, W, 3) about the vertical, as `environment.rotation` does.
 
-    As `environment.rotation` does.
-
-    Periodic and differentiable in both arguments; exact at whole columns.
+    Its columns are interpolated linearly and go round. Differentiable in both
+    arguments; exact at whole columns.
     """
     columns = radiance.shape[1]
     shift = torch.remainder(degrees / 360.0, 1.0) * columns
@@ -324,10 +324,11 @@ def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
 
 
 def compute_harmonic_light(coefficients: Tensor, reference: Tensor) -> Tensor:
-    """Return light (H, W, 3) from 9 spherical-harmonic coefficients a channel.
+    """Return light (H, W, 3) as a sum of 9 spherical harmonics in each channel.
 
     Args:
-        coefficients: (27,), multiples of the map's mean.
+        coefficients: (27,) in units of the map's mean: for each harmonic three
+            channels.
         reference: the map (H, W, 3).
     """
     height, width = reference.shape[:2]

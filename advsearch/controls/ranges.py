@@ -135,9 +135,10 @@ class DistributionRange(Range):
     label: str
 
     def interpolate(self, u: Tensor, *, log: bool = False) -> Tensor:
-        """Return the values at coordinates in [0, 1].
+        """Return the values at coordinates in [0, 1]: the quantiles of the
+        distribution.
 
-        Differentiable, by the slope of the quantiles.
+        The derivative is the slope of the quantiles, by finite differences.
         """
         values = self._compute_values(u.detach())
         if u.requires_grad:
@@ -266,10 +267,11 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
 
 
 def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
-    """Return both ranges of angles that a reversed one may mean, for a message.
+    """Return a clause about both ranges of angles that a reversed one may mean.
 
     From 350 to 10 may mean the 20 degrees through 0 or the 340 in between. The first
-    range is moved by a turn, so that it ascends and stays within the parameter's bounds.
+    range is shifted by a turn, so that it ascends and stays within the parameter's
+    bounds.
     """
     begin = low
     end = high + FULL_TURN
@@ -303,9 +305,11 @@ MAX_REPEATS = 1000  # largest number of values that a weighted choice is repeate
 def _make_weighted_choice(
     where: str, values: Sequence[ParameterValue], weights: object
 ) -> OneOf:
-    """Return a choice that repeats each value in proportion to its weight.
+    """Return a choice among values with weights.
 
-    So equal fractions of u draw it with that probability.
+    Each value is repeated in proportion to its weight, so that a uniform coordinate
+    selects it with that probability. Raises InputError: weights are missing or invalid,
+    or one is too small for `MAX_REPEATS`.
     """
     weight_list = list(weights) if isinstance(weights, (list, tuple)) else []
     valid_weights = [
@@ -335,10 +339,11 @@ def _make_weighted_choice(
 
 
 def _count_repeats(probabilities: Sequence[float]) -> list[int]:
-    """Return how often each value is repeated so that it has its probability.
+    """Return how often each value is repeated, in proportion to its probability.
 
     The total is the smallest with which all counts are whole numbers, or `MAX_REPEATS`
-    if there is none; then cumulated counts are rounded, so that their sum is right.
+    if there is none. Counts are differences of rounded cumulative counts, so that their
+    sum is the total.
     """
     total = MAX_REPEATS
     for candidate in range(1, MAX_REPEATS):
@@ -420,8 +425,9 @@ def compute_difference(first: float, second: float, *, is_angle: bool = False) -
 def clip_to_range(
     value: float, low: float, high: float, *, is_angle: bool = False
 ) -> float:
-    """Return the value in a range that is nearest to a value; of an angle, nearest the
-    shorter way round.
+    """Return the value in a range that is nearest to a given one.
+
+    Angles are compared the shorter way round.
     """
     if is_angle:
         # in [low, low + 360): above `high` the way on to `low` may be shorter
@@ -482,8 +488,9 @@ class Slot:
         )
 
     def start_value(self) -> ParameterValue:
-        """Return the default, or the nearest value that is allowed; of names, the first
-        that is allowed.
+        """Return the parameter's default, or the allowed value that is nearest to it.
+
+        Names have no nearest value: the first allowed one is returned.
         """
         spec = self.spec
         default = self.parameter.default
@@ -505,7 +512,7 @@ class Slot:
         )
 
     def start_coordinates(self) -> list[float]:
-        """Return the coordinates of that value."""
+        """Return the coordinates of `start_value`; none if the parameter is fixed."""
         spec = self.spec
         value = self.start_value()
         if isinstance(spec, Range):
@@ -513,6 +520,7 @@ class Slot:
                 spec.find_coordinate(float(value), log=self.parameter.log)
             ] * self.n_values
         if isinstance(spec, OneOf):
+            # the middle of the value's interval of [0, 1]
             return [(spec.values.index(value) + 0.5) / len(spec.values)]
         return []
 
@@ -547,6 +555,7 @@ def parse_distribution(
         lower_probability = float(frozen.cdf(parameter.low))
         upper_probability = float(frozen.cdf(parameter.high))
         outside = lower_probability + float(frozen.sf(parameter.high))
+        # whether the distribution ends below and above
         has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
     if outside > MAX_OUTSIDE_PROBABILITY:
         raise InputError(
@@ -603,7 +612,12 @@ def _freeze_distribution(
 def _read_python_quantiles(
     label: str, parameter: Parameter, setting: PythonQuantiles
 ) -> DistributionRange:
-    """Return the spec of a function from Python, an inverse CDF."""
+    """Return the range of a parameter whose values a Python function gives.
+
+    The function is an inverse CDF, from a probability to a value. It is checked at
+    `N_CHECKED_QUANTILES` probabilities. Raises InputError: its values leave the
+    parameter's bounds, or fall.
+    """
     name = str(setting["name"])
 
     def quantiles(probabilities: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -611,6 +625,7 @@ def _read_python_quantiles(
         return np.array(values).reshape(probabilities.shape)
 
     with np.errstate(all="ignore"):
+        # whether the distribution ends below and above; if not, its tails are cut off
         has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
     lower_probability = 0.0 if has_end[0] else TAIL_PROBABILITY
     upper_probability = 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY

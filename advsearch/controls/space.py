@@ -156,11 +156,11 @@ class Space:
     def _with_previous_inputs(
         self, u: Tensor
     ) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
-        """Return each control with its slice of u and the inputs of those evaluated
-        before it, in the order of the controls.
+        """Return each control with its slice of u and the inputs set before it.
 
-        A control that refines nothing gets no inputs; after the last that refines, none
-        are computed.
+        The result has the order of the controls; but inputs are set in the order of
+        evaluation. A control that refines nothing gets no inputs, and none are computed
+        after the last control that needs some.
         """
         slices = u.detach().split(self.sizes)
         order = self._evaluation_order
@@ -260,7 +260,8 @@ class Space:
             InputError: no number of controls has k coordinates.
         """
         sizes = self.sizes
-        # of controls without coordinates at the end, none is fixed
+        # several counts are possible where controls have no coordinates; the smallest
+        # is taken
         counts = [
             count for count in range(len(sizes) + 1) if sum(sizes[:count]) == len(u)
         ]
@@ -370,6 +371,7 @@ class _FixedControl(Control):
     """A bound control that stays at one configuration, and takes no coordinates."""
 
     def __init__(self, control: Control, u: Tensor) -> None:
+        """Fix a control at a slice of u: it has no coordinates any more."""
         self._control = control
         self._u = u
         self.name = control.name

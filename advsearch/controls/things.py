@@ -208,6 +208,7 @@ class ThingsControl(Control):
             is_absent = values[f"{name}.presence"]
             if is_absent:
                 turn = ABSENT_SCALE * turn
+            # without derivative
             position = base.new_tensor([*stand.position, stand.height])
             depth = (
                 base.new_tensor([0.0, 0.0, ABSENT_DEPTH / self.scene.metres])
@@ -303,13 +304,14 @@ class ThingsControl(Control):
     ) -> tuple[Stand, assets.Float64Array]:
         """Find the free position of one thing, and its outline (K, 2) there.
 
-        An absent thing is not pushed anywhere.
+        The thing moves along the line from the object's center through its requested
+        position; an absent thing stays there.
 
         Args:
             name: of the thing.
             values: of the control.
             initial_footprint: of the thing before it is moved.
-            object_center: (2,) that it is pushed away from.
+            object_center: (2,) the object's center.
             obstacles: it is pushed away from the object until it is free of these.
             solids: of the surroundings; it is first pushed towards the object until it
                 is free of these.
@@ -418,9 +420,11 @@ def _find_foot(part: parts.MeshPart) -> assets.Float64Array:
 def _compute_footprint(
     scene: SceneDescription, name: str, so_far: Mapping[str, Tensor]
 ) -> parts.Footprint:
-    """Return the footprint of a mesh on the ground, as earlier controls left it.
+    """Return the footprint of a mesh on the ground, as the controls before have left
+    it.
 
-    `so_far` may have its pose (4, 4) and offsets (N, 3) of its vertices.
+    `so_far` are their inputs, among which may be the mesh's pose (4, 4) and the offsets
+    (N, 3) of its vertices; otherwise it is as in the scene.
     """
     part = scene.meshes[name]
     pose = so_far.get(f"{name}.to_world")

@@ -35,7 +35,7 @@ def resize_to_square(image: Tensor, side: int) -> Tensor:
 def enlarge(pixels: Tensor, factor: int) -> Tensor:
     """Return an image (h, w, 3) sRGB at a whole multiple of its size.
 
-    It is interpolated as the renderer does it.
+    It is interpolated linearly in light, as the renderer interpolates textures.
     """
     larger = F.interpolate(
         to_planes(srgb_to_linear(pixels)),
