@@ -66,9 +66,10 @@ def change_image(image: Tensor, change_name: str, n_cameras: int = 1) -> Tensor:
 
 
 def meets_claim(claim: str, before: Prediction, after: Prediction) -> bool:
-    """Return whether a change of the image did what a claim states.
+    """Return whether a prediction did what was claimed, when its image was changed.
 
-    The claim is that the prediction "must_change", or "must_not_change".
+    The claim is "must_change" or "must_not_change". For "must_change" another label
+    counts as a change, and so does another probability.
     """
     has_other_label = before.label != after.label
     if claim != "must_change":
