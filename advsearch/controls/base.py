@@ -361,10 +361,10 @@ class Control:
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance with some settings, by name.
+        """Return the parameters of an instance with some settings.
 
-        Those of the class, unless the scene or the settings name them. A mapping has
-        the values too.
+        They are those of the class. Subclasses add parameters that settings name.
+        `settings` are the names, or a mapping that has the values too.
         """
         return cls.parameters
 
@@ -663,7 +663,11 @@ class Control:
         return f"`set` {setting}={format_value(self.scene.number(setting))}"
 
     def _group(self, slot: Slot) -> Group:
-        """Return the group of coordinates of a searched parameter."""
+        """Return the group of coordinates of a searched parameter.
+
+        A choice has no estimators, since it has no derivative. Raises InputError: a
+        distribution together with a ball.
+        """
         parameter = slot.parameter
         name = parameter.name
         spec = slot.spec

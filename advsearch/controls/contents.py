@@ -355,9 +355,10 @@ class ContentsControl(Control):
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
-        """Find the bounds of each proportion.
+        """Find the bounds of each proportion, also of those that are not set.
 
-        Raises InputError: they cannot add up to 1.
+        If anything is searched, these go from 0 to what the others leave. Raises
+        InputError: the proportions cannot add up to 1.
         """
         super().__init__(name, **settings)
         self.proportion_bounds = self._read_bounds()

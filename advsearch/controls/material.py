@@ -615,6 +615,7 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
     weights = np.abs(normals) ** BLEND_EXPONENT
     weights /= weights.sum(axis=-1, keepdims=True)
     texels = np.zeros((side, side, 3), dtype=np.float32)
+    # seen along each axis: the two others, of which the second points up in the tile
     for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
         projected = look_up_texture(
             make_tile(name), positions[..., right] * scale, -positions[..., up] * scale

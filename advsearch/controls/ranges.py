@@ -194,6 +194,8 @@ def to_plain_value(value: object) -> object:
 def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
     """Parse what a parameter was set to.
 
+    Two numbers in a list are a range; names, or another count of numbers, are a choice.
+
     Args:
         label: how messages name it, e.g. "pose.yaw".
         parameter: says what is allowed.

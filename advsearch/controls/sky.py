@@ -134,7 +134,10 @@ class Sky:
     """
 
     def __init__(self, ground: Tensor) -> None:
-        """Compute the directions and solid angles of the texels above the horizon."""
+        """Compute the directions and solid angles of the texels above the horizon.
+
+        Row 0 of the map is straight up. `ground` (3,) is the ground's albedo.
+        """
         self.ground = ground
         upper = MAP_ROWS // 2
         elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (

@@ -231,7 +231,8 @@ class Space:
     def exposure(self) -> tuple[float, float]:
         """Seconds that the shutter is open, and in which rows are read.
 
-        The latter are below 0 where rows are read from the bottom.
+        They are those of the control with the longest exposure. The latter are below 0
+        where rows are read from the bottom.
         """
         exposures = (control.exposure for control in self.controls)
         return max(

@@ -399,7 +399,7 @@ def _compute_height(
 ) -> float:
     """Return the height of a thing's foot at a position (2,) of the ground.
 
-    It is as far above the ground there as at `foot` (3,), where it stands so far.
+    The thing keeps its height above the ground, which it has at `foot` (3,) so far.
     """
     height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
     height: float = height_above_ground + scene.get_ground_height(position)

@@ -369,9 +369,11 @@ class Bank(PredictedSearch):
         """Return the objectives of u (d,) under conditions that are not in the bank."""
         objectives = []
         for index in range(N_COMPARED):
-            draw = seeds.stream(seed, "draw", index)
+            draw_seed = seeds.stream(seed, "draw", index)
             evaluation, _ = self.problem.evaluate_full(
-                Query(u, draw), self.problem.add_conditions(u, draw), draw
+                Query(u, draw_seed),
+                self.problem.add_conditions(u, draw_seed),
+                draw_seed,
             )
             objectives.append(evaluation.objective)
         return objectives

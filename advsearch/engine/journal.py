@@ -181,7 +181,8 @@ def check_digests(
 ) -> None:
     """Store the digests of networks and functions, or check those of a resumed run.
 
-    A model behind an address stores its answers in the run.
+    A model behind an address has none: its answers are stored in the run instead.
+    Functions are by name; None stands for one that was not given.
 
     Raises:
         InputError: a network or a function is not the one that the run began with.

@@ -154,10 +154,10 @@ class SurfaceLight(PredictedSearch):
         self._needs_new_light = self._find_light_conditions()[n_searched:]
 
     def _find_coordinates(self, inputs: frozenset[str]) -> Tensor:
-        """Return which coordinates of the full space change any of some inputs, (d,)
-        bool.
+        """Return which coordinates of the full space change some inputs, (d,) bool.
 
-        A control's coordinates count together.
+        It is known for each control only: all of its coordinates count if any input of
+        `inputs` changes.
         """
         space = self.problem.space
         changes_inputs = torch.zeros(len(space.start), dtype=torch.bool)
@@ -329,7 +329,8 @@ class SurfaceLight(PredictedSearch):
         predicted.
         """
         problem = self.problem
-        # Conditions of a random search are used in turn, with what their cameras see.
+        # a random search uses few sets of conditions in turn, for which what cameras
+        # see is stored
         reuses_conditions = (
             query.kind == "baseline"
             and problem.conditions is not None

@@ -176,6 +176,9 @@ def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
 def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
     """Return Poisson counts by inverting the distribution function; no derivative.
 
+    A count is the number of candidates 0, 1, 2, ... whose cumulative probability is
+    below the quantile.
+
     Args:
         mean: of each count, 0 to about 80.
         quantile: quantile of each count in [0, 1), of the same shape.
@@ -188,6 +191,7 @@ def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
         if not bool(is_above.any()):
             break
         count += is_above
+        # of the next count
         probability *= mean / candidate
         total += probability
     return count.to(mean.dtype)
@@ -201,9 +205,9 @@ def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     with the fraction.
     """
     (lost_fraction,) = interpolate_table(IMPULSE, level)
-    draw = _draw_noise(image, seed, "impulse noise", normal=False)
+    uniform = _draw_noise(image, seed, "impulse noise", normal=False)
     extreme = (_draw_noise(image, seed, "impulse value", normal=False) < 0.5).float()
-    noisy = torch.where(draw < lost_fraction.detach(), extreme, image)
+    noisy = torch.where(uniform < lost_fraction.detach(), extreme, image)
     slope = extreme - image.detach()
     # the added term is 0, but has the derivative
     return noisy + (lost_fraction - lost_fraction.detach()) * slope
@@ -468,7 +472,10 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _make_drift(height: int, width: int, seed: int, decay: float) -> Tensor:
-    """Make fog (H, W, 1) in [0, 1]."""
+    """Make fog (H, W, 1) in [0, 1].
+
+    `decay` is as for `make_fractal_noise`: the larger it is, the smoother is the fog.
+    """
     rows, columns = compute_reference_size(height, width)
     return images.resized(
         make_fractal_noise(max(rows, columns), decay, make_generator(seed, "fog"))[

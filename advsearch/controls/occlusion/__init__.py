@@ -362,9 +362,11 @@ class _ObjectView:
 
     @staticmethod
     def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _ObjectView:
-        """Compute the view of a scene's object with the inputs of the controls before.
+        """Compute how the camera sees a scene's object; without derivatives.
 
-        Without derivatives.
+        `so_far` are the inputs of the controls before, which may move camera and
+        object. For a lens with a model the edge of the image is not known: all
+        directions of the image stand in for it.
         """
         points = _object_in_camera(scene, so_far)
         faces = scene.object.mesh.faces
@@ -447,8 +449,8 @@ def _directions_through_lens(
         columns = (left, right)
         rows = (top, bottom)
     directions = _spread_directions(model, columns, rows, silhouettes.RASTER)
-    hidden = directions[cover.contains(*(directions @ axes.T).T)]
-    return hidden if len(hidden) else None
+    seen = directions[cover.contains(*(directions @ axes.T).T)]
+    return seen if len(seen) else None
 
 
 def _spread_directions(

@@ -721,14 +721,18 @@ class PathControl(Control):
     def _camera_on_waypoints(
         self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return where the camera is on waypoints, and what it looks at; see
-        `_position_camera`.
+        """Return where the camera is on waypoints, and what it looks at.
+
+        It looks along its own rotation, if the waypoints have one; else at their
+        targets; else at the object. Arguments and results are those of
+        `_position_camera`, `center` is that of the object.
         """
         position = (
             center
             + waypoints.interpolate(time, waypoints.positions) / self.scene.metres
         )
         if waypoints.rotations is not None:
+            # the third column points ahead
             return position, position + waypoints.interpolate_rotation(time)[..., 2]
         if waypoints.targets is None:
             return position, center + shift
@@ -988,7 +992,7 @@ def _list_optional_columns(mover: str, is_single_path: bool) -> tuple[str, ...]:
 def read_waypoints(
     path: Path, mover: str, *, text: str, is_single_path: bool = True
 ) -> dict[str, Waypoints]:
-    """Read the paths of all that travels from a table of waypoints.
+    """Read the paths of the camera and the object from a table of waypoints.
 
     Args:
         path: of the file, for messages.
@@ -997,6 +1001,9 @@ def read_waypoints(
             or heading.
         is_single_path: whether a file about the camera may say what the object does at
             the same times.
+
+    Returns:
+        The path of each that moves; times begin at 0.
 
     Raises:
         FileFormatError: it is no table of numbers with the columns that a path needs,

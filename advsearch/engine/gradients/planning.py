@@ -545,7 +545,10 @@ def _compare_depths(
 
 
 def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
-    """Return why a path length was chosen."""
+    """Return why light paths of `depth` segments were chosen, as a clause.
+
+    It has what they leave out, and what the next shorter ones would have.
+    """
     texts = []
     for cut in cuts:
         if cut.depth == depth:

@@ -151,10 +151,10 @@ def _average(image: Tensor, radius: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _get_buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
-    """Return the buffers in which images of a size are denoised, in a thread.
+    """Return four buffers (H, W, 3) for images of one size in one thread.
 
-    With other memory the filter would be set up anew, which takes longer than to run
-    it.
+    They are cached: with other memory the filter would be set up anew, which takes
+    longer than to run it.
     """
     return [torch.zeros(*resolution, 3) for _ in range(4)]
 

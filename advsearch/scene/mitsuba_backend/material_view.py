@@ -408,13 +408,13 @@ class _OutlineSamples(NamedTuple):
 
 
 def _to_space_fraction(film_fraction: Tensor, depth: Tensor) -> Tensor:
-    """Return how far along edges in space points are: halfway on the film is not
-    halfway.
+    """Convert positions along edges on the film to positions along edges in space.
 
-    Fractions (N,) grow from the first end of an edge to the second.
+    Both are fractions (N,) from the first end of an edge to the second. They differ as
+    the nearer half of an edge is longer on the film.
 
     Args:
-        film_fraction: (N,) how far along the edges they are on the film.
+        film_fraction: (N,) fractions on the film.
         depth: (N, 2) of both ends.
     """
     weighted = film_fraction * depth[:, 0]

@@ -468,7 +468,10 @@ class _PlaneHits:
         return light
 
     def backpropagate(self, scene: Any, cotangent: Any) -> None:
-        """Add the derivative of `cotangent * direct_change` by lights."""
+        """Add the derivatives of `cotangent * direct_change` by the lights' parameters.
+
+        The emitter sample is that of the primal pass, evaluated again with gradients.
+        """
         ds = self._emitter_sample
         is_sampled = self.is_hit & (ds.pdf != 0.0)
         with dr.resume_grad():

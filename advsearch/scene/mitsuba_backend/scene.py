@@ -183,9 +183,9 @@ class MitsubaScene:
 
     def _load_scene(self) -> list[parts.SceneInput]:
         """Load Mitsuba's scene, and return the inputs that it may have."""
-        description, filter = self.definition
+        description, filter_name = self.definition
         plugins = parts.make_scene_dict(
-            description, self.resolution, filter, self.sampler
+            description, self.resolution, filter_name, self.sampler
         )
         with parts.convert_refusals(description):
             lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
@@ -249,14 +249,16 @@ class MitsubaScene:
 
         What may change is `max_depth`, `sampler`, `integrator` and `leave_out`.
         """
-        description, filter = self.definition
+        description, filter_name = self.definition
         settings = {
             "max_depth": self.max_depth,
             "leave_out": self._leave_out,
             "sampler": self.sampler,
             **changes,
         }
-        other = MitsubaScene(description, self.resolution, filter=filter, **settings)
+        other = MitsubaScene(
+            description, self.resolution, filter=filter_name, **settings
+        )
         # An integrator that is loaded later makes the recordings of all scenes stale.
         for method in ("path", "guides"):
             other._integrator(method)

@@ -454,8 +454,8 @@ def _describe_left_out(
     Args:
         tree: the scene.
         shape: the object's.
-        hazy: the camera's medium is the scene's haze.
-        lit: the object keeps its light.
+        hazy: whether the camera's medium is rendered, as the scene's haze.
+        lit: whether the object keeps its light.
     """
     for name, plugin in _list_plugins(tree):
         if plugin["type"] in INTEGRATOR_TYPES:

@@ -276,9 +276,10 @@ def _get_radius(shape: Mapping[str, object]) -> float:
 
 
 def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
-    """Return the (4, 4) pose of the unit cylinder along z that is a given cylinder.
+    """Return the pose (4, 4) that makes the unit cylinder along z the cylinder of a
+    shape.
 
-    It has `radius`, and goes from `p0` to `p1`.
+    The shape has `radius`, and goes from `p0` to `p1`.
     """
     start = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), np.float64)
     end = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), np.float64)
@@ -379,13 +380,14 @@ def find_haze(
 def _read_haze_medium(
     medium: Mapping[str, object], matrix: Float64Array
 ) -> tuple[float, tuple[float, float, float]] | None:
-    """Return extinction, in the object's lengths, and albedo of a medium.
+    """Return the extinction, per length of the object, and the albedo of a medium.
 
-    None if it is not grey, or out of range (comparisons with NaN are false); `matrix`
-    is as in `find_haze`.
+    None if it is not grey or out of range; numbers that are not understood are NaN, for
+    which all comparisons are false. `matrix` is as in `find_haze`.
     """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
+    # how many lengths of the object one length of the scene has
     object_size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / object_size
     is_grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MAX_EXTINCTION

@@ -190,6 +190,8 @@ class ViewTracer:
                 [_make_camera_numbers(inputs, height, width) for inputs in cameras]
             ).astype(np.float32)
 
+            # Maps are arguments of the recorded function, so that it works for other
+            # light of the same sizes.
             def trace(
                 mitsuba_scene: Any,
                 lane: Any,

@@ -112,9 +112,9 @@ def trace_texel_rays(
 def _find_sky_cell(
     scene: MitsubaScene, direction: Any, sky_shape: tuple[int, int]
 ) -> Any:
-    """Return the index of the environment's cell that directions meet.
+    """Return the index of the environment's cell that lies in a direction.
 
-    `sky_shape` is its number of rows and columns of cells.
+    The environment is cut into cells, `sky_shape` (rows, columns), counted row by row.
     """
     n_rows, n_columns = sky_shape
     column, row = compute_map_position(direction, world_to_map(scene))

@@ -75,7 +75,7 @@ def write_scene(
     Raises:
         InputError: something in it is no part of stock Mitsuba.
     """
-    description, filter = scene.definition
+    description, filter_name = scene.definition
     if description.camera_model is not None:
         raise InputError(
             "camera: stock Mitsuba has no sensor with distortion; export "
@@ -90,7 +90,7 @@ def write_scene(
     }
     xml_scene: Plugin = {
         "integrator": integrator,
-        **make_scene_dict(description, scene.resolution, filter, scene.sampler),
+        **make_scene_dict(description, scene.resolution, filter_name, scene.sampler),
     }
     # inputs that are not in the dictionary yet: `_put_part` takes some of them out
     remaining_inputs = {

@@ -132,7 +132,11 @@ class SurfaceRenderer(Predictor):
         return inputs.get(COLOR_INPUT, self._base[COLOR_INPUT])
 
     def is_applicable(self, inputs: Mapping[str, Tensor]) -> bool:
-        """Return whether only cameras and environment differ in some scene inputs."""
+        """Return whether the arrangement holds for some scene inputs.
+
+        They may differ from its own in cameras and environment only, not in the base
+        color.
+        """
         expected = {**self.arrangement.inputs, COLOR_INPUT: self.base_color}
         fixed_inputs = {
             name: inputs[name] for name in inputs if name not in FREE_INPUTS
@@ -185,10 +189,12 @@ class SurfaceRenderer(Predictor):
     def get_light(
         self, inputs: Mapping[str, Tensor]
     ) -> tuple[ArrangementLight, Tensor]:
-        """Return the light under the environment of scene inputs, and its factor (3,).
+        """Return the light under the environment of some scene inputs, and its factor
+        (3,).
 
-        Exposures and tints of one map have one light. It is computed on first use, and
-        up to `MAX_BYTES` of lights are stored: the oldest go first.
+        Exposures and tints of one map share one light, and differ by the factor. A
+        light is computed on first use. Up to `MAX_BYTES` of lights are stored; the
+        oldest go first.
         """
         fingerprint = MapFingerprint.compute(
             inputs.get(ENVIRONMENT_INPUT, self._base[ENVIRONMENT_INPUT]).detach()

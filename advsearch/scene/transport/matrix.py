@@ -240,7 +240,10 @@ class TextureTransport:
         *,
         small: bool = False,
     ) -> None:
-        """Make empty matrices: from texels, and from cells of `CELL_SIZE` texels."""
+        """Make empty matrices: from texels, and from cells of `CELL_SIZE` texels.
+
+        Shapes are (height, width); `small` is as for the class.
+        """
         self._image_shape = image_shape
         self._texture_shape = texture_shape
         # rounded up: the last cells of rows and columns may have fewer texels
