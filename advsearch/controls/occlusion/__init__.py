@@ -449,8 +449,8 @@ def _directions_through_lens(
         columns = (left, right)
         rows = (top, bottom)
     directions = _spread_directions(model, columns, rows, silhouettes.RASTER)
-    seen = directions[cover.contains(*(directions @ axes.T).T)]
-    return seen if len(seen) else None
+    directions_on_mesh = directions[cover.contains(*(directions @ axes.T).T)]
+    return directions_on_mesh if len(directions_on_mesh) else None
 
 
 def _spread_directions(
