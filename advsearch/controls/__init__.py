@@ -200,13 +200,18 @@ def check_control_settings(
 def merge_control_settings(
     settings: Mapping[str, object],
 ) -> dict[str, dict[str, object]]:
-    """Return settings by control for names as `make_control` takes them.
+    """Merge settings that are given by name into the settings of each control.
 
-    `camera.azimuth` and `camera.elevation` become one control that searches both.
+    `camera.azimuth` and `camera.elevation` become one control that searches both. A
+    parameter that only a name states has its default range; what settings state of it
+    wins.
 
     Args:
         settings: settings by name; a name may be "kind", "kind:name", "kind.parameter"
             or "kind:name.parameter".
+
+    Returns:
+        Settings by the name of each control, as `make_control` takes them.
     """
     by_control: dict[str, dict[str, object]] = {}
     for name, control_settings in check_control_settings(settings).items():
@@ -313,7 +318,10 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def _check_controls_in_photograph(controls: Sequence[Control], spec: str) -> None:
-    """Raise InputError if a control would not be true of what a photograph shows."""
+    """Raise InputError if a control would contradict what a photograph shows.
+
+    `spec` is how the user stated the photograph.
+    """
     for control in controls:
         if control.photograph_refusal:
             raise InputError(

@@ -396,9 +396,10 @@ class Control:
         return to_file_name(self.name)
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene.
+        """Return the mesh that the control is about, in a scene.
 
-        Raises UnknownNameError: there is none of that name.
+        Raises UnknownNameError or InputError: there is none of that name, or it is one
+        of a Mitsuba scene that stays as it is.
         """
         mesh = self.mesh
         if mesh in scene.meshes:
@@ -572,8 +573,9 @@ class Control:
     def get_spec(self, parameter: Parameter) -> Spec:
         """Return what a parameter, as `resolve_parameter` returned it, is set to.
 
-        A parameter that the user did not set is fixed at its default if another one was
-        given a range, or if it has no search range; else it is searched.
+        A parameter that the user did not set is searched over its default range. But it
+        is fixed at its default if it has no such range, or if another parameter was
+        given a range.
         """
         if parameter.name in self.specs:
             return self.specs[parameter.name]
@@ -881,7 +883,10 @@ NumberControl = Control  # its name in packages that add controls
 
 
 def _to_tensor(constant: ParameterValue, slot: Slot, device: torch.device) -> Tensor:
-    """Return one number, or the index of a name, in the shape of a parameter."""
+    """Return a fixed value as a tensor of the shape of its parameter.
+
+    A name becomes its index among the parameter's options.
+    """
     if isinstance(constant, str):
         return torch.full(
             (),

@@ -408,9 +408,9 @@ class CameraControl(Control):
 
 
 def adapt_length_unit(parameter: Parameter, has_metres: bool) -> Parameter:
-    """Return a parameter in the unit of lengths that a scene has.
+    """Return a parameter whose unit of length fits the scene.
 
-    That is object sizes around an object without a size in metres.
+    Without a size of the object in metres, lengths are in object sizes.
     """
     return (
         replace(parameter, unit="object sizes")

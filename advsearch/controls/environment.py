@@ -251,7 +251,7 @@ def _is_file(name: ParameterValue) -> bool:
 
 
 def _is_scene_environment(name: ParameterValue, scene: SceneDescription) -> bool:
-    """Return whether an environment is the scene's own."""
+    """Return whether an environment, a bundled name or a file, is the scene's own."""
     environment = scene.environment
     if environment is None or not _is_file(name):
         return (
@@ -288,11 +288,10 @@ def _read_environment(real_path: str, name: str, *version: int) -> EnvironmentAs
 
 @lru_cache(maxsize=64)
 def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
-    """Return the scene's own map (None), or that of another environment, (H, W, 3)
-    linear radiance.
+    """Return the map (H, W, 3) of an environment, linear radiance.
 
-    If the scene is metered, another map is scaled so that the metered gain of the image
-    stays that of the scene.
+    None as the asset stands for the scene's own environment. If the scene is metered,
+    another map is scaled so that the metered gain of the image stays that of the scene.
     """
     scene_environment = scene.require_environment("the environment")
     if asset is None:

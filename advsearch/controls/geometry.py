@@ -86,7 +86,10 @@ class WeldedMesh:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Weld the seams of a mesh, and find its walls."""
+        """Weld the seams of a mesh, and find its walls.
+
+        Vertices at the same position become one. Faces without area are left out.
+        """
         self.position_of_vertex, count = weld_vertices(mesh)
         self.positions = np.zeros((count, 3))
         self.positions[self.position_of_vertex] = mesh.vertices
@@ -460,7 +463,12 @@ class DisplacementLimits:
         return torch.cat([field.square().sum(dim=1), face_usage, wall_usage])
 
     def _compute_squared_gradients(self, field: Tensor) -> Tensor:
-        """Return the squared norm (F,) of the gradient of a field (P, 3) on each face."""
+        """Return the squared norm (F,) of the gradient of a field (P, 3) on each face.
+
+        In two axes of the face, along edge 1 and across it, the gradient's columns are
+        d1 / length and (d2 - d1 along / length) length / double area. `_inverse_axes`
+        has the three factors.
+        """
         inverse_axes = self._inverse_axes.to(field.device)
         face_corners = self._faces.to(field.device)
         corners = [field.index_select(0, corner) for corner in face_corners.T]

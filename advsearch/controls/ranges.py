@@ -158,7 +158,10 @@ class DistributionRange(Range):
         return torch.from_numpy(np.clip(values, self.low, self.high)).to(u)
 
     def find_coordinate(self, value: float, *, log: bool = False) -> float:
-        """Return the coordinate of a value, by bisection."""
+        """Return the coordinate of a value, by bisection on the quantiles.
+
+        `log` has no effect. Values outside of the range have the nearest coordinate.
+        """
         lower = 0.0
         upper = 1.0
         for _ in range(60):
@@ -374,7 +377,11 @@ def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
 
 
 def _check_value(label: str, parameter: Parameter, value: object) -> ParameterValue:
-    """Return a value of a parameter. Raises InputError: it cannot have it."""
+    """Return a value of a parameter as a name or a float.
+
+    Raises InputError or UnknownNameError: it is neither one of the options nor a number
+    within the parameter's bounds.
+    """
     if parameter.options:
         if not isinstance(value, str):
             raise InputError(
@@ -578,7 +585,11 @@ def parse_distribution(
 def _freeze_distribution(
     where: str, name: object, arguments: Mapping[str, Any]
 ) -> tuple[Any, str]:
-    """Return a distribution of scipy with its arguments, and how messages write it."""
+    """Return a distribution of scipy with its arguments, and how messages write it.
+
+    Raises UnknownNameError or InputError: there is none of that name, or it does not
+    take the arguments.
+    """
     # takes a quarter of a second, and few runs draw by a distribution
     from scipy import stats
 
@@ -662,7 +673,11 @@ def _make_range(
     upper_probability: float,
     label: str,
 ) -> DistributionRange:
-    """Return a range between two probabilities of a distribution."""
+    """Return the range of a distribution between two probabilities.
+
+    `label` is the distribution's name, and `setting_name` what was set to it, for
+    messages. Raises InputError: the range has a single value.
+    """
     low, high = (
         float(value)
         for value in quantiles(np.array([lower_probability, upper_probability]))

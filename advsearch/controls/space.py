@@ -70,7 +70,11 @@ class Space:
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """Every group of coordinates in the order of u, without an estimator yet."""
+        """Every group of coordinates in the order of u.
+
+        They have no estimator yet. The material form is not among the valid ones if the
+        scene does not support it.
+        """
         lacks_material_form = not self._has_material_form()
         groups = []
         begin = 0
@@ -320,9 +324,10 @@ class Space:
         )
 
     def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
-        """Return views of the camera over the box of the control that moves it.
+        """Return views of the camera in configurations of the control that moves it.
 
-        Without such a control it is the one view of the scene.
+        They are spread over the box of its coordinates. If no control moves the camera,
+        it is the one view of the scene.
         """
         for control, start in self.split_by_control(self.start):
             has_coordinates = bool(control.slots) or isinstance(control, _FixedControl)

@@ -259,7 +259,11 @@ class TextureControl(Control):
         return resize_to_square(original, int(resolution or default))
 
     def _make_painter(self, part: MeshPart, mask: Tensor) -> Painter:
-        """Return what paints the texels of a mask (h, w) bool, in the form chosen."""
+        """Return what paints the texels of a mask (h, w) bool.
+
+        The form that was chosen decides: a palette, waves, or every texel by itself.
+        `part` is the mesh, whose areas weigh the colors of a palette.
+        """
         texels = self._original[mask]
         norm = self.chosen["norm"]
         epsilon = self._settings.get("epsilon")

@@ -260,10 +260,11 @@ class ThingsControl(Control):
         return stands
 
     def _list_obstacles(self, so_far: Mapping[str, Tensor]) -> list[parts.Footprint]:
-        """List what a thing may not stand in: the object first, then the camera, then
-        the things that do not move.
+        """List the footprints of what a thing may not stand in.
 
-        The camera's footprint is a circle of the clearance, from the camera upwards.
+        The object is first, then the camera, then the things that do not move. The
+        camera's footprint is a circle around it, which is as high as wide, from the
+        camera upwards.
         """
         scene = self.scene
         object_footprint = _compute_footprint(scene, "object", so_far)

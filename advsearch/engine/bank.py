@@ -207,7 +207,10 @@ class Bank(PredictedSearch):
     def _sample(
         self, conditions: Sequence[Condition], count: int, stream: str, index: int
     ) -> list[Condition]:
-        """Return random conditions, each once."""
+        """Return `count` random conditions out of some, none of them twice.
+
+        The random numbers are those of a stream and an index.
+        """
         generator = torch.Generator().manual_seed(
             seeds.stream(self.problem.seed, stream, index)
         )
@@ -215,7 +218,12 @@ class Bank(PredictedSearch):
         return [conditions[position] for position in order[:count]]
 
     def _predict_images(self, conditions: Sequence[Condition], u: Tensor) -> Tensor:
-        """Return predicted images (n, H, W, 3) of u (d,), with a graph."""
+        """Return predicted images (n, H, W, 3) of u (d,) under conditions, with a
+        graph.
+
+        If the searched controls alone set all inputs of the matrix, these are computed
+        once for all conditions.
+        """
         inputs = self.problem.searched_space.inputs(u)
         images = []
         for condition in conditions:

@@ -488,7 +488,11 @@ class Journal:
         return rows
 
     def _note_machine(self, name: str | None) -> None:
-        """Store the description of a machine that is not like this one, once."""
+        """Store the description of a machine that differs from this one, at its first
+        row.
+
+        `name` is None for machines that are like this one.
+        """
         if name is None or name in self.machines:
             return
         stats = self.evaluator.worker_stats
@@ -499,7 +503,10 @@ class Journal:
         self.set_note(MACHINES_NOTE, self.machines)
 
     def _row_of_trial(self, query: Query, evaluation: Evaluation) -> Row:
-        """Return the row of a trial."""
+        """Return the row of a trial.
+
+        With random conditions the row has their values, too.
+        """
         values = dict(query.values)
         if query.draws_conditions:
             values |= self.problem.describe_conditions(query.u, query.seed)

@@ -461,7 +461,7 @@ def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> b
 def make_domain(
     controls: Sequence[Control], start: Tensor | None = None, **more: Any
 ) -> Domain:
-    """Return the domain of a search over some controls: the budgets of their groups.
+    """Return the domain of a search over some controls: a block for each group.
 
     Args:
         controls: in the order of u.
@@ -617,6 +617,7 @@ def mean_variation(colors: Tensor) -> Tensor:
     squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
     squared = squared_right + squared_down
     # clamped, since the square root has no derivative at 0
+    # minus the smallest length, so that an even color has none
     length = squared.clamp(min=MIN_COLOR_STEP**2).sqrt() - MIN_COLOR_STEP
     if is_masked:
         length = length[mask[..., 0] > 0.0]

@@ -385,7 +385,11 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
 
 
 def _camera_setting(description: SceneDescription) -> str | None:
-    """Return the `camera` setting of a scene; None for the pinhole that orbits."""
+    """Return how the `camera` setting states a scene's camera.
+
+    It is the first of these that there is: a rig, a preset, a lens, a camera of the
+    scene file; None for the pinhole that orbits.
+    """
     if description.rig:
         return description.rig_spec
     if description.preset:
@@ -401,13 +405,16 @@ def fit_camera(
 ) -> SceneDescription:
     """Return the scene with its camera fitted to a picture size.
 
+    Its aspect becomes that of the picture. Bundled lenses are made for it, and
+    raindrops get a camera model. In a photograph the photograph's own size decides.
+
     Args:
         description: the scene.
         resolution: side, or (height, width), in pixels.
 
     Raises:
-        InputError: several cameras and drops on a lens; or the scene is rendered into
-            a photograph of another shape.
+        InputError: several cameras and drops on a lens; or the scene is rendered into a
+            photograph of another shape.
     """
     height, width = _height_and_width(resolution)
     aspect = width / height
@@ -576,10 +583,11 @@ def choose_moments(
 def _measure_max_motion(
     space: Space, motion: Motion, assembly: Assembly, duration: float
 ) -> float:
-    """Return how many pixels a point moves at most in a duration in seconds.
+    """Return how many pixels a point of the image moves at most in some seconds.
 
     It is measured on `N_MOTION_SAMPLES` random configurations of the controls that
-    move, on points that are visible before and after.
+    move, from half the duration before to half after, on points that are visible at
+    both ends.
     """
     moving_controls = tuple(
         control for control in space.controls if any(control.exposure)

@@ -124,6 +124,7 @@ def blur_along_line(
     for index, weight in enumerate(weights):
         top = count + round(index * math.sin(angle))
         left = count + round(index * math.cos(angle))
+        # the image as it is `index` pixels further along the line
         shifted = padded[:, :, top : top + height, left : left + width]
         total = total + weight * images.to_image(shifted)
     return total
@@ -524,10 +525,14 @@ def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _make_ice(height: int, width: int, seed: int) -> Tensor:
-    """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film."""
+    """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film.
+
+    Numbers are chosen by eye.
+    """
     rows, columns = compute_reference_size(height, width)
     source = make_generator(seed, "frost")
     film = make_fractal_noise(max(rows, columns), 1.4, source)[:rows, :columns, None]
+    # drawn at twice the size, so that lines are smooth
     feathers = images.resized(
         _draw_feathers(2 * rows, 2 * columns, source), rows, columns
     )
@@ -600,7 +605,11 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
-    """Make falling snow (H, W, 1) in [0, 1] at a whole severity."""
+    """Make falling snow (H, W, 1) in [0, 1] at a whole severity.
+
+    Noise on a coarse grid is cut off below a threshold, which leaves flakes, and
+    blurred along the direction of their fall.
+    """
     rows, columns = compute_reference_size(height, width)
     mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]
     source = make_generator(seed, "snow")

@@ -350,7 +350,10 @@ class PathControl(Control):
         return movements
 
     def _check_needless(self) -> None:
-        """Check that choices about trajectories have one. Raises InputError."""
+        """Check that choices about trajectories are set only if there is a trajectory.
+
+        Raises InputError: they are set without one.
+        """
         needless = [
             name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
         ]
@@ -503,7 +506,7 @@ class PathControl(Control):
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
-        """Seconds that the shutter is open, and in which rows are read.
+        """Seconds that the shutter is open, and seconds in which all rows are read.
 
         The latter are below 0 where rows are read from the bottom.
         """

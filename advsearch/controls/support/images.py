@@ -120,9 +120,9 @@ def resized(
 def draw_noise(
     height: int, width: int, seed: int, stream_name: str, *, normal: bool = True
 ) -> Tensor:
-    """Return the noise (height, width, 3) of a stream of random numbers.
+    """Return noise (height, width, 3) from a named stream of random numbers; cached.
 
-    Standard normal, or uniform in [0, 1).
+    It is standard normal, or uniform in [0, 1).
     """
     generator = torch.Generator().manual_seed(seeds.stream(seed, stream_name))
     sample = torch.randn if normal else torch.rand

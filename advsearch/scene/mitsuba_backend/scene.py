@@ -755,8 +755,10 @@ class MitsubaScene:
             self.parameters[key] = value
 
     def _integrator(self, method: str) -> Any:
-        """Return the integrator of a method, at the current depth; load it on first
-        use.
+        """Return the integrator of a method at the current depth, loaded on first use.
+
+        The methods are "path", "hidden", which hides the environment, "guides" for the
+        denoiser, and "boundary" with the terms of moving outlines.
         """
         key = method, self.depth
         if key not in self._integrators:

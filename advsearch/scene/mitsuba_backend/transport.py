@@ -550,7 +550,10 @@ def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Sur
 
 
 def _sample_center_rays(sensor: Any, resolution: tuple[int, int]) -> tuple[Any, Any]:
-    """Return the ray and weight through the center of each pixel, without raindrops."""
+    """Return the ray and weight through the center of each pixel.
+
+    They are in the order of rows. Raindrops before the camera are left out.
+    """
     height, width = resolution
     pixel = dr.arange(mi.UInt32, height * width)
     position = mi.Point2f(

@@ -255,7 +255,10 @@ class _SceneText:
         return list(root)
 
     def fill_text(self, text: str) -> str:
-        """Replace the `$names` in a text by their values."""
+        """Replace every `$name` in a text by its value.
+
+        Raises FileFormatError: a name has no value, or the text becomes too long.
+        """
         filled = ""
         # of the pieces, every second one is a name
         for index, piece in enumerate(re.split(r"\$(\w+)", text)):
@@ -536,7 +539,10 @@ class _FileReader:
         return {**plugin, "filename": str(file)}
 
     def _read_bitmap(self, plugin: Plugin) -> Plugin:
-        """Read a texture as linear values."""
+        """Return a texture's plugin with its file read, as linear values.
+
+        A large file of linear values is averaged down to `TEXTURE_LIMIT`.
+        """
         file = self._find_file("a texture", plugin.pop("filename"))
         if file.suffix.lower() not in RADIANCE:
             is_raw = bool(plugin.get("raw"))

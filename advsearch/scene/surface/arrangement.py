@@ -309,7 +309,10 @@ class Arrangement:
         return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
     def _get_object_buffer(self, buffer: str) -> Float32Array:
-        """Return the object's vertices or normals (V, 3)."""
+        """Return the object's "vertices" or "normals" (V, 3).
+
+        They are those of the inputs, or else of the scene as it was loaded.
+        """
         name = f"{OBJECT}.{buffer}"
         values = (
             self.inputs[name]
@@ -322,7 +325,11 @@ class Arrangement:
     def _make_object_texels(
         self, charts: Charts, vertices: Float32Array, normals: Float32Array
     ) -> list[texels.LitTexels]:
-        """Return the texels of the object; of both sides if its back is visible."""
+        """Return the texels of the object, as one surface.
+
+        If its back is visible from outside there are two: the front and the back, whose
+        normals are reversed.
+        """
         single = texels.make_mesh_texels(OBJECT, charts, vertices, normals)
         if not is_visible_from_behind(self._scene, OBJECT, single.positions):
             return [single]

@@ -104,7 +104,10 @@ class SurfaceRenderer(Predictor):
     n_traced_images = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
-        """Fix everything as it is at u but cameras, environment and base color."""
+        """Fix everything as it is at u, but cameras, environment and base color.
+
+        The arrangement of texels is made for it; `seed` is that of its rays.
+        """
         super().__init__(traced)
         self.n_dropped = 0
         self.stored_lights: dict[MapFingerprint, ArrangementLight] = {}
@@ -347,7 +350,11 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
 
 
 def find_scene_refusal(renderer: Renderer) -> Refusal | None:
-    """Return why light cannot be stored on a scene's surfaces; None if it may be."""
+    """Return why light cannot be stored on a scene's surfaces; None if it may be.
+
+    It may be for an object with one texture, on a ground and under an environment,
+    without noise in the images that it is compared with.
+    """
     description = renderer.scene.definition[0]
     mesh_part = description.meshes[OBJECT]
     if mesh_part.mesh.repeats or mesh_part.surface is not None:

@@ -340,7 +340,11 @@ def _compute_texel_width(charts: Charts, vertices: Float32Array) -> float:
 def _iter_neighbourhood(
     y: Float64Array, x: Float64Array
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield rows and columns of texels around positions, one offset at a time."""
+    """Yield rows and columns (N,) of the neighbours of positions in a grid.
+
+    A position's neighbours are the texels up to `FILTER_REACH` from the nearest one;
+    each step yields one neighbour of all positions.
+    """
     for row_offset in range(-FILTER_REACH, FILTER_REACH + 1):
         for column_offset in range(-FILTER_REACH, FILTER_REACH + 1):
             row = np.round(y).astype(int) + row_offset
@@ -381,7 +385,11 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
 def _interpolate(
     charts: Charts, vertices: Float32Array, normals: Float32Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Return the position and the unit normal of each cell, both (h, w, 3)."""
+    """Return the position and the unit normal of the surface in each cell, both (h, w,
+    3).
+
+    `vertices` and `normals` are (V, 3).
+    """
     corners = charts.mesh.faces[charts.face]
     position = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])
     normal = np.einsum("hwk,hwkc->hwc", charts.weights, normals[corners])

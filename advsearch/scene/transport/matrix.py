@@ -213,7 +213,9 @@ class ColoredRows:
         return torch.from_numpy(self._unpack().T @ colored.numpy())
 
     def _unpack(self) -> scipy.sparse.csr_matrix:
-        """Return the matrix of fractions in float32."""
+        """Return the matrix of fractions in float32, from the 16 bits in which it is
+        stored.
+        """
         assert self._packed is not None, "finish it first"
         fractions, columns, row_starts = self._packed
         return scipy.sparse.csr_matrix(
@@ -399,7 +401,8 @@ def find_bilinear_weights(
 ) -> tuple[npt.NDArray[np.int32], Float32Array]:
     """Return the four texels of each bilinear look-up, and their fractions.
 
-    Texel centers lie at half numbers; the look-up repeats at the border.
+    The centers of texels are half a texel from the border, across which the texture
+    repeats.
 
     Args:
         uv: (n, 2) texture coordinates.
