@@ -352,8 +352,8 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
 def find_scene_refusal(renderer: Renderer) -> Refusal | None:
     """Return why light cannot be stored on a scene's surfaces; None if it may be.
 
-    It may be for an object with one texture, on a ground and under an environment,
-    without noise in the images that it is compared with.
+    It may be for an object with one texture, on a ground and under an environment, if
+    images are denoised.
     """
     description = renderer.scene.definition[0]
     mesh_part = description.meshes[OBJECT]
