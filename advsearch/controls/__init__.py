@@ -86,7 +86,8 @@ def make_unknown_control_error(
 ) -> UnknownNameError:
     """Return the error for a control that does not exist.
 
-    It says of which control the name is a parameter, or else the hint.
+    If `kind` is a parameter of other controls, the message says so in place of `hint`.
+    Names of `instances` are suggested as well as those of controls.
     """
     owners = [
         name
@@ -109,10 +110,12 @@ def parse_control_name(
 def _parse_name(
     control_name: str, settings: dict[str, object]
 ) -> tuple[str, str, str | None]:
-    """Return kind, instance name and single parameter (None without one).
+    """Return the kind, the instance's name, and the parameter of a control's full name.
 
-    A name is KIND, KIND:NAME, KIND.PARAMETER or KIND.PARAMETER:NAME; any name if the
-    settings have a "kind", which is taken out of them; or that of a class of controls.
+    The parameter is None unless the full name has one. If the settings have a "kind",
+    that is removed from them, and the full name is the instance's. Otherwise the full
+    name is that of a class of controls, or KIND, KIND:NAME, KIND.PARAMETER or
+    KIND.PARAMETER:NAME.
     """
     kind, colon, name = control_name.partition(":")
     kind, dot, parameter = kind.partition(".")
@@ -151,8 +154,11 @@ def check_instance_name(label: str, name: str, colon: str = ":") -> None:
 
 
 def _get_default_range(control: type[Control], parameter: str) -> object:
-    """Return the range, or the choices, of a parameter that is searched by name
-    alone.
+    """Return the range, or the choices, of a parameter for which only its name was
+    given.
+
+    Raises UnknownNameError or InputError: the control has no such parameter, or no
+    ranges.
     """
     if not control.parameters:
         raise InputError(
@@ -194,13 +200,18 @@ def check_control_settings(
 def merge_control_settings(
     settings: Mapping[str, object],
 ) -> dict[str, dict[str, object]]:
-    """Return settings by control for names as `make_control` takes them.
+    """Merge settings that are given by name into the settings of each control.
 
-    `camera.azimuth` and `camera.elevation` become one control that searches both.
+    `camera.azimuth` and `camera.elevation` become one control that searches both. A
+    parameter that only a name states has its default range; what settings state of it
+    wins.
 
     Args:
         settings: settings by name; a name may be "kind", "kind:name", "kind.parameter"
             or "kind:name.parameter".
+
+    Returns:
+        Settings by the name of each control, as `make_control` takes them.
     """
     by_control: dict[str, dict[str, object]] = {}
     for name, control_settings in check_control_settings(settings).items():
@@ -307,7 +318,10 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def _check_controls_in_photograph(controls: Sequence[Control], spec: str) -> None:
-    """Raise InputError if a control would not be true of what a photograph shows."""
+    """Raise InputError if a control would contradict what a photograph shows.
+
+    `spec` is how the user stated the photograph.
+    """
     for control in controls:
         if control.photograph_refusal:
             raise InputError(

@@ -114,6 +114,9 @@ class BackgroundControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the linear color (3,) of the backdrop; nothing where the environment
+        is shown.
+        """
         if BACKDROPS[int(values["what"])] == "environment":
             return {}
         return {
@@ -125,6 +128,9 @@ class BackgroundControl(Control):
     def measured(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Value]:
+        """Return the sRGB levels of the color, which is searched as hue, saturation and
+        value.
+        """
         levels = hsv_to_rgb(*(values[name] for name in COLOR_PARAMETERS))
         channels = zip(color.CHANNELS, levels, strict=True)
         return {
@@ -138,6 +144,9 @@ def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
     All are display-referred. Piecewise linear in each argument, so differentiable
     almost everywhere; a grey has the derivative 0 by hue.
     """
+    # (3,) where the hue is on the color circle of six sectors, as red, green and blue
+    # see it
     sector = torch.remainder(torch.tensor([5.0, 3.0, 1.0]).to(hue) + hue / 60.0, 6.0)
+    # how much of the saturation is taken from each channel
     ramp = torch.minimum(sector, 4.0 - sector).clamp(0.0, 1.0)
     return value * (1.0 - saturation * ramp)

@@ -196,9 +196,10 @@ class Choice:
     signed: bool = False
 
     def check(self, control: str, value: object) -> None:
-        """Check what was chosen in an instance of a control.
+        """Check what was chosen; raises InputError if it cannot be chosen.
 
-        None is fine where it is the default. Raises InputError: it cannot be chosen.
+        `control` is the name of the instance, for messages. None is fine where it is
+        the default.
         """
         if value is None and self.default is None:
             return
@@ -360,10 +361,10 @@ class Control:
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance with some settings, by name.
+        """Return the parameters of an instance with some settings.
 
-        Those of the class, unless the scene or the settings name them. A mapping has
-        the values too.
+        They are those of the class. Subclasses add parameters that settings name.
+        `settings` are the names, or a mapping that has the values too.
         """
         return cls.parameters
 
@@ -395,9 +396,10 @@ class Control:
         return to_file_name(self.name)
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene.
+        """Return the mesh that the control is about, in a scene.
 
-        Raises UnknownNameError: there is none of that name.
+        Raises UnknownNameError or InputError: there is none of that name, or it is one
+        of a Mitsuba scene that stays as it is.
         """
         mesh = self.mesh
         if mesh in scene.meshes:
@@ -442,6 +444,7 @@ class Control:
             value = self._settings.get(parameter.name)
             if value is None:
                 continue
+            # the full range only names the form: it cannot be narrowed
             if value not in (
                 [parameter.low, parameter.high],
                 (parameter.low, parameter.high),
@@ -539,6 +542,7 @@ class Control:
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
         counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
+        # a slot of several values has the same range for each coordinate
         self._low, self._span = low_and_span.T.repeat_interleave(counts, dim=1)
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -569,8 +573,9 @@ class Control:
     def get_spec(self, parameter: Parameter) -> Spec:
         """Return what a parameter, as `resolve_parameter` returned it, is set to.
 
-        A parameter that the user did not set is fixed at its default if another one was
-        given a range, or if it has no search range; else it is searched.
+        A parameter that the user did not set is searched over its default range. But it
+        is fixed at its default if it has no such range, or if another parameter was
+        given a range.
         """
         if parameter.name in self.specs:
             return self.specs[parameter.name]
@@ -617,8 +622,9 @@ class Control:
     def _list_adjusted_defaults(self) -> Iterator[AdjustedDefault]:
         """Yield the values of the clean scene that the start does not have.
 
-        Values that the user fixed are not among them, nor is anything but the `amount`
-        of a control that has one, as it hides the rest.
+        Values that the user fixed are left out. A control with an `amount` yields
+        nothing but that one: at the amount of the clean scene its other parameters have
+        no effect.
 
         Raises:
             InputError: the user set one of them for the scene.
@@ -659,7 +665,11 @@ class Control:
         return f"`set` {setting}={format_value(self.scene.number(setting))}"
 
     def _group(self, slot: Slot) -> Group:
-        """Return the group of coordinates of a searched parameter."""
+        """Return the group of coordinates of a searched parameter.
+
+        A choice has no estimators, since it has no derivative. Raises InputError: a
+        distribution together with a ball.
+        """
         parameter = slot.parameter
         name = parameter.name
         spec = slot.spec
@@ -873,7 +883,10 @@ NumberControl = Control  # its name in packages that add controls
 
 
 def _to_tensor(constant: ParameterValue, slot: Slot, device: torch.device) -> Tensor:
-    """Return one number, or the index of a name, in the shape of a parameter."""
+    """Return a fixed value as a tensor of the shape of its parameter.
+
+    A name becomes its index among the parameter's options.
+    """
     if isinstance(constant, str):
         return torch.full(
             (),

@@ -40,6 +40,10 @@ class BodyControl(Control):
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+        """Return the parameters of the class, and those of a rig that are set.
+
+        A name that no rig can have is left out here, and rejected later.
+        """
         known = {parameter.name for parameter in cls.parameters}
         declared = (
             geometry.find_rig_parameter(name) for name in settings if name not in known
@@ -73,6 +77,7 @@ class BodyControl(Control):
         if requested is None:
             plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
+        # a number may be given as text
         index = (
             int(requested)
             if Parameter.is_number(requested) or str(requested).isdigit()

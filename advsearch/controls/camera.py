@@ -166,6 +166,7 @@ class CameraControl(Control):
                 f"`controls` {self.name}: a shifted picture together with an aperture "
                 "is not supported; leave one out"
             )
+        # coefficients of the distortion that were set
         bent_coefficients = [name for name in COEFFICIENTS if name in self.specs]
         if bent_coefficients and scene.camera_model is None:
             scene = replace(
@@ -325,8 +326,10 @@ class CameraControl(Control):
         }
         if not model.name:
             aspect = self.scene.aspect
+            # as a fraction of the larger side, along which the field of view is
             focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
             model_values |= {
+                # fx is a fraction of the width, fy of the height
                 "fx": focal * max(1.0, 1.0 / aspect),
                 "fy": focal * max(1.0, aspect),
             }
@@ -340,9 +343,11 @@ class CameraControl(Control):
         return torch.stack([model_values[name].to(fov) for name in NUMBER_NAMES])
 
     def _with_fixed_lens(self) -> SceneDescription:
-        """Return the scene with the field of view that was set.
+        """Return the scene with the field of view to which the control fixes it, if it
+        does.
 
-        The distance is worked out as for the same setting.
+        The camera's distance depends on the field of view, so that it is computed for
+        this one.
         """
         fov = self.specs.get("fov")
         focal_length = self.specs.get("focal_length")
@@ -357,9 +362,8 @@ class CameraControl(Control):
     def _compute_pose(self, values: Values, distance: Tensor) -> Tensor:
         """Return the pose (4, 4) on the orbit, at a distance () in object sizes.
 
-        If the height counts, the elevation follows from it: if the user set the height,
-        or if neither height nor elevation is set and the scene states a height or it is
-        searched.
+        The elevation follows from the height in two cases: the user set the height; or
+        set neither of the two, and the scene states a height or the height is searched.
         """
         azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
         elevation = torch.deg2rad(values["elevation"])
@@ -393,6 +397,7 @@ class CameraControl(Control):
         )
         level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
         level_up = torch.linalg.cross(-outwards, level_left)
+        # turned by the roll about the direction of view
         left = roll.cos() * level_left + roll.sin() * level_up
         up = roll.cos() * level_up - roll.sin() * level_left
         position = (
@@ -403,9 +408,9 @@ class CameraControl(Control):
 
 
 def adapt_length_unit(parameter: Parameter, has_metres: bool) -> Parameter:
-    """Return a parameter in the unit of lengths that a scene has.
+    """Return a parameter whose unit of length fits the scene.
 
-    That is object sizes around an object without a size in metres.
+    Without a size of the object in metres, lengths are in object sizes.
     """
     return (
         replace(parameter, unit="object sizes")

@@ -115,11 +115,12 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
 
 
 def _fill_missed_radii(radii: assets.Float64Array) -> assets.Float64Array | None:
-    """Replace what rays missed by the median of its height.
+    """Replace the distance of each ray that missed the wall by the median at its
+    height.
 
     Args:
-        radii: distances (rows, rays) from the axis to the wall, not finite where a ray
-            hit nothing.
+        radii: (rows, rays) distances from the axis to the wall, not finite where a ray
+            hit nothing. A row is a height.
 
     Returns:
         (rows, rays); None if too few rays hit a wall.
@@ -150,12 +151,13 @@ def _find_basin(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float] |
     """Find the largest basin of a mesh: where most water would stand.
 
     Returns:
-        Its axis (2,), which is the center of the water seen from above, and the heights
-            of its floor and its rim; None if it is too shallow or its opening too
-            small.
+        Its axis (2,), the center of the water seen from above, weighted by depth; and
+        the heights of its floor and its rim. None if it is too shallow or its opening
+        too small.
     """
     corner, cell, ground = _compute_height_map(mesh)
     water = _fill_with_water(ground)
+    # connected cells with water; 0 is dry, basins count from 1
     labels, count = ndimage.label(water - ground > 1e-3)
     if count == 0:
         return None
@@ -174,18 +176,20 @@ def _find_basin(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float] |
 def _compute_height_map(
     mesh: assets.Mesh,
 ) -> tuple[assets.Float64Array, float, assets.Float64Array]:
-    """Compute the highest surface over a grid with an empty margin.
+    """Compute the height of the highest surface in each cell of a grid, seen from
+    above.
 
-    Edges are drawn as well as faces, so that a thin upright wall is not missed between
-    two cells.
+    Around the mesh there is a margin of empty cells, lower than all of it. Edges are
+    drawn as well as faces, so that a thin upright wall is not missed between two cells.
 
     Returns:
-        Position (2,) of cell (0, 0), side of a cell, heights (h, w).
+        Position (2,) of the center of cell (0, 0), side of a cell, and heights (h, w).
     """
     vertices = mesh.vertices.astype(np.float64)
     lower = vertices[:, :2].min(axis=0)
     upper = vertices[:, :2].max(axis=0)
     cell = float((upper - lower).max()) / GRID_CELLS
+    # a margin of at least one cell
     lower = lower - 1.5 * cell
     width, height = (np.ceil((upper - lower) / cell).astype(np.int64) + 2).tolist()
     ground = np.full((height, width), vertices[:, 2].min() - 1.0)
@@ -222,8 +226,9 @@ def _draw_edges(
 def _fill_with_water(ground: assets.Float64Array) -> assets.Float64Array:
     """Return the level of water on a height map (h, w) from whose edges it runs off.
 
-    Every cell stands as high as its ground or its lowest neighbour's water, whichever
-    is higher; repeated until nothing changes.
+    At first there is water without end inside, and none at the edges. Then each cell's
+    water falls to its lowest neighbour's, but not below the ground, until nothing
+    changes.
     """
     water = np.full_like(ground, np.inf)
     water[[0, -1]] = ground[[0, -1]]
@@ -265,6 +270,7 @@ def _find_wall(
     first_side = ray[:, :1] * first_end[:, 1] - ray[:, 1:] * first_end[:, 0]
     second_side = ray[:, :1] * second_end[:, 1] - ray[:, 1:] * second_end[:, 0]
     is_crossed = (first_side > 0.0) != (second_side > 0.0)
+    # along the segment, where the ray's line crosses it
     fraction = first_side / np.where(is_crossed, first_side - second_side, 1.0)
     along_ray = (ray @ first_end.T) * (1.0 - fraction) + (ray @ second_end.T) * fraction
     along_ray = np.where(is_crossed & (along_ray > 0.0), along_ray, np.inf)
@@ -276,10 +282,11 @@ def _find_wall(
 def _cut_faces(
     mesh: assets.Mesh, height: float
 ) -> tuple[assets.IntArray, assets.Float64Array, assets.Float64Array]:
-    """Cut a mesh by a level plane.
+    """Cut the faces of a mesh by a level plane.
 
     Returns:
-        The faces (S,) that it cuts, and the two ends (S, 2) of each cut.
+        (S,) indices of the faces that the plane cuts, and (S, 2) x and y of both ends
+        of each cut.
     """
     corners = mesh.vertices[mesh.faces.astype(np.int64)].astype(np.float64)
     is_above = corners[..., 2] > height
@@ -295,7 +302,7 @@ def _cut_faces(
     ends = []
     for step in (1, 2):
         other = corners[index, (apex_corner + step) % 3]
-        # never divided by 0
+        # the two other corners are on the other side: both cut edges begin at the apex
         rise = np.where(other[:, 2] == apex[:, 2], 1.0, other[:, 2] - apex[:, 2])
         fraction = (height - apex[:, 2]) / rise
         ends.append(apex[:, :2] + fraction[:, None] * (other[:, :2] - apex[:, :2]))
@@ -348,9 +355,10 @@ class ContentsControl(Control):
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
-        """Find the bounds of each proportion.
+        """Find the bounds of each proportion, also of those that are not set.
 
-        Raises InputError: they cannot add up to 1.
+        If anything is searched, these go from 0 to what the others leave. Raises
+        InputError: the proportions cannot add up to 1.
         """
         super().__init__(name, **settings)
         self.proportion_bounds = self._read_bounds()
@@ -489,10 +497,11 @@ class ContentsControl(Control):
     # ---- proportions
 
     def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        """Return the range of an ingredient's cut, from 0 to 1 of what is possible
-        there.
+        """Return the range of a parameter; for an ingredient, that of its cut (see
+        `find_cuts`).
 
-        The last ingredient with a range has no cut: it is what the others leave.
+        A cut goes from 0 to 1. The last of the ingredients whose proportion has a range
+        has none: it gets what the others leave.
         """
         if parameter.name not in INGREDIENTS:
             return super().get_spec(parameter)
@@ -504,7 +513,11 @@ class ContentsControl(Control):
         return Range(0.0, 1.0) if parameter.name in ranged[:-1] else Fixed(0.0)
 
     def cut_proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return proportions that add up to one, by ingredient; differentiable.
+        """Return the proportion of each ingredient for its cut; they add up to 1.
+
+        Ingredients are cut off one after the other: a cut from 0 to 1 goes from the
+        least to the largest proportion that is still possible. Differentiable in the
+        cuts.
 
         Args:
             cuts: coordinates in [0, 1] by ingredient.
@@ -518,7 +531,11 @@ class ContentsControl(Control):
         return proportions
 
     def find_cuts(self, proportions: Mapping[str, float]) -> dict[str, float]:
-        """Return the cuts whose proportions are nearest to some, by ingredient."""
+        """Return the cuts, by ingredient, for proportions or the nearest that are
+        possible.
+
+        It is the inverse of `cut_proportions`.
+        """
         left = torch.ones(())
         cuts = dict[str, float]()
         for name in INGREDIENTS:
@@ -533,18 +550,19 @@ class ContentsControl(Control):
     def _possible_range(self, name: str, left: Tensor) -> tuple[Tensor, Tensor]:
         """Return the least and the largest proportion () that an ingredient may have.
 
-        They are its own bounds, as far as the ingredients after it can make up the
-        rest.
+        They are its own bounds, narrowed so that the ingredients after it can make up
+        the rest.
 
         Args:
             name: of the ingredient.
-            left: what those before it have left ().
+            left: () what the ingredients before it have left of 1.
         """
         index = INGREDIENTS.index(name)
         limits = left.new_tensor(
             [self.proportion_bounds[ingredient] for ingredient in INGREDIENTS]
         )
         lower, upper = limits[index]
+        # of all ingredients after this one together
         rest_lower, rest_upper = limits[index + 1 :].sum(dim=0)
         return torch.maximum(lower, left - rest_upper), torch.minimum(
             upper, left - rest_lower
@@ -568,8 +586,10 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
     scattering = proportions.new_tensor(1e-6)  # not 0, of pure water
     for name, reflectance in REFLECTANCE.items():
         deep_reflectance = proportions.new_tensor(reflectance)
+        # scattering of the ingredient
         part = amounts[name] * SCATTERING[name]
         # K / S of the ingredient, by its reflectance at infinite depth
+        # (1 - R)^2 / (2 R), with the division in the next line
         absorption_ratio = (1.0 - deep_reflectance).square()
         absorption = absorption + part * absorption_ratio / (2.0 * deep_reflectance)
         scattering = scattering + part
@@ -584,10 +604,11 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
 def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     """Return the vertices (1 + K, 3) of the liquid's surface, the center first.
 
-    They are in mesh coordinates, K = `WALL_DIRECTIONS`. The wall's distance is
-    interpolated between the heights at which it is known, so the vertices are
-    differentiable in the level, with kinks at those heights. Below `SINKING_LEVEL` the
-    surface shrinks and sinks into the floor.
+    They are in mesh coordinates; K is `WALL_DIRECTIONS`. `level` is () from 0 at the
+    floor to 1 at the highest level. The wall's distance is interpolated between the
+    heights at which it is known, so that vertices are differentiable in the level, with
+    kinks at those heights. Below `SINKING_LEVEL` the surface shrinks and sinks into the
+    floor.
     """
     heights = torch.from_numpy(vessel.heights).to(level)
     radii = torch.from_numpy(vessel.radii).to(level)

@@ -117,6 +117,7 @@ class EnvironmentControl(Control):
         return (replace(which, options=options), *others)
 
     def check_choices(self) -> None:
+        """Check that there are harmonics if a ball is set for them. Raises InputError."""
         epsilon = self.chosen["epsilon"]
         if "epsilon" in self._settings and "harmonics" not in self._settings:
             raise InputError(
@@ -250,7 +251,7 @@ def _is_file(name: ParameterValue) -> bool:
 
 
 def _is_scene_environment(name: ParameterValue, scene: SceneDescription) -> bool:
-    """Return whether an environment is the scene's own."""
+    """Return whether an environment, a bundled name or a file, is the scene's own."""
     environment = scene.environment
     if environment is None or not _is_file(name):
         return (
@@ -287,11 +288,10 @@ def _read_environment(real_path: str, name: str, *version: int) -> EnvironmentAs
 
 @lru_cache(maxsize=64)
 def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
-    """Return the scene's own map (None), or that of another environment, (H, W, 3)
-    linear radiance.
+    """Return the map (H, W, 3) of an environment, linear radiance.
 
-    If the scene is metered, another map is scaled so that the metered gain of the image
-    stays that of the scene.
+    None as the asset stands for the scene's own environment. If the scene is metered,
+    another map is scaled so that the metered gain of the image stays that of the scene.
     """
     scene_environment = scene.require_environment("the environment")
     if asset is None:
@@ -306,11 +306,10 @@ def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor
 
 
 def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
-    """Rotate a map (H, W, 3) about the vertical by linear resampling of its columns.
+    """Rotate a map (H, W, 3) about the vertical, as `environment.rotation` does.
 
-    As `environment.rotation` does.
-
-    Periodic and differentiable in both arguments; exact at whole columns.
+    Its columns are interpolated linearly and go round. Differentiable in both
+    arguments; exact at whole columns.
     """
     columns = radiance.shape[1]
     shift = torch.remainder(degrees / 360.0, 1.0) * columns
@@ -324,10 +323,11 @@ def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
 
 
 def compute_harmonic_light(coefficients: Tensor, reference: Tensor) -> Tensor:
-    """Return light (H, W, 3) from 9 spherical-harmonic coefficients a channel.
+    """Return light (H, W, 3) as a sum of 9 spherical harmonics in each channel.
 
     Args:
-        coefficients: (27,), multiples of the map's mean.
+        coefficients: (27,) in units of the map's mean: for each harmonic three
+            channels.
         reference: the map (H, W, 3).
     """
     height, width = reference.shape[:2]

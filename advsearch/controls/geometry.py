@@ -86,7 +86,10 @@ class WeldedMesh:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Weld the seams of a mesh, and find its walls."""
+        """Weld the seams of a mesh, and find its walls.
+
+        Vertices at the same position become one. Faces without area are left out.
+        """
         self.position_of_vertex, count = weld_vertices(mesh)
         self.positions = np.zeros((count, 3))
         self.positions[self.position_of_vertex] = mesh.vertices
@@ -161,9 +164,12 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     """
     welded_mesh = get_welded_mesh(mesh)
     points, cell = _landmarks(welded_mesh)
+    # each function gives three fields, one for each axis; two functions more than
+    # needed, for the rotations that are removed
     n_scalars = min(math.ceil(count / 3) + 2, len(points) - 1)
     width = BANDWIDTH * cell
     density, functions, mass, values = _diffusion_map(points, width, n_scalars)
+    # of the Laplacian, to which the kernel converges: 0 for a constant function
     energy = (1.0 - values) / width**2
     combination = _without_rotation(points, functions, mass, energy, count)
 
@@ -221,8 +227,9 @@ def _fix_signs(vectors: Float64Array) -> Float64Array:
 def _landmarks(solid: WeldedMesh) -> tuple[Float64Array, float]:
     """Return points (N, 3) spread evenly over the surface, and the side of their cells.
 
-    Each is the mean of the samples and vertices in a cubic cell. Cells are enlarged
-    until there are at most `MAX_LANDMARKS`.
+    The surface is sampled evenly by area, and its vertices are added. Each landmark is
+    the mean of all that lies in one cubic cell. Cells are enlarged until there are at
+    most `MAX_LANDMARKS`.
     """
     corners = solid.positions[solid.faces]
     areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
@@ -252,12 +259,17 @@ def _without_rotation(
     energy: Float64Array,
     count: int,
 ) -> Float64Array:
-    """Combine scalar modes to vector fields that hold no rotation, smoothest first.
+    """Combine scalar functions to vector fields without rotation, smoothest first.
+
+    All fields whose components are sums of the functions are considered. Those
+    orthogonal to the three rotations about the center are kept, and sorted by their
+    energy. (A shift is none of them, as the constant function is not among the
+    functions.)
 
     Args:
         points: (N, 3).
         functions: (N, S), orthonormal under `mass`.
-        mass: (N,).
+        mass: (N,) weight of each point.
         energy: (S,), how fast each function varies.
         count: number of fields.
 
@@ -295,7 +307,11 @@ class Preconditioner:
     """
 
     def __init__(self, welded_mesh: WeldedMesh) -> None:
-        """Factorise the system, and compute the rigid motions."""
+        """Factorise the system, and compute an orthonormal basis of the rigid motions.
+
+        The system is the identity plus the Laplacian times the squared smoothing
+        length.
+        """
         count = len(welded_mesh.positions)
         laplacian, mean_length = _wall_laplacian(welded_mesh)
         strength = (SMOOTHING_LENGTH * welded_mesh.extent / mean_length) ** 2
@@ -334,6 +350,7 @@ def _wall_laplacian(solid: WeldedMesh) -> tuple[Any, float]:
     edge_vectors = solid.positions[edges[:, 0]] - solid.positions[edges[:, 1]]
     lengths = np.linalg.norm(edge_vectors, axis=1)
     mean_length = float(lengths.mean())
+    # 1 for an edge of mean length; limited for very short ones
     edge_weights = (mean_length / lengths.clip(0.1 * mean_length)) ** 2
     wall_weights = np.full(len(solid.walls), WALL_WEIGHT)
     links = np.concatenate([edges, solid.walls])
@@ -419,13 +436,17 @@ class DisplacementLimits:
         self._positions = torch.from_numpy(welded_mesh.positions)
 
     def compute_squared_usage(self, field: Tensor) -> Tensor:
-        """Return how far `epsilon d` uses each bound up, squared.
+        """Return how much of each bound the displacement `epsilon d` uses up, squared.
+
+        The bounds are: a length of epsilon at each position, a strain of
+        `MAX_FACE_STRAIN` of each face, and of `MAX_WALL_STRAIN` across each wall. 1 is
+        a bound that is just reached.
 
         Args:
             field: d, (P, 3).
 
         Returns:
-            (N,): of the length at each position, of each face, of each wall.
+            (N,): positions first, then faces, then walls.
         """
         walls = self._walls.to(field.device)
         wall_widths = self._wall_widths.to(field.device)
@@ -442,7 +463,12 @@ class DisplacementLimits:
         return torch.cat([field.square().sum(dim=1), face_usage, wall_usage])
 
     def _compute_squared_gradients(self, field: Tensor) -> Tensor:
-        """Return the squared norm (F,) of the gradient of a field (P, 3) on each face."""
+        """Return the squared norm (F,) of the gradient of a field (P, 3) on each face.
+
+        In two axes of the face, along edge 1 and across it, the gradient's columns are
+        d1 / length and (d2 - d1 along / length) length / double area. `_inverse_axes`
+        has the three factors.
+        """
         inverse_axes = self._inverse_axes.to(field.device)
         face_corners = self._faces.to(field.device)
         corners = [field.index_select(0, corner) for corner in face_corners.T]
@@ -453,10 +479,15 @@ class DisplacementLimits:
         return (gradient_1.square() + gradient_2.square()).sum(dim=1)
 
     def limit(self, field: Tensor) -> Tensor:
-        """Return the offsets (P, 3) for a field d (P, 3), float64; differentiable."""
+        """Return offsets (P, 3) within all bounds for a field d (P, 3), float64.
+
+        They are epsilon d / (1 + sum r^p)^(1/p), where r are the fractions of the
+        bounds that epsilon d uses up and p is `NORM_EXPONENT`: small fields stay as
+        they are, large ones reach the tightest bound, and all is differentiable.
+        """
         squared_usage = self.compute_squared_usage(field)
-        # All is divided by the largest, so that powers stay within the range of floats:
-        # (1 + sum r^p) = largest^(p/2) * total, with `largest` squared as usages are.
+        # Divided by the largest (a square, too), powers stay within the range of
+        # floats: 1 + sum r^p = largest^(p/2) * total.
         largest = squared_usage.detach().max().clamp_min(1.0)
         powers = (squared_usage / largest).pow(NORM_EXPONENT // 2).sum()
         total = powers + largest ** (-NORM_EXPONENT // 2)

@@ -112,6 +112,7 @@ class HazeControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the density (1,) and the albedo (3,) of the haze."""
         albedo = color.combine_channels(values)
         return {
             f"{self.name}.density": values["density"].reshape(1),
@@ -120,7 +121,7 @@ class HazeControl(Control):
 
 
 def _find_haze(scene: SceneDescription) -> parts.HazePart | None:
-    """Return the haze that a scene comes with."""
+    """Return the haze that a scene comes with; None without any, or of density 0."""
     return next(
         (
             part

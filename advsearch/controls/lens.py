@@ -186,7 +186,12 @@ def draw_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
 
 
 def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:
-    """Return the opacity (dots, H, W) of each dot in each pixel; see `draw_dots`."""
+    """Return the opacity (dots, H, W) of each dot in each pixel.
+
+    It is opacity * exp(-(r^2)^falloff), where r is the distance from the dot's center
+    in its radii. x and y are fractions of the image's width and height, radii of its
+    shorter side; `values` are as for `draw_dots`.
+    """
     shorter_side = min(height, width)
     device = values["x"].device
     column = torch.arange(width, device=device) + 0.5
@@ -197,5 +202,6 @@ def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Te
     in_radii = squared_distance / values["radius"][:, None, None] ** 2
     falloff = values["falloff"]
     max_in_radii = float(_MAX_EXPONENT ** (1.0 / falloff.detach()))
+    # not 0, where a power has no derivative
     fading = torch.exp(-(in_radii.clamp(1e-12, max_in_radii) ** falloff))
     return values["opacity"][:, None, None] * fading

@@ -143,7 +143,11 @@ class LightControl(Control):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return where the lamp is, and how bright."""
+        """Return where the lamp is, and how bright.
+
+        A power of 1 is the metered irradiance of the scene at a distance of 1; a ball
+        of the same intensity has that over its area as seen from afar.
+        """
         position = torch.stack([values[axis] for axis in ("x", "y", "z")])
         intensity = (
             color.combine_channels(values)

@@ -84,9 +84,10 @@ def register_pattern(
 
 
 def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
-    """Return gradient noise with whole lattice cells across the tile.
+    """Return gradient noise (Perlin 1985) at points of a grid: about -1 to 1, mean 0.
 
-    About -1 to 1, mean 0 (Perlin 1985).
+    `cells` are the lattice cells across and down the tile; the noise goes on
+    periodically.
     """
     columns, rows = cells
     generator = np.random.Generator(np.random.PCG64(seed))
@@ -107,6 +108,7 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
     y_weight = _fade(y)
     upper = corner(0, 0) * (1.0 - x_weight) + corner(1, 0) * x_weight
     lower = corner(0, 1) * (1.0 - x_weight) + corner(1, 1) * x_weight
+    # 1.5: bilinear sums of unit gradients rarely exceed 2 / 3
     return np.asarray((upper * (1.0 - y_weight) + lower * y_weight) * 1.5)
 
 
@@ -125,6 +127,7 @@ def _clouds(
         total += 0.5**octave * _noise(
             grid, (cells[0] << octave, cells[1] << octave), seed + 101 * octave
         )
+    # the sum of all weights
     return total / (2.0 - 0.5 ** (octaves - 1))
 
 
@@ -171,23 +174,23 @@ def _cells(
 def _turing(
     wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12
 ) -> Float64Array:
-    """Return animal stripes or spots in [-1, 1].
+    """Return animal stripes or spots (SIDE, SIDE) in [-1, 1].
 
-    Noise, band-passed and saturated again and again; after about ten rounds the pattern
-    has settled.
+    Noise is filtered to waves of about one length and saturated, again and again; after
+    about ten rounds the pattern has settled.
 
     Args:
-        wavelength: along x and along y, in tiles; unequal ones make stripes across
-            the shorter.
-        bias: that is added before saturation: away from 0 stripes break up into
-            spots.
+        wavelength: along x and along y, in tiles; unequal ones make stripes across the
+            shorter.
+        bias: that is added before saturation: away from 0 stripes break up into spots.
         seed: of the noise.
-        rounds: number of steps.
+        rounds: number of filterings.
     """
     frequency = np.fft.fftfreq(TILE_SIDE, 1.0 / TILE_SIDE)
     radius = np.hypot(
         frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1]
     )
+    # passes frequencies within about 22 % of one wave per wavelength
     band = np.exp(-(((radius - 1.0) / 0.22) ** 2))
     field = np.random.Generator(np.random.PCG64(seed)).standard_normal(
         (TILE_SIDE, TILE_SIDE)
@@ -237,7 +240,11 @@ def plain(grid: Grid) -> Float64Array:
 
 @register_pattern(0.6, roughness=0.45)
 def wood(grid: Grid) -> Float64Array:
-    """Paint year rings with fibres and pores."""
+    """Paint year rings with fibres and pores.
+
+    The last argument of `_noise` and `_clouds` is a seed; other numbers are chosen by
+    eye.
+    """
     x, y = grid
     bend = 0.16 * _clouds(grid, (2, 1), 2, 11) + 0.012 * _noise(grid, (8, 3), 12)
     rings = 9.0 * (x + bend) + 0.25 * _noise(grid, (5, 2), 17)
@@ -258,7 +265,11 @@ def wood(grid: Grid) -> Float64Array:
 
 @register_pattern(0.9, roughness=0.15)
 def marble(grid: Grid) -> Float64Array:
-    """Paint clouds with dark veins."""
+    """Paint clouds with dark veins.
+
+    The last argument of `_clouds` and `_warped` is a seed; other numbers are chosen by
+    eye.
+    """
     warped = _warped(grid, 2, 0.22, 21)
     finely_warped = _warped(warped, 6, 0.03, 22)
     x, y = finely_warped
@@ -272,6 +283,7 @@ def marble(grid: Grid) -> Float64Array:
         turbulence = 0.5 * _clouds(finely_warped, (2, 2), 4, seed)
         strength = 0.25 + 0.75 * _step(_clouds(warped, (3, 3), 2, seed + 50), 0.0, 0.8)
         profile = _compute_vein_profile(n_right * x + n_down * y + turbulence, width)
+        # n_right and n_down are whole, so that veins meet at the tile's border
         veins += depth * strength * profile
     return _mix(
         _mix(_color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, 0.58, 0.8)),
@@ -290,14 +302,20 @@ def _compute_vein_profile(phase: Float64Array, width: float) -> Float64Array:
 
 @register_pattern(0.6, roughness=0.9, specular=0.2)
 def brick(grid: Grid) -> Float64Array:
-    """Paint a wall of bricks with mortar."""
+    """Paint a wall of bricks with mortar.
+
+    The last argument of `_noise`, `_clouds` and `_warped` is a seed; other numbers are
+    chosen by eye.
+    """
     x, y = _warped(grid, 12, 0.0035, 31)
     rows = 8
     columns = 4
     row = np.floor(y * rows)
+    # every other course is shifted by half a brick
     course_x = x * columns + 0.5 * (row % 2.0)
     column = np.floor(course_x) % columns
     # distance to the edge of the brick, in heights of a course
+    # a brick is twice as long as high
     edge_x = 2.0 * (0.5 - np.abs(course_x % 1.0 - 0.5))
     edge_y = 0.5 - np.abs(y * rows % 1.0 - 0.5)
     solid = _step(
@@ -321,11 +339,16 @@ def _paint_fired_clay(grid: Grid, brick_tone: Float64Array) -> Float64Array:
 
 @register_pattern(0.45, roughness=0.95, specular=0.1)
 def fabric(grid: Grid) -> Float64Array:
-    """Paint a plain weave of two threads."""
+    """Paint a plain weave of two threads.
+
+    The last argument of `_noise` and `_warped` is a seed; other numbers are chosen by
+    eye.
+    """
     x, y = _warped(grid, 6, 0.004, 41)
     count = 16
     thread_x = x * count
     thread_y = y * count
+    # height of a round thread across its width
     round_x = np.sin(np.pi * (thread_x % 1.0))
     round_y = np.sin(np.pi * (thread_y % 1.0))
     # the warp is the upright thread
@@ -357,7 +380,11 @@ def _thread_tones(
 
 @register_pattern(0.7, roughness=0.8, specular=0.2)
 def leopard(grid: Grid) -> Float64Array:
-    """Paint rosettes with dots between them."""
+    """Paint rosettes with dots between them.
+
+    The last argument of `_clouds`, `_warped` and `_scattered` is a seed; other numbers
+    are chosen by eye, lengths in tiles.
+    """
     warped = _warped(_warped(grid, 4, 0.03, 51), 12, 0.012, 52)
     points = _scattered(42, 53)
     distance, index = _cells(warped, points)
@@ -379,7 +406,9 @@ def _draw_rosettes(
     distance: Float64Array,
     index: npt.NDArray[np.int64],
 ) -> tuple[Float64Array, Float64Array]:
-    """Draw broken rings around points, and their darker cores; each (SIDE, SIDE).
+    """Return where broken rings around points are, and their cores; each (SIDE, SIDE).
+
+    Both are from 0 to 1. Numbers are chosen by eye, lengths in tiles.
 
     Args:
         grid: coordinates of the texels.
@@ -391,9 +420,11 @@ def _draw_rosettes(
     size = generator.uniform(0.85, 1.15, len(points))[index]
     turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index]
     radius = distance / size
+    # the shorter way on the torus, -0.5 to 0.5
     x_offset = (grid[0] - points[index, 0] + 0.5) % 1.0 - 0.5
     y_offset = (grid[1] - points[index, 1] + 0.5) % 1.0 - 0.5
     angle = np.arctan2(y_offset, x_offset)
+    # around a ring: it is broken where this is low
     waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
     outer_edge = 0.056 + 0.004 * np.cos(angle + turn)
     ring = _step(radius, 0.031, 0.008) * (1.0 - _step(radius, outer_edge, 0.008))
@@ -417,7 +448,11 @@ def checker(grid: Grid) -> Float64Array:
 
 @register_pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
 def rust(grid: Grid) -> Float64Array:
-    """Paint rust under flakes of paint."""
+    """Paint rust under flakes of paint.
+
+    The last argument of `_noise`, `_clouds` and `_warped` is a seed; other numbers are
+    chosen by eye.
+    """
     warped = _warped(grid, 4, 0.06, 71)
     broad = 0.5 + 0.5 * _clouds(warped, (3, 3), 5, 72)
     grain = _clouds(grid, (48, 48), 3, 73)
@@ -452,8 +487,10 @@ def _bend_blades(
         along: (1, along, 1) from 0 to 1.
         across: (1, 1, across) from -1 to 1.
     """
+    # half a width of 0.0042 tiles at the root, 0 at the tip
     offset = across * 0.0042 * (1.0 - along**2)
     heading = lean + bend * along
+    # a chord of a circular arc points halfway between the headings of its ends
     middle = lean + 0.5 * bend * along
     x = root[..., 0] + length * along * np.cos(middle) - offset * np.sin(heading)
     y = root[..., 1] + length * along * np.sin(middle) + offset * np.cos(heading)
@@ -486,7 +523,10 @@ def grass(grid: Grid) -> Float64Array:
 def _draw_points(
     x: Float64Array, y: Float64Array, colors: Float64Array
 ) -> Float64Array:
-    """Draw points (N,) of a torus with colors (N, 3) on dark soil, the last on top."""
+    """Draw points of a torus on dark soil, and return the tile (SIDE, SIDE, 3).
+
+    `x` and `y` are (N,) in tiles, `colors` (N, 3). The last point in a texel is on top.
+    """
     column = np.floor(x * TILE_SIDE).astype(np.int64) % TILE_SIDE
     row = np.floor(y * TILE_SIDE).astype(np.int64) % TILE_SIDE
     texels = np.broadcast_to(_color("14240b"), (TILE_SIDE * TILE_SIDE, 3)).copy()
@@ -499,12 +539,17 @@ def _draw_points(
 
 @register_pattern(0.5, roughness=0.85, specular=0.2)
 def elephant(grid: Grid) -> Float64Array:
-    """Paint skin with folds."""
+    """Paint skin with folds.
+
+    The last argument of `_clouds` and `_warped` is a seed; other numbers are chosen by
+    eye.
+    """
     warped = _warped(_warped(grid, 3, 0.05, 91), 14, 0.012, 92)
     folds = np.zeros((TILE_SIDE, TILE_SIDE))
     for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
         points = _scattered(count, seed)
         distance, _ = _cells(warped, points)
+        # folds run where the two nearest points are equally far
         folds += depth * np.exp(-(((distance[..., 1] - distance[..., 0]) / width) ** 2))
     long_folds = np.abs(_clouds(_warped(grid, 5, 0.04, 95), (3, 14), 3, 96))
     folds += 0.55 * np.exp(-((long_folds / 0.035) ** 2))
@@ -519,6 +564,10 @@ def elephant(grid: Grid) -> Float64Array:
 
 @register_pattern(0.5, roughness=0.32, metallic=1.0)
 def steel(grid: Grid) -> Float64Array:
+    """Paint brushed steel: scratches along x.
+
+    The last argument of `_noise` is a seed; other numbers are chosen by eye.
+    """
     scratches = (
         _noise(grid, (3, 240), 101)
         + 0.6 * _noise(grid, (7, 120), 102)
@@ -566,6 +615,7 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
     weights = np.abs(normals) ** BLEND_EXPONENT
     weights /= weights.sum(axis=-1, keepdims=True)
     texels = np.zeros((side, side, 3), dtype=np.float32)
+    # seen along each axis: the two others, of which the second points up in the tile
     for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
         projected = look_up_texture(
             make_tile(name), positions[..., right] * scale, -positions[..., up] * scale
@@ -619,9 +669,14 @@ class MaterialControl(Control):
         return scene
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
+        """Return a parameter; those of the surface have the value of the material as
+        default.
+
+        Of several materials that is the object's own surface if it is among them, else
+        the first.
+        """
         if parameter.name not in SURFACE_PARAMETERS:
             return parameter
-        # the fixed or first material
         first = (
             OBJECT_SURFACE
             if OBJECT_SURFACE in self._material_names

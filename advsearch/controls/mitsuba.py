@@ -48,6 +48,11 @@ class MitsubaControl(Control):
         return tuple(_make_parameter(key) for key in settings)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Add a part that holds the numbers which are set by Mitsuba's names.
+
+        Raises InputError: they are about more than the object, and the surroundings are
+        a photograph; or the scene has no such number.
+        """
         others = [key for key in self._settings if not key.startswith("object.")]
         if scene.backdrop_photograph is not None and others:
             raise InputError(

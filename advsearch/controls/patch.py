@@ -265,6 +265,7 @@ class PatchControl(PictureControl):
     def scene_inputs(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
+        """Return the object's base color with the patch painted into it."""
         return {
             BASE_COLOR: self._painter.paint(
                 so_far.get(BASE_COLOR), values["pixels"], values
@@ -290,13 +291,12 @@ class PatchControl(PictureControl):
 
 
 def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
-    """Return the side of the object that faces the camera.
+    """Return the azimuth and the height of a patch on the side that faces the camera.
 
-    It inverts `_outward_direction`.
+    It is the inverse of `_outward_direction`.
 
     Returns:
-        Azimuth in degrees, and height from 0 to 1, as the parameters of the
-            control.
+        Azimuth in degrees, and height from 0 to 1, as the parameters of the control.
     """
     center, radius, half_height = _measure_mesh(scene.object.mesh)
     camera = np.append(geometry.camera_to_world(scene)[:3, 3], 1.0)
@@ -304,6 +304,7 @@ def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
     x, y, z = np.linalg.solve(geometry.object_to_world(scene), camera)[:3] - center
     # at least a tiny distance: a camera straight above is at height 1
     level_distance = max(math.hypot(x, y), 1e-12)
+    # on a sphere into which the ellipsoid is scaled
     elevation = math.atan2(z * radius, level_distance * half_height)
     azimuth = math.degrees(math.atan2(y, x)) % 360.0
     return azimuth, 0.5 + elevation / math.pi
@@ -500,6 +501,7 @@ class PatchPainter:
         """
         center, radius, half_height = self._center_and_sizes
         outwards = _outward_direction(azimuth, height, radius, half_height)
+        # far outside of the object
         ray_origin = center + 4.0 * (radius + half_height) * outwards
         face, point = self._surface.find_hit(ray_origin, -outwards)
         # A face may be seen from its back: then all normals are flipped.
@@ -559,10 +561,11 @@ class PatchPainter:
         return np.asarray(connected[is_close])
 
     def _measure_texel_spacing(self, rows: assets.IntArray) -> float:
-        """Return the median distance of neighbouring texels on the surface.
+        """Return the median distance of neighbouring texels on the surface, in object
+        sizes.
 
-        It is in object sizes. Texels without an area do not count; if none has one, it
-        is that of a map that spans one object size.
+        Texels without an area do not count; if none has one, the distance is that in a
+        map which spans one object size.
         """
         areas = self._areas[rows]
         has_area = areas > 0.0
@@ -576,8 +579,8 @@ def _outward_direction(
 ) -> assets.Float64Array:
     """Return the unit vector (3,) from the center of an object to a patch on it.
 
-    The patch is on an ellipsoid with the object's radius and half-height; `height` is
-    its latitude, 0 at the lower pole and 1 at the upper.
+    The patch lies on an ellipsoid with the object's radius and half-height. `height` is
+    its latitude: 0 at the lower pole, 0.5 at the equator, 1 at the upper pole.
     """
     angle = math.radians(azimuth)
     latitude = (height - 0.5) * math.pi
@@ -618,10 +621,10 @@ def _fade_in(cosine: assets.Float64Array) -> Tensor:
 def _make_frame(
     normal: assets.Float64Array, upwards: assets.Float64Array
 ) -> assets.Float64Array:
-    """Return a right-handed frame (3, 3): rows right, up and normal.
+    """Return a right-handed frame (3, 3), whose rows are right, up and the normal.
 
-    Up is the part of `upwards` that is across the normal; if there is none, that of
-    the axis that is least along the normal.
+    Up is `upwards` without its part along the normal. If nothing is left, it is the
+    axis that is least along the normal.
     """
     up = upwards - float(upwards @ normal) * normal
     if float(np.linalg.norm(up)) < 1e-6:
@@ -638,9 +641,10 @@ def unroll_surface(
 ) -> tuple[assets.Float64Array, assets.Float64Array]:
     """Return the coordinates of points along a surface, and their normals' cosines.
 
-    In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its
-    arc is `R phi`, phi being the angle that the normal has turned. So the component
-    along the direction of turning is stretched by `phi / sin(phi)`.
+    The surface around the center is taken for a cylinder. There a point lies at R
+    sin(phi) in the tangent plane, but at R phi along the surface, where R is the radius
+    and phi the angle by which the normal has turned. So the component along the
+    direction of turning is stretched by phi / sin(phi).
 
     Args:
         offsets: (N, 3) of the points from the center.
@@ -648,8 +652,8 @@ def unroll_surface(
         frame: rows right, up and normal at the center.
 
     Returns:
-        Coordinates (N, 2) to the right and upwards, and cosines (N,) with the
-            normal of the frame.
+        Coordinates (N, 2) to the right and upwards, and cosines (N,) with the normal of
+        the frame.
     """
     in_plane = offsets @ frame[:2].T  # (N, 2)
     tilt = normals @ frame[:2].T  # (N, 2)
@@ -666,12 +670,12 @@ def unroll_surface(
 
 
 def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
-    """Average colors (N, 3) at positions (N, 2) in [0, 1] over side x side pixels.
+    """Average colors (N, 3) over the side x side pixels in which they lie.
 
-    Positions are (column, row).
+    `positions` are (N, 2), column and row in [0, 1].
 
     Returns:
-        (side * side, 3), row by row; a pixel without any has the nearest color.
+        (side * side, 3), row by row; a pixel without any color has the nearest one.
     """
     column, row = (positions * side).long().clamp(0, side - 1).T
     index = row * side + column
@@ -687,8 +691,10 @@ def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
 
 
 def _rotate(coordinates: Tensor, degrees: Tensor) -> Tensor:
-    """Return coordinates (N, 2) in the axes of a patch that is turned
-    counter-clockwise.
+    """Return coordinates (N, 2) in the axes of a patch.
+
+    The patch is turned counter-clockwise by `degrees` (), so that coordinates turn
+    clockwise.
     """
     angle = torch.deg2rad(degrees)
     cosine = torch.cos(angle)

@@ -87,10 +87,12 @@ class PoseControl(Control):
         linear = values["scale"] * rotation
         # height of the lowest point over the center
         if self.chosen["on_ground"] in ("yes", True):
+            # of the mesh as it is turned and scaled
             lowest = ((vertices - center) @ linear[2]).amin()
         else:
             lowest = floor - center[2]
         shift = torch.stack([values["x"], values["y"], floor + values["z"] - lowest])
+        # turned about its center, the mesh stays above where that was
         level_center = torch.cat([center[:2], center.new_zeros(1)])
         translation = shift - linear @ center + level_center
         return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base}
@@ -100,7 +102,7 @@ class PoseControl(Control):
 def _get_base_pose(
     mesh: MeshPart, surrounding: MeshPart | None
 ) -> tuple[Tensor, Tensor, float]:
-    """Return where a mesh stands before it is posed.
+    """Return where a mesh is before it is posed.
 
     Args:
         mesh: that is posed.
@@ -109,7 +111,7 @@ def _get_base_pose(
 
     Returns:
         The pose (4, 4) from its own coordinates, its vertices (V, 3) in the scene, and
-            their lowest height.
+        their lowest height.
     """
     if surrounding is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0

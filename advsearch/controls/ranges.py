@@ -135,9 +135,10 @@ class DistributionRange(Range):
     label: str
 
     def interpolate(self, u: Tensor, *, log: bool = False) -> Tensor:
-        """Return the values at coordinates in [0, 1].
+        """Return the values at coordinates in [0, 1]: the quantiles of the
+        distribution.
 
-        Differentiable, by the slope of the quantiles.
+        The derivative is the slope of the quantiles, by finite differences.
         """
         values = self._compute_values(u.detach())
         if u.requires_grad:
@@ -157,7 +158,10 @@ class DistributionRange(Range):
         return torch.from_numpy(np.clip(values, self.low, self.high)).to(u)
 
     def find_coordinate(self, value: float, *, log: bool = False) -> float:
-        """Return the coordinate of a value, by bisection."""
+        """Return the coordinate of a value, by bisection on the quantiles.
+
+        `log` has no effect. Values outside of the range have the nearest coordinate.
+        """
         lower = 0.0
         upper = 1.0
         for _ in range(60):
@@ -192,6 +196,8 @@ def to_plain_value(value: object) -> object:
 
 def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
     """Parse what a parameter was set to.
+
+    Two numbers in a list are a range; names, or another count of numbers, are a choice.
 
     Args:
         label: how messages name it, e.g. "pose.yaw".
@@ -266,10 +272,11 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
 
 
 def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
-    """Return both ranges of angles that a reversed one may mean, for a message.
+    """Return a clause about both ranges of angles that a reversed one may mean.
 
     From 350 to 10 may mean the 20 degrees through 0 or the 340 in between. The first
-    range is moved by a turn, so that it ascends and stays within the parameter's bounds.
+    range is shifted by a turn, so that it ascends and stays within the parameter's
+    bounds.
     """
     begin = low
     end = high + FULL_TURN
@@ -303,9 +310,11 @@ MAX_REPEATS = 1000  # largest number of values that a weighted choice is repeate
 def _make_weighted_choice(
     where: str, values: Sequence[ParameterValue], weights: object
 ) -> OneOf:
-    """Return a choice that repeats each value in proportion to its weight.
+    """Return a choice among values with weights.
 
-    So equal fractions of u draw it with that probability.
+    Each value is repeated in proportion to its weight, so that a uniform coordinate
+    selects it with that probability. Raises InputError: weights are missing or invalid,
+    or one is too small for `MAX_REPEATS`.
     """
     weight_list = list(weights) if isinstance(weights, (list, tuple)) else []
     valid_weights = [
@@ -335,10 +344,11 @@ def _make_weighted_choice(
 
 
 def _count_repeats(probabilities: Sequence[float]) -> list[int]:
-    """Return how often each value is repeated so that it has its probability.
+    """Return how often each value is repeated, in proportion to its probability.
 
     The total is the smallest with which all counts are whole numbers, or `MAX_REPEATS`
-    if there is none; then cumulated counts are rounded, so that their sum is right.
+    if there is none. Counts are differences of rounded cumulative counts, so that their
+    sum is the total.
     """
     total = MAX_REPEATS
     for candidate in range(1, MAX_REPEATS):
@@ -367,7 +377,11 @@ def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
 
 
 def _check_value(label: str, parameter: Parameter, value: object) -> ParameterValue:
-    """Return a value of a parameter. Raises InputError: it cannot have it."""
+    """Return a value of a parameter as a name or a float.
+
+    Raises InputError or UnknownNameError: it is neither one of the options nor a number
+    within the parameter's bounds.
+    """
     if parameter.options:
         if not isinstance(value, str):
             raise InputError(
@@ -420,8 +434,9 @@ def compute_difference(first: float, second: float, *, is_angle: bool = False) -
 def clip_to_range(
     value: float, low: float, high: float, *, is_angle: bool = False
 ) -> float:
-    """Return the value in a range that is nearest to a value; of an angle, nearest the
-    shorter way round.
+    """Return the value in a range that is nearest to a given one.
+
+    Angles are compared the shorter way round.
     """
     if is_angle:
         # in [low, low + 360): above `high` the way on to `low` may be shorter
@@ -482,8 +497,9 @@ class Slot:
         )
 
     def start_value(self) -> ParameterValue:
-        """Return the default, or the nearest value that is allowed; of names, the first
-        that is allowed.
+        """Return the parameter's default, or the allowed value that is nearest to it.
+
+        Names have no nearest value: the first allowed one is returned.
         """
         spec = self.spec
         default = self.parameter.default
@@ -505,7 +521,7 @@ class Slot:
         )
 
     def start_coordinates(self) -> list[float]:
-        """Return the coordinates of that value."""
+        """Return the coordinates of `start_value`; none if the parameter is fixed."""
         spec = self.spec
         value = self.start_value()
         if isinstance(spec, Range):
@@ -513,6 +529,7 @@ class Slot:
                 spec.find_coordinate(float(value), log=self.parameter.log)
             ] * self.n_values
         if isinstance(spec, OneOf):
+            # the middle of the value's interval of [0, 1]
             return [(spec.values.index(value) + 0.5) / len(spec.values)]
         return []
 
@@ -547,6 +564,7 @@ def parse_distribution(
         lower_probability = float(frozen.cdf(parameter.low))
         upper_probability = float(frozen.cdf(parameter.high))
         outside = lower_probability + float(frozen.sf(parameter.high))
+        # whether the distribution ends below and above
         has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
     if outside > MAX_OUTSIDE_PROBABILITY:
         raise InputError(
@@ -567,7 +585,11 @@ def parse_distribution(
 def _freeze_distribution(
     where: str, name: object, arguments: Mapping[str, Any]
 ) -> tuple[Any, str]:
-    """Return a distribution of scipy with its arguments, and how messages write it."""
+    """Return a distribution of scipy with its arguments, and how messages write it.
+
+    Raises UnknownNameError or InputError: there is none of that name, or it does not
+    take the arguments.
+    """
     # takes a quarter of a second, and few runs draw by a distribution
     from scipy import stats
 
@@ -603,7 +625,12 @@ def _freeze_distribution(
 def _read_python_quantiles(
     label: str, parameter: Parameter, setting: PythonQuantiles
 ) -> DistributionRange:
-    """Return the spec of a function from Python, an inverse CDF."""
+    """Return the range of a parameter whose values a Python function gives.
+
+    The function is an inverse CDF, from a probability to a value. It is checked at
+    `N_CHECKED_QUANTILES` probabilities. Raises InputError: its values leave the
+    parameter's bounds, or fall.
+    """
     name = str(setting["name"])
 
     def quantiles(probabilities: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -611,6 +638,7 @@ def _read_python_quantiles(
         return np.array(values).reshape(probabilities.shape)
 
     with np.errstate(all="ignore"):
+        # whether the distribution ends below and above; if not, its tails are cut off
         has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
     lower_probability = 0.0 if has_end[0] else TAIL_PROBABILITY
     upper_probability = 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
@@ -645,7 +673,11 @@ def _make_range(
     upper_probability: float,
     label: str,
 ) -> DistributionRange:
-    """Return a range between two probabilities of a distribution."""
+    """Return the range of a distribution between two probabilities.
+
+    `label` is the distribution's name, and `setting_name` what was set to it, for
+    messages. Raises InputError: the range has a single value.
+    """
     low, high = (
         float(value)
         for value in quantiles(np.array([lower_probability, upper_probability]))

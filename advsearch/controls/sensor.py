@@ -153,6 +153,7 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     std = torch.sqrt(variance + _DARK**2) - _DARK
     light = light + std * images.draw_noise(height, width, seed, "sensor").to(light)
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
+    # white balance: red and blue in stops, green is the reference
     gains = torch.stack(
         [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
     )
@@ -166,13 +167,14 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
 def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
     """Return the fraction of the light (H, W, 1) that comes through a lens.
 
-    `amount` () is missing in the corners.
+    `amount` () is the fraction that is lost in the corners.
     """
     # Natural vignetting, (1 + k r^2)^-2 with r = 1 in the corners, where it is
     # 1 - amount.
     down, right = (torch.arange(side) + 0.5 - side / 2 for side in (height, width))
     squared_corner = (height**2 + width**2) / 4.0
     squared_radius = (down[:, None] ** 2 + right[None, :] ** 2) / squared_corner
+    # from (1 + k)^-2 = 1 - amount
     k = (1.0 - amount) ** -0.5 - 1.0
     return ((1.0 + k * squared_radius.to(amount)) ** -2)[..., None]
 
@@ -180,7 +182,7 @@ def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
 def apply_aberration(image: Tensor, amount: Tensor) -> Tensor:
     """Return an image (H, W, 3) with lateral chromatic aberration.
 
-    Red is larger by a factor 1 + amount about the middle, blue is smaller.
+    Red is larger about the center by the factor 1 + amount, blue smaller by 1 - amount.
     """
     height, width = image.shape[:2]
     down, right = torch.meshgrid(

@@ -191,7 +191,11 @@ class ShadowControl(Control):
         return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
 
     def _pose(self, values: Values, distance: float) -> Tensor:
-        """Return the card's pose (4, 4) at a distance from the object's middle."""
+        """Return the card's pose (4, 4) at a distance from the object's center.
+
+        It faces the object, is shifted across by x and y, and turned about the line to
+        the object.
+        """
         right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
         turn = torch.deg2rad(values["turn"])
         size = values["size"].clamp_min(MIN_SIZE)
@@ -200,6 +204,8 @@ class ShadowControl(Control):
         middle = torch.from_numpy(geometry.compute_center(self.scene)).to(right)
         center = middle + distance * outwards
         center = center + values["x"] * right + values["y"] * up
+        # two signs change, so that the frame stays right-handed and the card faces
+        # inwards
         axes = torch.stack([first_axis, -second_axis, -outwards], dim=1)
         return geometry.make_affine(size * axes, center)
 
@@ -225,15 +231,15 @@ class ShadowControl(Control):
     def _find_distance(
         self, values: Values, so_far: Mapping[str, Tensor]
     ) -> float | None:
-        """Find the smallest distance, at least the requested, at which the camera does
-        not see the card.
+        """Find the smallest distance at which the camera does not see the card.
 
-        That is so if a ball around the card is outside of the cone through the corners
-        of the image. The card stays nearer than the lamp.
+        It is at least the requested one, and the card stays nearer than the lamp. A
+        distance counts if a ball around the card is outside of the cone through the
+        corners of the image.
 
         Returns:
             The distance in object sizes; None if the card has no size, or is visible at
-                all distances.
+            all distances.
         """
         size = float(values["size"].detach())
         requested = float(values["distance"].detach())
@@ -265,10 +271,12 @@ class ShadowControl(Control):
             widest = math.radians(float(fov.detach()))
         else:
             widest = math.radians(self.scene.number("camera.fov"))
+        # below 180 degrees, where it would be infinite
         half_tangent = math.tan(min(widest, 3.0) / 2.0)
         corner = math.atan(half_tangent * math.hypot(1.0, min(aspect, 1.0 / aspect)))
         shift = so_far.get("camera.shift")
         if shift is not None:
+            # a generous bound on the angle by which a shift moves the corners
             corner += 2.0 * float(shift.detach().abs().max())
         return corner
 

@@ -79,10 +79,10 @@ def compute_direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
 def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
     """Interpolate a table (10, ...) between the integer turbidities 1 to 10.
 
-    By cubics with a continuous derivative: the slope at an integer turbidity is that
-    between its neighbors (Catmull and Rom 1974), one-sided at the ends. The authors
-    interpolate linearly, so that the derivative jumps at integer turbidities, the
-    default of 3 among them.
+    It is a cubic Hermite spline, so that the derivative is continuous. The slope at an
+    integer turbidity is that between its neighbors (Catmull and Rom 1974), one-sided at
+    the ends. The authors of the table interpolate linearly: then the derivative jumps
+    at integers, the default of 3 among them.
     """
     below = min(8, max(0, int(turbidity.detach()) - 1))
     t = turbidity - 1.0 - below  # from 0 at the entry below to 1 at the next
@@ -93,7 +93,7 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
         before = max(0, index - 1)
         after = min(9, index + 1)
         slopes.append((table[after] - table[before]) / (after - before))
-    # a cubic Hermite spline, as a correction of the line
+    # the spline, as a correction of the straight line
     rise = upper - lower
     return torch.lerp(lower, upper, t) + t * (1.0 - t) * (
         (1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise)
@@ -103,10 +103,10 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
 def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     """Return the sun's irradiance (3,) on a surface that faces it.
 
-    In the unit of the sky's radiance times steradian.
-
-    A piece of the model is a cubic in the elevation above the piece's beginning. A term
-    `cos(psi)^j` of the limb's darkening has the mean `2 / (j + 2)` over the disk.
+    Its unit is that of the sky's radiance times steradian. The model has 45 pieces,
+    whose bounds are even in the cube root of the elevation. A piece is a cubic in the
+    elevation above its lower bound. A term cos(psi)^j of the darkening towards the limb
+    has the mean 2 / (j + 2) over the disk.
     """
     radians = torch.deg2rad(elevation)
     fraction = float(radians.detach()) / (math.pi / 2.0)
@@ -134,7 +134,10 @@ class Sky:
     """
 
     def __init__(self, ground: Tensor) -> None:
-        """Compute the directions and solid angles of the texels above the horizon."""
+        """Compute the directions and solid angles of the texels above the horizon.
+
+        Row 0 of the map is straight up. `ground` (3,) is the ground's albedo.
+        """
         self.ground = ground
         upper = MAP_ROWS // 2
         elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (
@@ -188,11 +191,12 @@ class Sky:
     def _interpolated(
         self, table: Tensor, elevation: Tensor, turbidity: Tensor
     ) -> Tensor:
-        """Interpolate a table (10, 2, 6, 3, ...) in turbidity, ground albedo (0 or 1)
-        and elevation; the last axis before others is the channel.
+        """Interpolate a table (10, 2, 6, 3, ...) in turbidity, elevation and ground
+        albedo.
 
-        It is a quintic Bezier curve in the cube root of the elevation, and linear in
-        the albedo.
+        Its axes are turbidity, albedo (0 or 1), control point and channel. It is a
+        quintic Bezier curve in the cube root of the elevation, and linear in the
+        albedo. Returns (3, ...).
         """
         # not 0, where the cube root has no derivative
         x = (elevation / 90.0).clamp(1e-6, 1.0).pow(1.0 / 3.0)
@@ -202,16 +206,16 @@ class Sky:
         curves = torch.einsum(
             "k,akc...->ac...", weights, _at_turbidity(table, turbidity)
         )
+        # (3, 1, ...) to be broadcast
         albedo = self.ground.reshape(3, *[1] * (curves.ndim - 2))
         return torch.lerp(curves[0], curves[1], albedo)
 
     def compute_disk(self, sun: Tensor) -> Tensor:
-        """Return the sun's shape (ROWS / 2, COLUMNS, 1).
+        """Return the sun's shape (ROWS / 2, COLUMNS, 1), with an integral of 1 over
+        solid angle.
 
-        A smooth bump whose integral over solid angle is 1.
-
-        `(1 - r^2)^2` inside the radius: its derivative vanishes where it does, so that
-        an adjoint that samples by radiance sees its whole motion.
+        Inside its radius it is (1 - r^2)^2. The derivative of that vanishes at the
+        edge, so that an adjoint which samples by radiance sees the sun's whole motion.
         """
         distance = (self.directions - sun).square().sum(
             -1, keepdim=True
@@ -310,6 +314,7 @@ class SkyControl(Control):
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Give the scene the sky at the control's start as its environment."""
         bound = self.bind(scene)
         radiance = (
             bound.compute_radiance(bound.values(bound.start)).numpy().astype(np.float32)
@@ -320,6 +325,9 @@ class SkyControl(Control):
         )
 
     def fit(self) -> None:
+        """Fit the parameters, and store the irradiance towards the sun of the starting
+        sky.
+        """
         super().fit()
         start = self.values(self.start)
         # the sun's azimuth does not matter

@@ -70,7 +70,11 @@ class Space:
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """Every group of coordinates in the order of u, without an estimator yet."""
+        """Every group of coordinates in the order of u.
+
+        They have no estimator yet. The material form is not among the valid ones if the
+        scene does not support it.
+        """
         lacks_material_form = not self._has_material_form()
         groups = []
         begin = 0
@@ -156,11 +160,11 @@ class Space:
     def _with_previous_inputs(
         self, u: Tensor
     ) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
-        """Return each control with its slice of u and the inputs of those evaluated
-        before it, in the order of the controls.
+        """Return each control with its slice of u and the inputs set before it.
 
-        A control that refines nothing gets no inputs; after the last that refines, none
-        are computed.
+        The result has the order of the controls; but inputs are set in the order of
+        evaluation. A control that refines nothing gets no inputs, and none are computed
+        after the last control that needs some.
         """
         slices = u.detach().split(self.sizes)
         order = self._evaluation_order
@@ -231,7 +235,8 @@ class Space:
     def exposure(self) -> tuple[float, float]:
         """Seconds that the shutter is open, and in which rows are read.
 
-        The latter are below 0 where rows are read from the bottom.
+        They are those of the control with the longest exposure. The latter are below 0
+        where rows are read from the bottom.
         """
         exposures = (control.exposure for control in self.controls)
         return max(
@@ -260,7 +265,8 @@ class Space:
             InputError: no number of controls has k coordinates.
         """
         sizes = self.sizes
-        # of controls without coordinates at the end, none is fixed
+        # several counts are possible where controls have no coordinates; the smallest
+        # is taken
         counts = [
             count for count in range(len(sizes) + 1) if sum(sizes[:count]) == len(u)
         ]
@@ -318,9 +324,10 @@ class Space:
         )
 
     def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
-        """Return views of the camera over the box of the control that moves it.
+        """Return views of the camera in configurations of the control that moves it.
 
-        Without such a control it is the one view of the scene.
+        They are spread over the box of its coordinates. If no control moves the camera,
+        it is the one view of the scene.
         """
         for control, start in self.split_by_control(self.start):
             has_coordinates = bool(control.slots) or isinstance(control, _FixedControl)
@@ -370,6 +377,7 @@ class _FixedControl(Control):
     """A bound control that stays at one configuration, and takes no coordinates."""
 
     def __init__(self, control: Control, u: Tensor) -> None:
+        """Fix a control at a slice of u: it has no coordinates any more."""
         self._control = control
         self._u = u
         self.name = control.name

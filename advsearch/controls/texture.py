@@ -259,7 +259,11 @@ class TextureControl(Control):
         return resize_to_square(original, int(resolution or default))
 
     def _make_painter(self, part: MeshPart, mask: Tensor) -> Painter:
-        """Return what paints the texels of a mask (h, w) bool, in the form chosen."""
+        """Return what paints the texels of a mask (h, w) bool.
+
+        The form that was chosen decides: a palette, waves, or every texel by itself.
+        `part` is the mesh, whose areas weigh the colors of a palette.
+        """
         texels = self._original[mask]
         norm = self.chosen["norm"]
         epsilon = self._settings.get("epsilon")
@@ -284,7 +288,9 @@ class TextureControl(Control):
     def _texels_of(
         self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]
     ) -> BoolArray:
-        """Return which texels (h, w) only lookups on some materials read.
+        """Return which texels (h, w) are read for some materials and for no others.
+
+        `names` are the materials; `shape` is that of the texture, `part` its mesh.
 
         Raises:
             InputError: the mesh has no materials, or too many of the texels are shared.
@@ -322,7 +328,10 @@ class TextureControl(Control):
         return {f"{self._mesh_name}.base_color": srgb_to_linear(self._texels(u))}
 
     def _texels(self, u: Tensor) -> Tensor:
-        """Return all texels (h, w, 3) of a slice of u."""
+        """Return the full texture (h, w, 3) at a slice of u.
+
+        Texels that are not painted have their original color.
+        """
         painted = self._painter.texels(u)
         original = self._original.to(u.device)
         if self._painted_mask is None:
@@ -390,6 +399,9 @@ def to_texels(u: Tensor) -> Tensor:
 def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> Painter:
     """Return a painter that changes a few colors, and all texels that resemble them.
 
+    A texel changes by the mean of the colors' changes, weighted by how near they are to
+    it.
+
     Args:
         original: (n, 3) sRGB, the texels.
         centers: (k, 3) sRGB, the original's palette.
@@ -413,9 +425,10 @@ def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> P
 def _paint_palette(
     original: Tensor, weights: Tensor, centres: Tensor, u: Tensor
 ) -> Tensor:
-    """Return the texels (n, 3) with the palette of a slice u.
+    """Return the texels (n, 3) for a changed palette, the coordinates u (3 k,).
 
-    Each changes by the weighted (n, k) changes of the colors (k, 3).
+    Each texel changes by the changes of the palette's colors, times its weights (n, k).
+    `centres` (k, 3) is the original palette.
     """
     change = weights.to(u.device) @ (u.reshape(-1, 3) - centres.to(u.device))
     return (original.to(u.device) + change).clamp(0.0, 1.0)
@@ -503,11 +516,12 @@ def compute_palette(image: Tensor, weight: Float32Array, count: int) -> Tensor:
 def _quantise_colors(
     image: Tensor, weight: Float32Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the mean colors (N, 3) of the 5-bit cells of an image, and their mass
-    (N,).
+    """Return the different colors (N, 3) of an image, and their mass (N,).
 
-    The mass is the root of the summed weight; with the weight itself, shades of the
-    largest surface would take all centers. Cells without weight are left out.
+    The image is sorted into cells of 5 bits a channel; a color is the weighted mean of
+    its cell. The mass is the square root of the cell's weight: with the weight itself,
+    shades of the largest surface would take all centers. Cells without weight are left
+    out.
     """
     colors = image.reshape(-1, 3).double().numpy()
     weights = weight.reshape(-1).astype(np.float64)
@@ -527,10 +541,11 @@ def _quantise_colors(
 def _choose_first_centers(
     points: Float64Array, mass: Float64Array, count: int
 ) -> list[int]:
-    """Choose the indices of up to `count` points (N, 3) that k-means starts from.
+    """Choose the points (N, 3) from which k-means starts, as up to `count` indices.
 
-    The heaviest first, then each time the point with the largest mass times squared
-    distance from the nearest chosen one; fewer if no other point is left.
+    The heaviest is first. Then it is always the point with the largest mass times
+    squared distance from the nearest chosen one. There are fewer if no other color is
+    left.
     """
     chosen = [int(mass.argmax())]
     while len(chosen) < min(count, len(points)):

@@ -208,6 +208,7 @@ class ThingsControl(Control):
             is_absent = values[f"{name}.presence"]
             if is_absent:
                 turn = ABSENT_SCALE * turn
+            # without derivative
             position = base.new_tensor([*stand.position, stand.height])
             depth = (
                 base.new_tensor([0.0, 0.0, ABSENT_DEPTH / self.scene.metres])
@@ -259,10 +260,11 @@ class ThingsControl(Control):
         return stands
 
     def _list_obstacles(self, so_far: Mapping[str, Tensor]) -> list[parts.Footprint]:
-        """List what a thing may not stand in: the object first, then the camera, then
-        the things that do not move.
+        """List the footprints of what a thing may not stand in.
 
-        The camera's footprint is a circle of the clearance, from the camera upwards.
+        The object is first, then the camera, then the things that do not move. The
+        camera's footprint is a circle around it, which is as high as wide, from the
+        camera upwards.
         """
         scene = self.scene
         object_footprint = _compute_footprint(scene, "object", so_far)
@@ -303,13 +305,14 @@ class ThingsControl(Control):
     ) -> tuple[Stand, assets.Float64Array]:
         """Find the free position of one thing, and its outline (K, 2) there.
 
-        An absent thing is not pushed anywhere.
+        The thing moves along the line from the object's center through its requested
+        position; an absent thing stays there.
 
         Args:
             name: of the thing.
             values: of the control.
             initial_footprint: of the thing before it is moved.
-            object_center: (2,) that it is pushed away from.
+            object_center: (2,) the object's center.
             obstacles: it is pushed away from the object until it is free of these.
             solids: of the surroundings; it is first pushed towards the object until it
                 is free of these.
@@ -397,7 +400,7 @@ def _compute_height(
 ) -> float:
     """Return the height of a thing's foot at a position (2,) of the ground.
 
-    It is as far above the ground there as at `foot` (3,), where it stands so far.
+    The thing keeps its height above the ground, which it has at `foot` (3,) so far.
     """
     height_above_ground = foot[2] - scene.get_ground_height(foot[:2])
     height: float = height_above_ground + scene.get_ground_height(position)
@@ -418,9 +421,11 @@ def _find_foot(part: parts.MeshPart) -> assets.Float64Array:
 def _compute_footprint(
     scene: SceneDescription, name: str, so_far: Mapping[str, Tensor]
 ) -> parts.Footprint:
-    """Return the footprint of a mesh on the ground, as earlier controls left it.
+    """Return the footprint of a mesh on the ground, as the controls before have left
+    it.
 
-    `so_far` may have its pose (4, 4) and offsets (N, 3) of its vertices.
+    `so_far` are their inputs, among which may be the mesh's pose (4, 4) and the offsets
+    (N, 3) of its vertices; otherwise it is as in the scene.
     """
     part = scene.meshes[name]
     pose = so_far.get(f"{name}.to_world")

@@ -87,7 +87,12 @@ class Deviation:
 
     @classmethod
     def from_views(cls, views: Sequence[ComparedView]) -> Deviation:
-        """Return the deviation over several views."""
+        """Return the deviation of predictions over several views, by means over the
+        views.
+
+        The margin may be off by `MAX_MARGIN_BIAS`, or by a fraction of what the search
+        has moved it, whichever is larger.
+        """
         square = statistics.fmean(view.squared_error for view in views)
         allowed_square = statistics.fmean(view.allowed_squared_error for view in views)
         margin_change = statistics.fmean(view.margin_change for view in views)
@@ -130,10 +135,10 @@ class Deviation:
 
 
 def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
-    """Compare predictions over `N_VIEWS` views, or over the first `N_FIRST_VIEWS` if
-    these are clearly good or clearly bad.
+    """Compare predictions with traced images over several views.
 
-    `compare_view` compares a single view, by its index below `N_VIEWS`.
+    At first over `N_FIRST_VIEWS`; only if these are neither clearly good nor clearly
+    bad, over all `N_VIEWS`. `compare_view` compares a single view, by its index.
     """
     views = [compare_view(index) for index in range(N_FIRST_VIEWS)]
     first = Deviation.from_views(views)
@@ -187,19 +192,20 @@ def compare_with_traced(
 def compute_squared_error(
     image: Tensor, halves: Sequence[Tensor], mask: Tensor | None = None
 ) -> float:
-    """Return the mean squared error of an image without the noise of its reference.
+    """Return the mean squared error of an image, without the noise of its reference.
 
-    The mean product of the differences to two traced images of independent noise is the
-    squared error without their noise, which a square would count. They are traced
-    without the denoiser, which leaves marks of its own in every image.
+    There are two reference images with independent noise. The product of the
+    differences to both has the squared error as its mean, while the noise cancels; in
+    the square of one difference it would count. They are traced without the denoiser,
+    which leaves marks of its own in every image.
 
     Args:
         image: (H, W, 3) image.
-        halves: two traced images (H, W, 3).
+        halves: the two reference images (H, W, 3).
         mask: (H, W) mask of the pixels that count; all do if None, or if it is empty.
 
     Returns:
-        The error in levels of 255, squared.
+        The error in levels of 255, squared; below 0 by chance where it is small.
     """
     first, second = halves
     products = (image - first) * (image - second)

@@ -48,10 +48,10 @@ MAX_SOBOL_DIM = 64  # coordinates of a condition up to which conditions are stra
 
 
 def sample_condition(domain: Domain, index: int, seed: int) -> Tensor:
-    """Return the condition (d,) with an index, far from those before it.
+    """Return the condition (d,) with an index, one of evenly spread ones.
 
-    By itself it is as likely as any other: a point of a scrambled Sobol sequence, or an
-    independent sample where the sequence cannot be used.
+    Each is as likely as any other. They are points of a scrambled Sobol sequence, or
+    independent samples where the sequence cannot be used.
     """
     has_l2_block = any(block.norm == "l2" for block in domain.blocks)
     if domain.dim > MAX_SOBOL_DIM or has_l2_block:
@@ -67,9 +67,10 @@ def sample_condition(domain: Domain, index: int, seed: int) -> Tensor:
 def _compare_means(
     bank_objectives: Sequence[float], unseen_objectives: Sequence[float]
 ) -> tuple[float, float]:
-    """Return the difference of the mean objectives, and its standard error.
+    """Return the difference of two mean objectives, and its standard error.
 
-    It is over 0 where conditions that are not in the bank are better for the model.
+    The difference is over 0 if the search does better under conditions of the bank than
+    under unseen ones: then it has adapted to the bank.
     """
     bank_mean = statistics.fmean(bank_objectives)
     gap = bank_mean - statistics.fmean(unseen_objectives)
@@ -148,7 +149,11 @@ class Bank(PredictedSearch):
         self._fill(0, tick)
 
     def replay(self, query: Query) -> None:
-        """Compare where that is due, and make the matrices that exist by then."""
+        """Bring the bank to the state in which a query is evaluated.
+
+        At every `COMPARISON_INTERVAL`-th query of a search it is compared with unseen
+        conditions. Then all matrices are made that it has by that query.
+        """
         if query.kind == "search" and query.phase == "search":
             self._latest_step = query.number
             if query.number and query.number % COMPARISON_INTERVAL == 0:
@@ -181,10 +186,10 @@ class Bank(PredictedSearch):
         return replace(evaluation, predicted=1)
 
     def _choose_conditions(self, kind: str, index: int) -> list[Condition]:
-        """Return the conditions of an evaluation: those that are new since the one
-        before, and random others of the bank.
+        """Return the conditions under which a query is evaluated.
 
-        The ranking has none that are new since the search ended.
+        They are those that are new in the bank since the query before, and random
+        others. While configurations are ranked, after the search, none is new.
         """
         count = min(self.problem.n_draws, len(self._conditions))
         previous_index = index - 1 if kind == "search" else self._latest_step
@@ -202,7 +207,10 @@ class Bank(PredictedSearch):
     def _sample(
         self, conditions: Sequence[Condition], count: int, stream: str, index: int
     ) -> list[Condition]:
-        """Return random conditions, each once."""
+        """Return `count` random conditions out of some, none of them twice.
+
+        The random numbers are those of a stream and an index.
+        """
         generator = torch.Generator().manual_seed(
             seeds.stream(self.problem.seed, stream, index)
         )
@@ -210,7 +218,12 @@ class Bank(PredictedSearch):
         return [conditions[position] for position in order[:count]]
 
     def _predict_images(self, conditions: Sequence[Condition], u: Tensor) -> Tensor:
-        """Return predicted images (n, H, W, 3) of u (d,), with a graph."""
+        """Return predicted images (n, H, W, 3) of u (d,) under conditions, with a
+        graph.
+
+        If the searched controls alone set all inputs of the matrix, these are computed
+        once for all conditions.
+        """
         inputs = self.problem.searched_space.inputs(u)
         images = []
         for condition in conditions:
@@ -234,13 +247,14 @@ class Bank(PredictedSearch):
             return self._image_renderer(self.problem.add_conditions(u))
 
     def _bank_size(self, index: int) -> int:
-        """Return how many conditions are collected by the evaluation with an index.
+        """Return how many conditions the bank has had by the evaluation with an index.
 
-        The bank grows from the start, and from each comparison in `growth_steps`, until
-        the next comparison; but not in the second half of a search. While it grows,
-        each evaluation adds one condition for every `DRAWS_PER_CONDITION` that it
-        draws.
+        It begins with `INITIAL_CONDITIONS` for each draw. It grows from the start on,
+        and again from each comparison in `growth_steps`, until the next comparison: by
+        one condition for every `DRAWS_PER_CONDITION` draws. In the second half of a
+        search it does not grow.
         """
+        # no growth in the second half
         index = min(index, self.steps // 2 - 1)
         n_growing_steps = 0
         for begin in (0, *self.growth_steps):
@@ -250,14 +264,17 @@ class Bank(PredictedSearch):
         return n_initial + n_growing_steps * draws // DRAWS_PER_CONDITION
 
     def _make_query(self, number: int) -> Query:
-        """Return the query for the light of the condition with an index.
+        """Return the query that collects the light of the condition with an index.
 
-        The light is collected at the configuration where the search was when the bank
-        began to grow for the last time before that condition; at the start before any.
+        Light is collected at one configuration: where the search was when the bank last
+        began to grow before this condition, or at the start.
         """
         assert self.problem.conditions is not None
         starts = [
-            begin for begin in self.growth_steps if self._bank_size(begin - 1) <= number
+            # comparisons after which this condition was added
+            begin
+            for begin in self.growth_steps
+            if self._bank_size(begin - 1) <= number
         ]
         u = self._grown_at[starts[-1]] if starts else self.problem.domain.start
         bank_seed = seeds.stream(self.problem.seed, "bank")
@@ -266,11 +283,11 @@ class Bank(PredictedSearch):
         return Query(torch.cat([u, condition]), seed, spp=SPP, product="light")
 
     def _fill(self, index: int, tick: ProgressCallback = lambda samples: None) -> None:
-        """Make the matrices of all conditions up to an evaluation, the newest last.
+        """Make the matrices of all conditions that the bank has by an evaluation.
 
         The light of all conditions up to the next comparison is requested at once, so
-        that workers can collect it in parallel. The oldest matrices are dropped if
-        memory is short.
+        that workers collect it in parallel. The oldest matrices are dropped when they
+        take more than `MAX_BYTES`. `tick` is called with the samples of each condition.
         """
         size = self._bank_size(index)
         first = self._conditions[-1].index + 1 if self._conditions else 0
@@ -306,6 +323,7 @@ class Bank(PredictedSearch):
         self.n_traced += 1
         with torch.no_grad():
             searched_inputs = self.problem.searched_space.inputs(query.u[:dim])
+        # whether the searched controls alone set all inputs of the matrix
         depends_on_searched_only = True
         for name, value in renderer.linearized_at.items():
             if name not in searched_inputs or not torch.equal(
@@ -359,9 +377,11 @@ class Bank(PredictedSearch):
         """Return the objectives of u (d,) under conditions that are not in the bank."""
         objectives = []
         for index in range(N_COMPARED):
-            draw = seeds.stream(seed, "draw", index)
+            draw_seed = seeds.stream(seed, "draw", index)
             evaluation, _ = self.problem.evaluate_full(
-                Query(u, draw), self.problem.add_conditions(u, draw), draw
+                Query(u, draw_seed),
+                self.problem.add_conditions(u, draw_seed),
+                draw_seed,
             )
             objectives.append(evaluation.objective)
         return objectives

@@ -103,6 +103,7 @@ class ParallelEvaluator:
         items: list[WorkItem] = [
             (self.key, self.problem.preparation, query) for query in queries
         ]
+        # by identity: workers return the same objects
         index_of_item = {id(item): index for index, item in enumerate(items)}
         # evaluations that came before those of earlier queries
         waiting = dict[int, Evaluation]()
@@ -131,6 +132,7 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
 
     def call(items: Sequence[WorkItem]) -> list[Evaluation]:
         evaluations = list[Evaluation]()
+        # queries of one problem follow one another
         for key, group in groupby(items, lambda item: item[0]):
             items_of_problem = list(group)
             # All are sent together, so that they have the same preparation.
@@ -179,7 +181,8 @@ def check_digests(
 ) -> None:
     """Store the digests of networks and functions, or check those of a resumed run.
 
-    A model behind an address stores its answers in the run.
+    A model behind an address has none: its answers are stored in the run instead.
+    Functions are by name; None stands for one that was not given.
 
     Raises:
         InputError: a network or a function is not the one that the run began with.
@@ -233,6 +236,7 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
     unwrapped: Any = inspect.unwrap(function)
     unwrapped = getattr(unwrapped, "__func__", unwrapped)
     arrays: list[Any] = []
+    # an object that is called as a function
     if not hasattr(unwrapped, "__code__"):
         attributes = sorted(getattr(unwrapped, "__dict__", {}).items())
         simplified = [(name, _simplify(value)) for name, value in attributes]
@@ -253,7 +257,10 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
 
 
 def _simplify_code(code: CodeType, docstring: str | None = None) -> tuple[Any, ...]:
-    """Return what a function does, without its name, place and docstring."""
+    """Return the code of a function in a form whose repr is the same in every process.
+
+    Its name, its place in the file and its docstring are left out.
+    """
     constants = [
         _simplify_code(constant)
         if isinstance(constant, CodeType)
@@ -338,11 +345,12 @@ class Journal:
     ) -> Iterator[Evaluation]:
         """Yield the evaluations of queries in their order, from the store or new ones.
 
-        New evaluations are stored.
+        New evaluations are stored before they are yielded.
 
         Args:
             queries: in order.
-            evaluate: evaluates those that are not stored; None for `traced`.
+            evaluate: evaluates those that are not stored; None for the journal's own
+                evaluator.
             on_replay: called with every query of a search that is read from the store.
         """
         stored = [self._read(query) for query in queries]
@@ -352,6 +360,7 @@ class Journal:
             if evaluation is None
         ]
         evaluate = self.evaluator if evaluate is None else evaluate
+        # lazy: each is computed when it is asked for below
         new_evaluations = iter(evaluate(new_queries))
         for query, evaluation in zip(queries, stored, strict=True):
             started = time.perf_counter()
@@ -366,7 +375,11 @@ class Journal:
             yield evaluation
 
     def _trials_of(self, kind: str) -> dict[int, Evaluation]:
-        """Return the trials of a kind by their numbers, stored ones included."""
+        """Return the trials of a kind by their numbers; the stored ones are read at
+        first use.
+
+        Trials that were lost are counted then.
+        """
         if kind in self._trials:
             return self._trials[kind]
         rows: Iterable[Row] = ()
@@ -376,6 +389,7 @@ class Journal:
         for row in rows:
             # Rows of old runs may have no judgement.
             if row.correct is not None:
+                # a predicted image has no seed; its count of samples is stored as spp
                 predicted = 0 if row.seed is not None else row.spp or 1
                 trials[row.step] = Evaluation.from_judgement(
                     read_judgement(row), predicted=predicted
@@ -390,9 +404,9 @@ class Journal:
     def _read(self, query: Query) -> Evaluation | None:
         """Return the stored evaluation of a query; None if there is none.
 
-        A query without a phase is one of the trials that are kept here, any other is
-        read from the run's files. The renderer counts non-finite values again that
-        were stored with it.
+        A query without a phase is a trial, any other belongs to a search. As a side
+        effect the renderer counts the non-finite values that were stored with the
+        evaluation.
 
         Raises:
             InputError: the stored evaluation is one of another configuration.
@@ -474,7 +488,11 @@ class Journal:
         return rows
 
     def _note_machine(self, name: str | None) -> None:
-        """Store the description of a machine that is not like this one, once."""
+        """Store the description of a machine that differs from this one, at its first
+        row.
+
+        `name` is None for machines that are like this one.
+        """
         if name is None or name in self.machines:
             return
         stats = self.evaluator.worker_stats
@@ -485,7 +503,10 @@ class Journal:
         self.set_note(MACHINES_NOTE, self.machines)
 
     def _row_of_trial(self, query: Query, evaluation: Evaluation) -> Row:
-        """Return the row of a trial."""
+        """Return the row of a trial.
+
+        With random conditions the row has their values, too.
+        """
         values = dict(query.values)
         if query.draws_conditions:
             values |= self.problem.describe_conditions(query.u, query.seed)
@@ -549,9 +570,10 @@ class Journal:
     ) -> Callable[[int], bool] | None:
         """Return a function that tells whether the time of a search is over.
 
-        The time before the run was resumed counts. An evaluation that is read from the
-        store never ends the search before the one after which it was ended; if the
-        store has renders of the ranking, that is the last one before these.
+        It takes the number of evaluations so far. Time that was spent before the run
+        was resumed counts. Evaluations that are read from the store take no time, and
+        never end the search before the last of them. If the store has renders of the
+        ranking already, the search had ended by then, and ends there again.
 
         Args:
             kind: of the search.

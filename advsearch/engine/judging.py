@@ -63,9 +63,9 @@ MAIN = "__main__"
 
 
 def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
-    """Return metrics as a file names them: "package.module:function".
+    """Return metrics by name as a file states them: "package.module:function".
 
-    A function that cannot be named so has its bare name.
+    A function that cannot be imported so has its bare name.
 
     Raises:
         InputError: no mapping of functions, a function with other parameters, or a name
@@ -125,6 +125,7 @@ def list_session_only_metrics(settings: Mapping[str, str]) -> list[str]:
 
 def check_metrics_importable(settings: Mapping[str, str]) -> None:
     """Raise InputError for a metric that workers could not import."""
+    # the first of them is an error
     for name in list_session_only_metrics(settings):
         bare_name = settings[name].rpartition(":")[2]
         raise InputError(
@@ -279,7 +280,7 @@ def add_metrics(
 def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
     """Return output and truth of the only image of a batch, as a metric gets them.
 
-    Of several models both are tuples, with an item for each model.
+    For several models both are tuples with one item for each model.
     """
     first_output = output[0]
     if isinstance(first_output, (tuple, list)):
@@ -297,7 +298,8 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
 def mean_metrics(judgements: Sequence[Judgement]) -> dict[str, float | None] | None:
     """Return the mean of each metric over the images for which it is a number.
 
-    A metric that is a number for none is None; without any metric the result is None.
+    The mean is None if it is a number for no image; without any metric the result is
+    None.
     """
     values_by_name: dict[str, list[float]] = {}
     for judgement in judgements:
@@ -329,10 +331,10 @@ def calibrate_task(
     judge: str,
     image_settings: Mapping[str, Any],
 ) -> Task:
-    """Return the task, calibrated by what its model predicts of clean images.
+    """Return the task, calibrated by what its model predicts on clean images.
 
-    The next scene is rendered where those before leave open how predictions are to be
-    read. A task that does not calibrate is returned as it is.
+    Scenes are rendered in turn until it is clear how predictions are to be read. A task
+    that does not calibrate is returned as it is.
 
     Args:
         task: of the model.
@@ -381,6 +383,7 @@ def check_truth(
             first predictions of a clean image.
     """
     try:
+        # each thing that is judged, or else the only one
         for facts_of_thing in facts.each.values() or (facts,):
             task.check(facts_of_thing)
     except InputError as error:
@@ -412,7 +415,7 @@ def check_truth(
 def find_label_warnings(
     models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]
 ) -> list[str]:
-    """Return a warning if a label for all objects is another class than their own.
+    """Return a warning if a label for all objects is another class than that of some.
 
     Args:
         models: with names of classes.
@@ -458,7 +461,7 @@ def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> b
 def make_domain(
     controls: Sequence[Control], start: Tensor | None = None, **more: Any
 ) -> Domain:
-    """Return the domain of a search over some controls: the budgets of their groups.
+    """Return the domain of a search over some controls: a block for each group.
 
     Args:
         controls: in the order of u.
@@ -614,6 +617,7 @@ def mean_variation(colors: Tensor) -> Tensor:
     squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
     squared = squared_right + squared_down
     # clamped, since the square root has no derivative at 0
+    # minus the smallest length, so that an even color has none
     length = squared.clamp(min=MIN_COLOR_STEP**2).sqrt() - MIN_COLOR_STEP
     if is_masked:
         length = length[mask[..., 0] > 0.0]
@@ -632,6 +636,7 @@ def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
         colors = colors[colors[..., 3] > 0][:, None, :3]
     fixed_colors = colors.detach()
     if palette is None:
+        # of the grid: rounded to its steps
         nearest = (
             MIN_PRINTABLE
             + PRINTABLE_STEP * ((fixed_colors - MIN_PRINTABLE) / PRINTABLE_STEP).round()
@@ -672,9 +677,10 @@ def measure_print_terms(space: Space, u: Tensor) -> PrintTerms:
 def subtract_print_penalty(
     evaluation: Evaluation, space: Space, u: Tensor
 ) -> Evaluation:
-    """Return an evaluation of u (d,) minus both weighted print terms.
+    """Return an evaluation of u (d,) from which both weighted print terms are
+    subtracted.
 
-    They are subtracted from its objective, and their derivative from its gradient.
+    That is from its objective; their derivative is subtracted from its gradient.
     """
     variable_u = u.detach().clone().requires_grad_()
     with torch.enable_grad():
@@ -761,11 +767,12 @@ def make_objective(
 def reduce_objectives(
     objectives: Sequence[Objective], reduction: EnsembleReduction
 ) -> Objective:
-    """Return the objective of several models: the mean of theirs, or the smallest.
+    """Return the objective of several models: the mean or the smallest of theirs.
 
-    With "worst" the model that is hardest to mislead is the one that counts, so that
-    the maximum is over 0 only where every model is misled. The mean may be large
-    because of one model; its gradient reaches all of them.
+    With "worst" it is the smallest: the model that is hardest to mislead counts, and
+    the objective is over 0 only where every model is misled. The mean may be large
+    because of one model; but its gradient reaches all of them. Arguments of the
+    returned function are tuples with an item for each model.
     """
 
     def objective(

@@ -160,6 +160,7 @@ class Scene:
         return Scene(add_lamps(with_requested_ground(relit)), self.is_session_only)
 
     def __getattr__(self, name: str) -> Any:
+        """Explain what takes the place of `render`; called for missing attributes only."""
         if name == "render":
             raise AttributeError(
                 "a scene has no `render`: advsearch.render(scene) makes a picture and "
@@ -170,6 +171,7 @@ class Scene:
         raise AttributeError(f"'Scene' object has no attribute {name!r}")
 
     def __repr__(self) -> str:
+        """Return the names of object and environment, and the fixed parameters."""
         description = self.description
         fixed = "".join(
             f", {name}={value!r}"
@@ -321,7 +323,7 @@ def load_scene(
 def _check_no_photograph(
     fixed_values: SettingValues, occluder: str | Path | None
 ) -> None:
-    """Raise InputError for what says something of a photograph where there is none."""
+    """Raise InputError for settings of a photograph in a scene that has none."""
     stated = [name for name in fixed_values if name in PHOTOGRAPH_SETTINGS]
     if occluder is not None:
         stated.append("occluder")
@@ -383,7 +385,11 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
 
 
 def _camera_setting(description: SceneDescription) -> str | None:
-    """Return the `camera` setting of a scene; None for the pinhole that orbits."""
+    """Return how the `camera` setting states a scene's camera.
+
+    It is the first of these that there is: a rig, a preset, a lens, a camera of the
+    scene file; None for the pinhole that orbits.
+    """
     if description.rig:
         return description.rig_spec
     if description.preset:
@@ -399,13 +405,16 @@ def fit_camera(
 ) -> SceneDescription:
     """Return the scene with its camera fitted to a picture size.
 
+    Its aspect becomes that of the picture. Bundled lenses are made for it, and
+    raindrops get a camera model. In a photograph the photograph's own size decides.
+
     Args:
         description: the scene.
         resolution: side, or (height, width), in pixels.
 
     Raises:
-        InputError: several cameras and drops on a lens; or the scene is rendered into
-            a photograph of another shape.
+        InputError: several cameras and drops on a lens; or the scene is rendered into a
+            photograph of another shape.
     """
     height, width = _height_and_width(resolution)
     aspect = width / height
@@ -547,9 +556,15 @@ def choose_moments(
 ) -> tuple[Moment, ...]:
     """Return the moments of an exposure at which an image is rendered.
 
-    There are enough of them that no point moves far in the image between two moments
-    (`MOMENTS_PER_PIXEL`), and that a flashing light is on in some and off in others;
-    at least `MIN_MOMENTS` and at most `MAX_MOMENTS`. `height` is in pixels.
+    There are so many that no point moves far in the image between two of them
+    (`MOMENTS_PER_PIXEL`), and that a flashing light is on in some and off in others; at
+    least `MIN_MOMENTS` and at most `MAX_MOMENTS`.
+
+    Args:
+        space: whose controls state the exposure.
+        motion: projects points of the scene into the image.
+        assembly: turns the inputs of the space into those of the scene.
+        height: of the image in pixels.
     """
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)
@@ -568,10 +583,11 @@ def choose_moments(
 def _measure_max_motion(
     space: Space, motion: Motion, assembly: Assembly, duration: float
 ) -> float:
-    """Return how many pixels a point moves at most in a duration in seconds.
+    """Return how many pixels a point of the image moves at most in some seconds.
 
     It is measured on `N_MOTION_SAMPLES` random configurations of the controls that
-    move, on points that are visible before and after.
+    move, from half the duration before to half after, on points that are visible at
+    both ends.
     """
     moving_controls = tuple(
         control for control in space.controls if any(control.exposure)
@@ -602,11 +618,13 @@ def _measure_max_motion(
 def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
     """Return settings by name, as a file holds them, for controls in any form.
 
-    A control that is named has the settings that the caller stated; an instance has all
-    of its settings.
+    An instance of a control is written with all of its settings. Otherwise a control
+    has the settings that the caller stated.
     """
     control_by_name = normalize_controls(controls)
     if not isinstance(controls, Mapping):
+        # only checks them: a name may be unknown. Settings of a mapping are checked
+        # when controls are made.
         make_controls(control_by_name)
     return {
         name: control.to_settings() if isinstance(control, Control) else dict(control)
@@ -629,6 +647,7 @@ def make_controls(controls: Controls) -> tuple[Control, ...]:
             named_settings[name] = {}
         else:
             named_settings[name] = control
+    # several names may state parameters of one control
     settings_by_control = merge_control_settings(named_settings)
     for name in instances:
         if settings_by_control[name]:
@@ -643,7 +662,9 @@ def make_controls(controls: Controls) -> tuple[Control, ...]:
 
 
 def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
-    """Return instances and settings by name, in the caller's order.
+    """Return controls in any form by name: an instance, or settings.
+
+    They have the caller's order.
 
     Raises:
         InputError: something else than names, settings and instances, or a name that
@@ -659,6 +680,7 @@ def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, o
         if isinstance(control, Control)
     }
     all_settings = check_control_settings(
+        # an instance counts as no settings here, and is put back below
         {**control_by_name, **dict.fromkeys(instances)}
     )
     return {
@@ -668,7 +690,7 @@ def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, o
 
 
 def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
-    """Return the controls of a mapping with Python distributions as settings.
+    """Return the controls of a mapping by name, with Python distributions as settings.
 
     Raises:
         InputError: a class, or an instance under another name than its own.
@@ -686,6 +708,7 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
             )
         if isinstance(control, Control):
             control_by_name[name] = control
+        # a mapping with such a key is the value of one parameter
         elif isinstance(control, Mapping) and not control.keys() & SINGLE_VALUE_KEYS:
             control_by_name[name] = {
                 key: distribution_to_setting(value) for key, value in control.items()

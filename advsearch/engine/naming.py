@@ -103,15 +103,13 @@ def list_imported_code(
 def load_models(
     models: Sequence[Any], task: Task, config: SceneConfig
 ) -> tuple[tuple[Model, ...], list[str]]:
-    """Load the models of a configuration.
-
-    From here on the process has the number of threads that the configuration states.
+    """Load the models of a configuration, and set its number of threads.
 
     Args:
         models: names, or models that a Python caller passed.
         task: of the models. Several tasks (`EnsembleTask`) are for one model each, and
             these models are joined into one.
-        config: has their labels, prompt, range of values and camera.
+        config: has their labels, prompt, range of values, camera and number of threads.
 
     Returns:
         The models, and their warnings as sentences of the run.
@@ -131,6 +129,7 @@ def load_models(
             f"model: expected {len(tasks)}, one for each task, got {len(models)}"
         )
     with warnings.catch_warnings(record=True) as caught:
+        # each of them, also one that was issued before
         warnings.simplefilter("always", ModelWarning)
         loaded = tuple(
             _load_for_task(
@@ -156,8 +155,8 @@ def _load_for_task(
 ) -> Model:
     """Load one model for its task.
 
-    One of several tasks gets the labels of the configuration only where it takes labels
-    and has no names of its own.
+    The labels and the prompt of the configuration are for the only task, or, of
+    several, for each one that takes labels and has no names of its own.
     """
     single_image_task = task.single_image_task
     labels = None
@@ -203,7 +202,9 @@ def _check_task_of_rig(task: Task, camera: str, n_cameras: int) -> None:
 
 
 def _check_n_images(model: Model) -> None:
-    """Raise InputError if a model takes another number of images than are rendered."""
+    """Raise InputError if a model takes another number of images than there are
+    cameras.
+    """
     module = model.module
     if isinstance(module, AllAtOnce) and module.cameras != model.cameras:
         verb = "is" if model.cameras == 1 else "are"
@@ -316,9 +317,9 @@ without such a setting counts as one that does not state it.
 def make_configured_controls(
     config: SceneConfig, controls: Controls, *, are_searched: bool = True
 ) -> tuple[Control, ...]:
-    """Return control instances with the run's settings where they state none.
+    """Return control instances; settings of the run complete what they do not state.
 
-    Controls that are not searched, but vary by chance, have no budget.
+    Controls that vary by chance (not `are_searched`) get no epsilon.
 
     Raises:
         InputError: a control that was passed as an instance would take a setting of the
@@ -357,7 +358,10 @@ def _check_takes_no_run_setting(config: SceneConfig, control: Control) -> None:
 def _run_settings_of(
     config: SceneConfig, qualified_name: str, control_settings: Mapping[str, object]
 ) -> dict[str, object]:
-    """Return what a control takes of the run's settings, by its own names for them."""
+    """Return those settings of the run that a control takes, by its own names for them.
+
+    A setting of the run may be a mapping by the names of controls.
+    """
     run_settings: dict[str, object] = {}
     for choice in _list_choices(qualified_name, control_settings) or ():
         value = getattr(config, choice.run_setting, None)
@@ -400,7 +404,8 @@ def select_run_settings(
 def check_run_settings(config: SceneConfig) -> None:
     """Check that every setting of a run is taken by one of its controls.
 
-    Controls that vary by chance have no epsilon.
+    An epsilon is looked for among the searched controls only: those that vary by chance
+    have none.
 
     Raises:
         InputError: no control takes a setting, or the one that it names does not.
@@ -436,7 +441,11 @@ def _check_named_controls(
     controls: Mapping[str, Mapping[str, object]],
     rejecting_kinds: Mapping[str, str],
 ) -> None:
-    """Check the controls that a setting names: they are there, and take it."""
+    """Check that the controls which a setting names exist, and take it.
+
+    `rejecting_kinds` has the kinds of the controls that do not take the setting. Raises
+    UnknownNameError or InputError.
+    """
     qualified_names = {
         parse_control_name(qualified_name, control_settings)[1]: qualified_name
         for qualified_name, control_settings in controls.items()
@@ -478,7 +487,9 @@ def _list_active_choices(
 ) -> list[Choice]:
     """List the choices of a control that have an effect with these settings.
 
-    A choice that bounds a parameter has none where that parameter is not searched.
+    A choice may bound one parameter. It has no effect if that parameter is not
+    searched: it is set to a number, another choice fixes it, or it has no default range
+    and none is set.
     """
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None

@@ -157,9 +157,10 @@ class Problem:
 
     @plan.setter
     def plan(self, plan: GradientPlan) -> None:
-        """Set the plan of the gradient, without derivatives by the conditions.
+        """Set the plan of the gradient.
 
-        The cost of the domain is updated.
+        Conditions are not differentiated. `domain` and `conditions` are made anew,
+        since the cost of a gradient depends on the plan.
         """
         controls = self.space.controls
         n_searched = len(controls) if self.n_searched is None else self.n_searched
@@ -214,10 +215,10 @@ class Problem:
     # ---- pictures
 
     def add_conditions(self, u: Tensor, draw_seed: int | None = None) -> Tensor:
-        """Return the full configuration: u (d,), and conditions behind it.
+        """Return the full configuration: u (d,), followed by conditions.
 
-        `draw_seed` is the seed of the conditions; without, they are those that leave
-        the scene unchanged.
+        With a `draw_seed` they are sampled; without, they are those that leave the
+        scene unchanged.
         """
         if self.conditions is None:
             return u
@@ -288,6 +289,7 @@ class Problem:
             judged = self._judge_outputs(output, images, truths, full_configurations)
         judgements_without_objective = []
         for judgement in judged:
+            # without the objective, and with NaN for a margin that is not finite
             plain = Judgement.of(
                 judgement.score,
                 judgement.margin,
@@ -306,7 +308,12 @@ class Problem:
         truths: Sequence[Truth],
         full_configurations: Sequence[Tensor],
     ) -> list[Judgement]:
-        """Judge images (N, H, W, 3) by task and metrics, with what each thing shows."""
+        """Judge a model's output for images (N, H, W, 3) by task and metrics.
+
+        If other things stand beside the object, payloads get what is visible of each.
+        That is rendered once for all configurations that differ in colors alone, and
+        cached.
+        """
         judged = list(judge_images(self.task, output, pictures, truths, self.metrics))
         if self.space.scene is None or not self.space.scene.things:
             return judged
@@ -342,6 +349,7 @@ class Problem:
         dim = self.domain.dim
         with torch.no_grad():
             predicted = predict(full_u)
+            # the start of the search, under the same conditions
             start = torch.cat([self.domain.start, full_u[dim:]])
             if is_random is not None:
                 start[:dim][is_random] = full_u[:dim][is_random]
@@ -408,6 +416,7 @@ class Problem:
         facts = replace(facts, views=tuple(camera_facts))
         truth = self.task.truth(facts)
         is_cacheable = not stated_values and len(geometric_u) <= MAX_CACHED_COORDINATES
+        # `numbers` is a cached property: it is there if the task has read it
         if is_cacheable and "numbers" not in vars(facts):
             _add_to_cache(self._truths, key, truth)
         return truth
@@ -464,8 +473,9 @@ class Problem:
     def _compute_step_in_unit(self, group: Group) -> tuple[float | None, str]:
         """Return the step of a single coordinate in its parameter's unit, and the unit.
 
-        It is measured in the middle of the range. (None, "") for a group of several
-        coordinates, without a step, or whose value is no number.
+        It is half the difference of the values one step above and below the middle of
+        the range. (None, "") for a group of several coordinates, without a step, or
+        without a number as its value.
         """
         if not group.step_reason or group.size != 1:
             return None, ""
@@ -499,7 +509,8 @@ class Problem:
     ) -> Iterator[Evaluation]:
         """Evaluate queries lazily, in their order.
 
-        `preparation` is what another process has prepared the same problem with.
+        `preparation` has the plan, sample count and depth that another process has
+        found for the same problem; they are set first.
         """
         if preparation is not None:
             self.spp = preparation.spp
@@ -545,7 +556,11 @@ class Problem:
         )
 
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
-        """Evaluate a query of a search: the mean over conditions that are drawn."""
+        """Evaluate a query of a search by its mean over sampled conditions.
+
+        Each condition has its own image. The image of the evaluation, if one is wanted,
+        is that without conditions.
+        """
         condition_seeds = [
             seeds.stream(query.seed, "draw", index) for index in range(self.n_draws)
         ]
@@ -686,7 +701,7 @@ class Problem:
         u: Tensor,
         gradient: WhichGradient,
     ) -> tuple[list[tuple[Evaluation, Output]], Tensor | None]:
-        """Evaluate several images in one batch of the model.
+        """Evaluate several images of one u in one batch of the model.
 
         Args:
             render: from u (d,) to images (N, H, W, 3), with a graph.
@@ -695,9 +710,9 @@ class Problem:
             gradient: whether a derivative is computed.
 
         Returns:
-            An evaluation without derivative and the model's output for each image, and
+            For each image an evaluation without derivative and the model's output; and
             the derivative (d,) of the sum of their objectives, weighted by
-            `compute_condition_weights`.
+            `compute_condition_weights`, or None.
         """
         variable_u = u.detach().clone().requires_grad_(bool(gradient))
         with torch.set_grad_enabled(bool(gradient)):
@@ -706,6 +721,7 @@ class Problem:
             outputs_of_images = _split_batch(outputs, len(full_configurations))
             truths = [self.find_truth(full_u) for full_u in full_configurations]
             variable_configurations = [
+                # an objective may ask for the configuration itself
                 torch.cat([variable_u, full_u[len(variable_u) :]])
                 for full_u in full_configurations
             ]
@@ -830,8 +846,9 @@ class Problem:
     ) -> Judgement:
         """Return the judgement over several conditions.
 
-        Where each condition has a truth of its own, scores are averaged; else the task
-        judges the average of the outputs.
+        If the truth varies with the conditions, scores and margins are averaged, and
+        the most frequent prediction is taken; otherwise the task judges the average of
+        the outputs.
         """
         if self.task.varies:
             usual = most_frequent_judgement(judged)
@@ -851,13 +868,14 @@ class Problem:
 
 
 def compute_condition_weights(values: Tensor) -> Tensor:
-    """Return weights (n,) of conditions in a derivative, by their objectives (n,).
+    """Return the weights (n,) of conditions in a derivative, for their objectives (n,).
 
-    The smaller the objective of a condition is, the larger is its weight. The mean
-    weight is 1. The mean of all objectives would be raised most easily where the
-    prediction is wrong already. Weights of exp(-z), where z is the objective in
-    standard deviations, raise it where that is not so (Li et al. 2021, *Tilted
-    Empirical Risk Minimization*, section 2, with a tilt of the opposite sign).
+    They are proportional to exp(-z), where z is the objective in standard deviations,
+    with a mean of 1: the smaller the objective, the larger the weight. With equal
+    weights the mean objective would be raised where that is easiest, where the
+    prediction is wrong already (Li et al. 2021, *Tilted Empirical Risk Minimization*,
+    section 2, with a tilt of the opposite sign). All are 1 if the objectives are equal,
+    or not finite.
     """
     objectives = values.detach()
     spread = objectives.new_zeros(())

@@ -120,14 +120,14 @@ def make_trial_row(
     *,
     has_success: bool = True,
 ) -> Row:
-    """Return the row that the store has of a trial.
+    """Return the row of a trial in the store.
 
     Args:
         kind: of the row.
         number: of the trial among those of the kind.
         seed: of the noise; None for a predicted image.
         spp: samples per pixel.
-        judgement: its judgement.
+        judgement: of its image.
         values: of the configuration.
         has_success: whether a search seeks some prediction; else the row has no
             success.
@@ -167,9 +167,9 @@ def _none_if_nan(value: float | None) -> float | None:
 
 
 def read_judgement(row: Row) -> Judgement:
-    """Return the judgement that a row has.
+    """Return the judgement that a row has, the inverse of `add_judgement`.
 
-    A row without a label is of an output that was not a number.
+    A row without a label is that of an output that was not a number.
     """
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(
@@ -196,15 +196,17 @@ def make_verified_rate(verification: Verification) -> VerifiedRate:
 def make_rate(
     counts: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]
 ) -> VerifiedRate:
-    """Return a rate as a result stores it.
+    """Return a rate of success as a result stores it.
 
     Args:
         counts: counts of the trials.
-        trials: those that count; the mean score is over those that are a number.
-        successes: those whose labels are counted.
+        trials: the judgements that count; the mean score is over those that are a
+            number.
+        successes: the judgements whose labels and outcomes are counted.
     """
     labels = Counter(trial.prediction.label for trial in successes)
     # 0.0 - x, and not -x: the mean of zeros is shown as 0 and not as -0.
+    # a margin is the score with the opposite sign
     margin = 0.0 - mean_number(trial.score for trial in trials)
     return VerifiedRate(
         successes=counts.successes,

@@ -187,6 +187,7 @@ class Rendering:
         return self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
 
     def __repr__(self) -> str:
+        """Return the names, the first label of each view, and the size."""
         labels = [
             repr(view.predictions[0].label if view.predictions else None)
             for view in self.views
@@ -363,6 +364,7 @@ def render(
     views = list[View]()
     truth_warnings = list[str]()
     remarks = tuple[str, ...]()
+    # a calibrated task goes on to the next view
     for view_description in _orbit_scene(description, around):
         rendered = _render_view(view_description, model, model_task, settings)
         views.append(rendered.view)
@@ -477,8 +479,9 @@ def _make_view_facts(
     u: Tensor,
     settings: _ViewSettings,
 ) -> Facts:
-    """Return the facts of a configuration (d,), with a view for each camera of a
-    rig.
+    """Return the facts of a configuration (d,).
+
+    For the cameras of a rig, `views` has the facts of each.
     """
     facts, *camera_facts = [
         make_facts(
@@ -518,10 +521,10 @@ def check_judged_thing(description: SceneDescription, judge: str) -> None:
 def list_camera_renders(
     renderer: Renderer, u: Tensor, n_rig_cameras: int
 ) -> list[Callable[[], Surfaces]]:
-    """Return functions that render what is visible at a configuration (d,).
+    """Return functions that render which surfaces are visible at a configuration (d,).
 
-    The first renders the view of the camera; the others those of the `n_rig_cameras` of
-    a rig.
+    The first is for the main camera; one follows for each of the `n_rig_cameras` of a
+    rig. Nothing is rendered until they are called.
     """
     return [
         partial(renderer.surfaces, u),
@@ -557,6 +560,7 @@ def make_facts(
         UnknownNameError: no thing has the name `judge`.
     """
     check_judged_thing(description, judge)
+    # rendered once, however many things ask for it
     cached_look = None if render_surfaces is None else cache(render_surfaces)
 
     def collect_numbers() -> dict[str, float]:
@@ -587,6 +591,7 @@ def make_facts(
     }
     facts_by_mesh = {}
     for mesh, facts in single_facts.items():
+        # of each thing, the facts of all others
         others = tuple(
             other for other_mesh, other in single_facts.items() if other_mesh != mesh
         )

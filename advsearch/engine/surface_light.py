@@ -61,7 +61,13 @@ def find_surface_light_refusal(
 ) -> Refusal | None:
     """Return why light on surfaces does not predict a search; None if it may.
 
-    How far its predictions are off is measured only then.
+    None does not say how good its predictions are, which is measured later.
+
+    Args:
+        problem: of the search.
+        steps: evaluations of the search.
+        policy: by which it searches.
+        specialise: whether anything may be left out or predicted at all.
     """
     if not specialise:
         return Refusal("nothing is left out")
@@ -113,8 +119,11 @@ class SurfaceLight(PredictedSearch):
     _looks: dict[tuple[int, int], list[LitCameraView]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Find which coordinates move cameras, change environments and color
-        surfaces.
+        """Find which coordinates move cameras, change environments and color surfaces.
+
+        `_moving` are the searched coordinates (d,) that move cameras or change the
+        environment, unless they were given; `_needs_new_light` are the conditions'
+        coordinates that need the light to be computed anew.
         """
         problem = self.problem
         space = problem.space
@@ -145,7 +154,11 @@ class SurfaceLight(PredictedSearch):
         self._needs_new_light = self._find_light_conditions()[n_searched:]
 
     def _find_coordinates(self, inputs: frozenset[str]) -> Tensor:
-        """Return which coordinates of the full space change inputs, (d,) bool."""
+        """Return which coordinates of the full space change some inputs, (d,) bool.
+
+        It is known for each control only: all of its coordinates count if any input of
+        `inputs` changes.
+        """
         space = self.problem.space
         changes_inputs = torch.zeros(len(space.start), dtype=torch.bool)
         for group in space.groups:
@@ -155,10 +168,11 @@ class SurfaceLight(PredictedSearch):
         return changes_inputs
 
     def _find_light_conditions(self) -> Tensor:
-        """Return which coordinates of the full space need another light, (d,) bool.
+        """Return which coordinates of the full space need new light, (d,) bool.
 
-        They are those that change the environment, except by a factor of brightness,
-        which is found by comparing two maps of different coordinates.
+        They are those that change the environment in more than its brightness. For the
+        conditions two maps at different coordinates are compared: if one is a multiple
+        of the other, the same light serves both.
         """
         problem = self.problem
         needs_new_light = self._find_coordinates(frozenset({ENVIRONMENT_INPUT}))
@@ -168,6 +182,7 @@ class SurfaceLight(PredictedSearch):
         for group in problem.space.groups:
             if bool(needs_new_light[group.coordinates].all()):
                 lower = start.clone()
+                # two values within the range, off its ends
                 lower[group.coordinates] = 0.3
                 upper = start.clone()
                 upper[group.coordinates] = 0.8
@@ -209,8 +224,10 @@ class SurfaceLight(PredictedSearch):
         return super().count_predicted(kind, evaluations)
 
     def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
-        """Compute the light under every condition of the bank, and compare its
+        """Compute the light under every condition of the bank, and compare its first
         images.
+
+        `tick` is called with what each light counts in the progress, `N_LIGHTS` in all.
         """
         problem = self.problem
         u = problem.domain.start if self.light_u is None else self.light_u
@@ -249,9 +266,9 @@ class SurfaceLight(PredictedSearch):
     ) -> Iterator[Evaluation]:
         """Evaluate queries of a search, or trials, in their order.
 
-        `trace` evaluates all queries from the first that is not predicted. Images are
-        predicted in batches if neither conditions nor colors vary: then they depend on
-        nothing that an evaluation might change.
+        Once a query cannot be predicted, it and all after it are evaluated by `trace`.
+        Images are predicted in batches if neither conditions nor colors vary: then they
+        do not depend on the evaluations before.
         """
         # images of queries that were predicted in one batch, by position
         predicted_images: dict[int, Tensor] = {}
@@ -308,9 +325,12 @@ class SurfaceLight(PredictedSearch):
         )
 
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
-        """Evaluate a query of a search: the mean over conditions."""
+        """Evaluate a query of a search by its mean over conditions, whose images are
+        predicted.
+        """
         problem = self.problem
-        # Conditions of a random search are used in turn, with what their cameras see.
+        # a random search uses few sets of conditions in turn, for which what cameras
+        # see is stored
         reuses_conditions = (
             query.kind == "baseline"
             and problem.conditions is not None
@@ -323,6 +343,7 @@ class SurfaceLight(PredictedSearch):
         ]
 
         def predict(batch: slice, u: Tensor) -> Tensor:
+            # under which the views of these conditions are stored
             key = (index, batch.start) if reuses_conditions else None
             return self._predict_images(full_configurations[batch], u, key)
 
@@ -337,7 +358,13 @@ class SurfaceLight(PredictedSearch):
             return replace(evaluation, picture=round_to_8_bit(images[0]))
 
     def _choose_conditions(self, kind: str, number: int, count: int) -> list[Tensor]:
-        """Return conditions of an evaluation: new cameras under lights of the bank."""
+        """Return `count` conditions of an evaluation: new cameras under lights of the
+        bank.
+
+        Each takes the coordinates that need new light from a random condition of the
+        bank, and all others from a new sample. Without conditions it is the only one of
+        the bank.
+        """
         problem = self.problem
         if problem.conditions is None:
             return self._bank_conditions * count
@@ -355,7 +382,8 @@ class SurfaceLight(PredictedSearch):
     def _compute_inputs(self, full_u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a full configuration.
 
-        They lack the base color where the searched controls set nothing else.
+        If no searched control moves anything, only those of the conditions are
+        computed, which are the last coordinates: the base color is then missing.
         """
         with torch.no_grad():
             n_coordinates = len(self._input_space.start)
@@ -390,13 +418,14 @@ class SurfaceLight(PredictedSearch):
         )
 
     def replay(self, query: Query) -> None:
-        """Compare predictions with traced images if that is due.
+        """Compare predictions with traced images if that is due, and draw the
+        consequences.
 
-        It is every `COMPARISON_INTERVAL` evaluations if base colors are searched, as
-        their light gets old; else after twice as many each time, as long as predictions
-        are accurate. If they are not, the light is computed again for the present
-        colors, if these are searched; after two such comparisons in a row, images are
-        traced from there on.
+        It is due every `COMPARISON_INTERVAL` evaluations if base colors are searched,
+        since their light gets old; else the interval doubles as long as predictions are
+        accurate. If they are not, the light is computed again for the present colors,
+        if these are searched. After two such comparisons in a row, all further images
+        are traced.
         """
         if query.kind != "search" or query.phase != "search" or self.tracing_reason:
             return
@@ -406,6 +435,7 @@ class SurfaceLight(PredictedSearch):
         is_accurate = self._compare(query.u, query.number).is_accepted
         interval = COMPARISON_INTERVAL
         if is_accurate and not self._searches_colors:
+            # the next comparison is at twice the number
             interval = query.number
         self._next_comparison = query.number + interval
         if is_accurate:
@@ -420,8 +450,8 @@ class SurfaceLight(PredictedSearch):
     def _compare(self, u: Tensor, index: int) -> Deviation:
         """Compare predicted images with traced ones, and store the deviation.
 
-        The first view is that of u (d,); in the others, searched cameras and
-        environments are random.
+        The first view is that of u (d,). In the others, searched cameras and
+        environments are random, and conditions are new in all.
         """
         problem = self.problem
         kind = "surface check"
@@ -438,6 +468,7 @@ class SurfaceLight(PredictedSearch):
             ]
             is_random = self._moving
             if not self._searches_colors:
+                # then nothing of the margin's change is due to the search
                 is_random = torch.ones_like(self._moving)
 
         def compare_view(number: int) -> ComparedView:

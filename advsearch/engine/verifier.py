@@ -159,6 +159,7 @@ class Verifier:
                 choice where conditions vary.
         """
         varies = self.problem.conditions is not None
+        # sample counts to choose from, ascending; a single one is no choice
         ladder = self.ladder
         has_choice = len(ladder) > 1
         n_trials = self.looks[0]
@@ -196,18 +197,23 @@ class Verifier:
     def _condition_ladder(
         self, n_candidates: int, searched: int | None
     ) -> Sequence[int]:
-        """Return the sample counts to choose from where conditions vary."""
+        """Return the sample counts to choose from where conditions vary.
+
+        `searched` are the samples that the searches took: counts that would make the
+        verification more expensive than that are left out. None for no such limit.
+        """
         if searched is None:
             return OVER_LADDER
         n_trials = (n_candidates + 1) * self.n_trials
         return limit_ladder(OVER_LADDER, n_trials, searched)
 
     def try_clean(self) -> None:
-        """Run the trials of the control group, unless they were run at this count.
+        """Run the trials of the control group, if they are missing at this sample
+        count.
 
-        These are of the clean configuration, under the seeds of every other group. A
-        start that looked wrong at first is tried before the search, at a sample count
-        of its own, and then again.
+        They are of the clean configuration, and have the seeds of every other group. If
+        the start looked wrong, they are run before the search, at a sample count of
+        their own, and once more after it.
         """
         if self.has_clean_trials:
             return
@@ -239,7 +245,7 @@ class Verifier:
     ) -> Verification:
         """Verify the configuration that a search found against the control group.
 
-        A control group that has too few trials gets more.
+        If the control group has too few trials it gets more, which are kept.
 
         Args:
             kind: of the rows.
@@ -313,10 +319,10 @@ class Verifier:
         has_success: bool = True,
         predictor: PredictedSearch | None = None,
     ) -> Iterator[Judgement]:
-        """Try configurations of a kind, numbered from 0, in batches that fit into
-        memory.
+        """Try `count` configurations of a kind, in batches that fit into memory.
 
-        `find_configuration` returns the configuration (d,) of a number; see `trials`.
+        `find_configuration` returns the configuration (d,) of a number from 0 on. Other
+        arguments are those of `try_configurations`.
         """
         for numbers in split_into_batches(
             0, count, max_batch_size(self.problem.domain.dim)
@@ -418,6 +424,11 @@ class Retrials:
         seed: int,
         executor: Workers | None = None,
     ) -> None:
+        """Make a journal for each condition; all of them share one store.
+
+        `trials` are the trials of a configuration under a condition; `executor`
+        evaluates them on workers, if there are any.
+        """
         self._progress = progress
         self._n_trials = trials
         self._seed = seed
@@ -491,11 +502,11 @@ class Retrials:
     def _evaluate_new(
         self, kind: str, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        """Judge images as the condition changes them.
+        """Evaluate trials: judge images as the condition changes them.
 
-        Images before the change are cached for other conditions, as long as trials are
-        of the same kind. Those that are missing are rendered by workers, if there are
-        any, and otherwise one by one here.
+        Images before that change are cached, since other conditions may need the same
+        ones; the cache is emptied when trials of another kind begin. Missing images are
+        rendered by workers if there are any, and otherwise one by one here.
         """
         if kind != self._shared_kind:
             self._images.clear()
@@ -510,6 +521,7 @@ class Retrials:
         ]
         evaluator = self._journals[condition.name].evaluator
         has_workers = evaluator.executor is not None and len(missing) > 1
+        # in the order of `missing`; empty without workers
         from_workers = iter(evaluator(missing) if has_workers else ())
         for query, key in zip(queries, keys, strict=True):
             machine = None
@@ -531,8 +543,8 @@ class Retrials:
     def _render(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """Return the image (H, W, 3) of u (d,), as `Problem.picture` does.
 
-        It is developed from the radiance of other conditions with the same light, if
-        there are any.
+        Conditions under the same light share the radiance, which is cached; only the
+        formation of the image from it differs.
         """
         problem = condition.problem
         if self._n_conditions_of_light[condition.radiance_key] < 2:

@@ -63,8 +63,8 @@ def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
 def pixelate(image: Tensor, severity: int) -> Tensor:
     """Average the picture over square cells; linear in the picture.
 
-    A cell has 1.7 to 4 pixels of a picture of the reference size, more in a larger one,
-    and as many in a smaller one.
+    At the reference size a cell is 1.7 to 4 pixels wide, by the severity; in a larger
+    picture it has more pixels, in a smaller one as many.
     """
     height, width = image.shape[:2]
     fraction = PIXELATE[severity - 1] / max(

@@ -124,6 +124,7 @@ def blur_along_line(
     for index, weight in enumerate(weights):
         top = count + round(index * math.sin(angle))
         left = count + round(index * math.cos(angle))
+        # the image as it is `index` pixels further along the line
         shifted = padded[:, :, top : top + height, left : left + width]
         total = total + weight * images.to_image(shifted)
     return total
@@ -160,11 +161,10 @@ def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Draw photon counts: Poisson numbers with the image as their mean.
+    """Replace the image by photon counts: Poisson numbers with the image as their mean.
 
-    The values are exact. Counts have no derivative, so the derivative is that of a
-    value which stays the same number of standard deviations from the mean when the mean
-    or the standard deviation changes a little.
+    Counts have no derivative. So the noise is written as z standard deviations; z stays
+    fixed, and the derivative is that of the mean and of the standard deviation.
     """
     (photons,) = interpolate_table(SHOT, level)
     quantile = _draw_noise(image, seed, "shot noise", normal=False)
@@ -176,6 +176,9 @@ def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
     """Return Poisson counts by inverting the distribution function; no derivative.
+
+    A count is the number of candidates 0, 1, 2, ... whose cumulative probability is
+    below the quantile.
 
     Args:
         mean: of each count, 0 to about 80.
@@ -189,6 +192,7 @@ def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
         if not bool(is_above.any()):
             break
         count += is_above
+        # of the next count
         probability *= mean / candidate
         total += probability
     return count.to(mean.dtype)
@@ -197,14 +201,16 @@ def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
 def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Replace a fraction of the values by 0 or 1 ("salt and pepper").
 
-    A value is lost at once, which has no derivative by the fraction of lost values; the
-    derivative is that of the average over all draws of which ones are lost.
+    A single value changes at once, which has no derivative by the fraction. The
+    derivative is that of the expected value, which moves from the image's to 0 or 1
+    with the fraction.
     """
     (lost_fraction,) = interpolate_table(IMPULSE, level)
-    draw = _draw_noise(image, seed, "impulse noise", normal=False)
+    uniform = _draw_noise(image, seed, "impulse noise", normal=False)
     extreme = (_draw_noise(image, seed, "impulse value", normal=False) < 0.5).float()
-    noisy = torch.where(draw < lost_fraction.detach(), extreme, image)
+    noisy = torch.where(uniform < lost_fraction.detach(), extreme, image)
     slope = extreme - image.detach()
+    # the added term is 0, but has the derivative
     return noisy + (lost_fraction - lost_fraction.detach()) * slope
 
 
@@ -284,6 +290,7 @@ def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     zooms = 1.0 + (largest - 1.0) * torch.linspace(
         0.0, 1.0, ZOOM_STEPS, device=level.device
     )
+    # an image magnified by a zoom is looked up 1 / zoom as far from its center
     matrices = torch.diag_embed((1.0 / zooms)[:, None].expand(-1, 2))
     theta = torch.cat([matrices, matrices.new_zeros(ZOOM_STEPS, 2, 1)], dim=2).to(
         image.device
@@ -405,8 +412,11 @@ def _make_elastic_shift(height: int, width: int, seed: int, severity: int) -> Te
 
 
 def _make_shear(rows: int, columns: int, corners: Tensor) -> Tensor:
-    """Make the affine shift (rows, columns, 2) in which three corners of the middle
-    third of the image have given shifts.
+    """Make the affine shift (rows, columns, 2) that moves three corners by given
+    shifts.
+
+    They are corners of a square around the image's center whose sides are two thirds of
+    the reference side.
 
     Args:
         rows: of the image.
@@ -415,10 +425,12 @@ def _make_shear(rows: int, columns: int, corners: Tensor) -> Tensor:
     """
     # An affine map is its value at the center, and its slopes along rows and columns.
     third = REFERENCE_SIDE // 3
+    # from the upper to the lower right corner, per row
     by_row = (corners[0] - corners[1]) / (2 * third)
     by_column = (corners[0] - corners[2]) / (2 * third) - by_row
     row = torch.arange(rows)[:, None, None] - (rows - 1) / 2.0
     column = torch.arange(columns)[None, :, None] - (columns - 1) / 2.0
+    # the center is in the middle between the lower right and the upper left corner
     return (corners[0] + corners[2]) / 2.0 + row * by_row + column * by_column
 
 
@@ -461,7 +473,10 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _make_drift(height: int, width: int, seed: int, decay: float) -> Tensor:
-    """Make fog (H, W, 1) in [0, 1]."""
+    """Make fog (H, W, 1) in [0, 1].
+
+    `decay` is as for `make_fractal_noise`: the larger it is, the smoother is the fog.
+    """
     rows, columns = compute_reference_size(height, width)
     return images.resized(
         make_fractal_noise(max(rows, columns), decay, make_generator(seed, "fog"))[
@@ -475,10 +490,9 @@ def _make_drift(height: int, width: int, seed: int, decay: float) -> Tensor:
 def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tensor:
     """Make fractal noise in [0, 1] by midpoint displacement on a torus.
 
-    It is at least side x side.
-
-    Each step doubles the grid: new points are the mean of their four neighbors plus
-    noise, whose height falls by `decay` squared from step to step (Fournier, Fussell,
+    The result is square, with a power of two of at least `side` texels a side. Each
+    step doubles the grid: a new point is the mean of its four neighbors plus noise,
+    whose height is divided by `decay` squared from step to step (Fournier, Fussell,
     Carpenter 1982, Computer rendering of stochastic models).
     """
     grid = torch.zeros(1, 1)
@@ -488,10 +502,12 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
         noise = (torch.rand(3, size, size, generator=source) * 2.0 - 1.0) * height
         right = grid.roll(-1, 1)
         down = grid.roll(-1, 0)
+        # diamond step: the centers of the cells
         middle = (grid + right + down + right.roll(-1, 0)) / 4.0 + noise[0]
         finer = torch.empty(2 * size, 2 * size)
         finer[::2, ::2] = grid
         finer[1::2, 1::2] = middle
+        # square step: the centers of the edges, from two old points and two centers
         finer[::2, 1::2] = (grid + right + middle + middle.roll(1, 0)) / 4.0 + noise[1]
         finer[1::2, ::2] = (grid + down + middle + middle.roll(1, 1)) / 4.0 + noise[2]
         grid = finer
@@ -509,10 +525,14 @@ def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _make_ice(height: int, width: int, seed: int) -> Tensor:
-    """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film."""
+    """Make ice (H, W, 3) in [0, 1]: feathers of crystals over an uneven film.
+
+    Numbers are chosen by eye.
+    """
     rows, columns = compute_reference_size(height, width)
     source = make_generator(seed, "frost")
     film = make_fractal_noise(max(rows, columns), 1.4, source)[:rows, :columns, None]
+    # drawn at twice the size, so that lines are smooth
     feathers = images.resized(
         _draw_feathers(2 * rows, 2 * columns, source), rows, columns
     )
@@ -549,9 +569,11 @@ def _draw_feather(
         shine: brightness in [0, 1].
     """
     direction = cmath.rect(1.0, 2.0 * math.pi * turn)
+    # in pixels; most needles are short
     length = 12.0 + 110.0 * size**3
     _draw_line(pen, start, start + length * direction, shine)
     for step in range(4, int(length), 4):
+        # barbs of uneven length, shorter towards the tip
         unevenness = 0.5 + 0.5 * math.sin(step + 50.0 * turn)
         barb = (0.2 + 0.35 * unevenness) * (length - step) * direction
         root = start + step * direction
@@ -574,6 +596,7 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
         lambda severity: _make_snowfall(image.shape[0], image.shape[1], seed, severity),
     ).to(image.device)
     grey = (image * image.new_tensor(LUMA_WEIGHTS)).sum(dim=-1, keepdim=True)
+    # paler, but never darker
     pale = torch.maximum(image, 1.5 * grey + 0.5)
     mixed = image_weight * image + (1.0 - image_weight) * pale
     # once more turned by 180 degrees, for twice as many flakes
@@ -582,7 +605,11 @@ def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
-    """Make falling snow (H, W, 1) in [0, 1] at a whole severity."""
+    """Make falling snow (H, W, 1) in [0, 1] at a whole severity.
+
+    Noise on a coarse grid is cut off below a threshold, which leaves flakes, and
+    blurred along the direction of their fall.
+    """
     rows, columns = compute_reference_size(height, width)
     mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]
     source = make_generator(seed, "snow")

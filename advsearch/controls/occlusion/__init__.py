@@ -324,7 +324,9 @@ def _find_covering_angle(
 ) -> float:
     """Find the angle, radians, at which an occluder hides a fraction of the object.
 
-    Below `EASE_IN_COVERAGE` it slides in from outside of the image.
+    The angle is that between the occluder and the object's center, seen from the
+    camera. Below `EASE_IN_COVERAGE` the occluder slides in from outside of the image,
+    in proportion to the fraction.
     """
     outside = silhouettes.find_angle_outside(
         view.directions_of_image,
@@ -360,9 +362,11 @@ class _ObjectView:
 
     @staticmethod
     def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _ObjectView:
-        """Compute the view of a scene's object with the inputs of the controls before.
+        """Compute how the camera sees a scene's object; without derivatives.
 
-        Without derivatives.
+        `so_far` are the inputs of the controls before, which may move camera and
+        object. For a lens with a model the edge of the image is not known: all
+        directions of the image stand in for it.
         """
         points = _object_in_camera(scene, so_far)
         faces = scene.object.mesh.faces
@@ -434,7 +438,9 @@ def _directions_through_lens(
     cover = silhouettes.rasterise_silhouette(points @ axes.T, faces)
     if cover is None:
         return None
+    # a camera model has y downwards
     positions, is_visible = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
+    # the part of the image to look at: the box of the vertices, if all are visible
     columns = (0.0, 1.0)
     rows = (0.0, 1.0)
     if bool(is_visible.all()):
@@ -443,8 +449,8 @@ def _directions_through_lens(
         columns = (left, right)
         rows = (top, bottom)
     directions = _spread_directions(model, columns, rows, silhouettes.RASTER)
-    hidden = directions[cover.contains(*(directions @ axes.T).T)]
-    return hidden if len(hidden) else None
+    directions_on_mesh = directions[cover.contains(*(directions @ axes.T).T)]
+    return directions_on_mesh if len(directions_on_mesh) else None
 
 
 def _spread_directions(
@@ -455,7 +461,8 @@ def _spread_directions(
 ) -> assets.Float64Array:
     """Return unit directions (N, 3) in which a lens sees a part of the image.
 
-    They are spread as those of `Silhouette.list_directions`.
+    There is one in each cell of a grid of count x count, at a point of a
+    low-discrepancy sequence; directions that the lens does not have are left out.
 
     Args:
         model: of the camera.
@@ -465,12 +472,13 @@ def _spread_directions(
     """
     row, column = np.divmod(np.arange(count * count), count)
     index = np.arange(count * count)
-    # one in each cell, at a point of a low-discrepancy sequence (Roberts 2018)
+    # the fractions of the plastic number (Roberts 2018)
     x_in_cells = column + (0.5 + 0.7548777 * index) % 1.0
     y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
     x = across[0] + x_in_cells / count * (across[1] - across[0])
     y = down[0] + y_in_cells / count * (down[1] - down[0])
     directions, inside = model.compute_rays(torch.from_numpy(np.stack([x, y], axis=1)))
+    # from y downwards to y upwards
     visible = directions[inside > 0.0].numpy() * (1.0, -1.0, 1.0)
     return np.asarray(visible / np.linalg.norm(visible, axis=1, keepdims=True))
 
@@ -504,6 +512,7 @@ def _fit_occluder(
     front = float(points[:, 0].max())
     back = float(-points[:, 0].min())
     half_width = float(np.hypot(points[:, 1], points[:, 2]).max())
+    # so that something fits at all
     near = max(near, 3.0 * MIN_CAMERA_DISTANCE)
     for _ in range(200):
         min_distance = MIN_CAMERA_DISTANCE + size * front
@@ -514,6 +523,7 @@ def _fit_occluder(
             max_distance = math.sqrt(squared_back_distance) - size * back
         if max_distance >= min_distance:
             break
+        # not enough room: try a smaller one
         size *= 0.95
     return size, min(max(distance, min_distance), max_distance)
 
@@ -521,10 +531,11 @@ def _fit_occluder(
 def _to_facing_camera(
     points: assets.Float64Array, size: float, distance: float
 ) -> assets.Float64Array:
-    """Return points (N, 3) to the right, up and forward of a camera.
+    """Return an occluder's points (N, 3) in the axes of a camera: right, up and
+    forward.
 
-    The camera looks at the center of an object from a distance; `size` scales the
-    object's points.
+    The camera looks at the occluder's center from `distance`, and the occluder's x axis
+    points to the camera. `size` scales the points.
     """
     right = points[:, 1] * size
     up = points[:, 2] * size

@@ -60,9 +60,13 @@ class Silhouette:
         y: assets.Float64Array,
         forwards: assets.Float64Array,
     ) -> NDArray[np.bool_]:
-        """Return whether directions, any shape and length, lie in the silhouette."""
+        """Return whether directions lie in the silhouette; none behind the camera does.
+
+        `x`, `y` and `forwards` are their components, of one shape and any length.
+        """
         height, width = self.mask.shape
         window = self.window
+        # only to divide by: those behind the camera are left out below
         depth = np.maximum(forwards, geometry.MIN_DEPTH)
         column = np.floor(
             (x / depth - window.left) / (window.right - window.left) * width
@@ -105,6 +109,7 @@ def rasterise_silhouette(
     pixel = max(window_width, window_height) / RASTER
     width = max(1, math.ceil(window_width / pixel))
     height = max(1, math.ceil(window_height / pixel))
+    # pixel centers are at whole numbers
     in_pixels = (tangents - (window.left, window.low)) * (
         width / window_width,
         height / window_height,
@@ -150,19 +155,23 @@ class Passage:
     direction: float
 
     def compute_coverage(self, angles: assets.Float64Array) -> assets.Float64Array:
-        """Return the hidden fraction (K,) at angles (K,) in radians from the center.
+        """Return the fraction of the target (K,) that is hidden at angles (K,), in
+        radians.
 
-        The directions of the target are turned by each angle instead of the occluder,
-        and looked up in its silhouette.
+        An angle is that of the occluder from the target's center. Instead of moving the
+        occluder, the directions of the target are turned back by the angle and looked
+        up in its silhouette.
         """
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
+        # axes in the image: towards the occluder's side, and across
         outwards = math.cos(turn) * right + math.sin(turn) * up
         sideways = -math.sin(turn) * right + math.cos(turn) * up
         fractions = []
         for angle in angles:
             turned_outwards = outwards * math.cos(angle) - forward * math.sin(angle)
             depth = outwards * math.sin(angle) + forward * math.cos(angle)
+            # back to right and up
             x = math.cos(turn) * turned_outwards - math.sin(turn) * sideways
             y = math.sin(turn) * turned_outwards + math.cos(turn) * sideways
             fractions.append(float(self.cover.contains(x, y, depth).mean()))
@@ -227,11 +236,10 @@ def find_angle_outside(
     axes: assets.Float64Array,
     direction: float,
 ) -> float:
-    """Return the angle in radians beyond which an occluder is out of the image on its
-    side.
+    """Return the angle in radians from which on an occluder is outside of the image.
 
-    Angles are scanned from outside; the result is the last before the occluder covers
-    any direction of the image.
+    Angles are scanned from outside to the center; the result is the last one before the
+    occluder covers any direction of the image.
 
     Args:
         directions: (N, 3) directions spread over the full image.

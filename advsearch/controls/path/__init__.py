@@ -123,6 +123,7 @@ class Waypoints:
         index = index.clamp(1, len(self.times) - 1)
         begin = self.times[index - 1]
         end = self.times[index]
+        # constant before the first and after the last waypoint
         fraction = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
         if column.ndim > 1:
             fraction = fraction[..., None]
@@ -259,7 +260,7 @@ class PathControl(Control):
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the time, and if there are several paths, the choice among them."""
+        """Return the time, and the choice of the path if there are several."""
         if not isinstance(settings, Mapping):
             return cls.parameters
         names = _split_paths(settings.get("path", APPROACH))
@@ -322,7 +323,8 @@ class PathControl(Control):
     def _read_path(self, name: str) -> MovementByMover:
         """Return what camera and object do on the path of a name.
 
-        A name with a "+" has a path for each; any other is one for what `moves`.
+        The name is one path for whatever `moves` states, or, with a "+" between two
+        paths, the camera's and the object's. A path is one of `PATHS` or a file.
         """
         names = [name]
         both = name.split(MOVER_SEPARATOR)
@@ -348,7 +350,10 @@ class PathControl(Control):
         return movements
 
     def _check_needless(self) -> None:
-        """Check that choices about trajectories have one. Raises InputError."""
+        """Check that choices about trajectories are set only if there is a trajectory.
+
+        Raises InputError: they are set without one.
+        """
         needless = [
             name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
         ]
@@ -456,9 +461,10 @@ class PathControl(Control):
     def _orient(
         self, path: Path, trajectory: Trajectory, assumed: dict[str, str]
     ) -> tuple[assets.Float64Array, Rotation | None]:
-        """Return positions and rotations as `Trajectory.orient` does.
+        """Return a trajectory's positions and rotations in a world whose z is up.
 
-        Choices that the user left out are added to `assumed`, with their values.
+        Choices that the user left out get defaults, which are added to `assumed` by
+        name. See `Trajectory.orient` for the results.
 
         Raises:
             InputError: axes are set for a file without rotations.
@@ -500,7 +506,7 @@ class PathControl(Control):
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
-        """Seconds that the shutter is open, and in which rows are read.
+        """Seconds that the shutter is open, and seconds in which all rows are read.
 
         The latter are below 0 where rows are read from the bottom.
         """
@@ -680,10 +686,9 @@ class PathControl(Control):
     ) -> tuple[Tensor, Tensor]:
         """Return where the camera is, and what it looks at.
 
-        That is the object, which is shifted, unless a file says something else.
-
-        A named path: approach comes straight ahead to where the camera stands, pass
-        goes straight past it from left to right, orbit goes once around the object.
+        It looks at the object, with its shift, unless a file says something else. Of
+        the named paths, approach comes straight ahead to where the camera stands, pass
+        goes straight past it from left to right, and orbit goes once around the object.
 
         Args:
             movements: what camera and object do.
@@ -707,9 +712,11 @@ class PathControl(Control):
         progress = (time / self.seconds).clamp(0.0, 1.0)
         if movement == APPROACH:
             ahead = _level_direction(pose[:3, 2])
+            # it begins `reach` times as far away as it ends
             to_go = (1.0 - progress)[..., None]
             return start - ahead * distance * (reach - 1.0) * to_go, center + shift
         if movement == PASS:
+            # 1 at the begin, 0 where the camera stands, -1 at the end
             from_middle = (1.0 - 2.0 * progress)[..., None]
             return start + pose[:3, 0] * distance * reach * from_middle, center + shift
         return center + _turn_about_vertical(start - center, progress), center + shift
@@ -717,14 +724,18 @@ class PathControl(Control):
     def _camera_on_waypoints(
         self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return where the camera is on waypoints, and what it looks at; see
-        `_position_camera`.
+        """Return where the camera is on waypoints, and what it looks at.
+
+        It looks along its own rotation, if the waypoints have one; else at their
+        targets; else at the object. Arguments and results are those of
+        `_position_camera`, `center` is that of the object.
         """
         position = (
             center
             + waypoints.interpolate(time, waypoints.positions) / self.scene.metres
         )
         if waypoints.rotations is not None:
+            # the third column points ahead
             return position, position + waypoints.interpolate_rotation(time)[..., 2]
         if waypoints.targets is None:
             return position, center + shift
@@ -734,12 +745,14 @@ class PathControl(Control):
     def _shift_object(
         self, movements: MovementByMover, scene_start: Start, time: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return how far the object is shifted, (..., 3) object sizes, and the degrees
-        (...,) that it is turned by.
+        """Return how far the object is shifted and turned from where it stands.
 
-        A named path: approach comes level towards the camera to where the object
-        stands, pass goes past that place from right to left, orbit turns the object
+        Of the named paths, approach comes level towards the camera to where the object
+        stands, pass goes past that place from right to left, and orbit turns the object
         once on the spot.
+
+        Returns:
+            (..., 3) object sizes, and (...,) degrees.
         """
         camera = scene_start.camera
         movement = movements.get(OBJECT)
@@ -758,8 +771,10 @@ class PathControl(Control):
             return no_shift, 360.0 * progress
         distance = (camera[:3, 3] - scene_start.middle).norm()
         if movement == APPROACH:
+            # it begins `reach` times as far from the camera as it ends
             to_go = distance * (reach - 1.0) * (1.0 - progress)
             return _level_direction(camera[:3, 2]) * to_go[..., None], no_turn
+        # positive at the begin, 0 where the object stands
         from_middle = distance * reach * (1.0 - 2.0 * progress)
         return _level_direction(-camera[:3, 0]) * from_middle[..., None], no_turn
 
@@ -843,9 +858,10 @@ def make_camera_pose(position: Tensor, rotation: Tensor, roll: float) -> Tensor:
 def _roll_camera(
     position: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float
 ) -> Tensor:
-    """Return the pose (4, 4) of a camera turned by degrees about where it looks.
+    """Return the pose (4, 4) of a camera that is turned about where it looks.
 
-    All others are (3,), three unit vectors at right angles among them.
+    `left`, `up` and `ahead` are its unit vectors (3,) before, at right angles; `roll`
+    is in degrees.
     """
     cos = math.cos(math.radians(roll))
     sin = math.sin(math.radians(roll))
@@ -862,10 +878,10 @@ def measure_tilt(rotations: Rotation) -> float:
 
 
 def align_quaternions(quaternions: assets.Float64Array) -> assets.Float64Array:
-    """Return quaternions (n, 4) with signs by which each is nearer to the one before
-    than its negative is, so that they can be interpolated.
+    """Return quaternions (n, 4) with signs that make neighbours similar.
 
-    A quaternion and its negative are the same rotation.
+    A quaternion and its negative are the same rotation; but between two of opposite
+    signs, interpolation would go the long way round.
     """
     is_opposite = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
     # the sign changes at each opposite pair, and stays changed
@@ -916,9 +932,9 @@ def unwrap_headings(
     """Return headings (n,) of which each goes to the next the shorter way round, and a
     note.
 
-    Only headings within one turn are changed, those all in [0, 360] or in [-180, 180]
-    that do not span a full turn; a file with others counts turns itself. The note is
-    None if nothing changes.
+    Only headings within one turn are changed: all in [0, 360] or all in [-180, 180],
+    with less than a full turn between them. A file with others counts turns itself. The
+    note is None if nothing changes.
 
     Args:
         degrees: (n,) headings, at the waypoints in turn.
@@ -954,6 +970,7 @@ def _is_path(name: str) -> bool:
 
 
 def _read_text(path: Path) -> str:
+    """Read a file of waypoints, without a byte order mark. Raises FileFormatError."""
     try:
         return stored_files.read_text(
             path, "a table of waypoints", MAX_FILE_BYTES
@@ -978,7 +995,7 @@ def _list_optional_columns(mover: str, is_single_path: bool) -> tuple[str, ...]:
 def read_waypoints(
     path: Path, mover: str, *, text: str, is_single_path: bool = True
 ) -> dict[str, Waypoints]:
-    """Read the paths of all that travels from a table of waypoints.
+    """Read the paths of the camera and the object from a table of waypoints.
 
     Args:
         path: of the file, for messages.
@@ -987,6 +1004,9 @@ def read_waypoints(
             or heading.
         is_single_path: whether a file about the camera may say what the object does at
             the same times.
+
+    Returns:
+        The path of each that moves; times begin at 0.
 
     Raises:
         FileFormatError: it is no table of numbers with the columns that a path needs,
@@ -1100,7 +1120,10 @@ def _unwrap_headings(
 def _stack_columns(
     column: Mapping[str, assets.Float64Array], names: Sequence[str]
 ) -> Tensor | None:
-    """Return columns of a table as a tensor (n, k), or (n,) of one; None without."""
+    """Return some columns of a table as a tensor (n, k), or (n,) for a single one.
+
+    None if the table does not have them.
+    """
     if names[0] not in column:
         return None
     values = np.stack([column[name] for name in names], axis=1).astype(np.float32)

@@ -237,7 +237,11 @@ def _read_table(
 def _read_named_columns(
     path: Path, names: Sequence[str], rows: Sequence[Sequence[str]], has_commas: bool
 ) -> Trajectory:
-    """Read the poses of a table whose columns have names of TUM or EuRoC."""
+    """Read a table whose columns have the names of TUM or EuRoC.
+
+    With commas it is EuRoC's. Times are converted to seconds from the first on. Columns
+    that are not known are left out, with a note.
+    """
     columns = _find_columns(names)
     table = _read_table(path, rows, len(names))
     unread = [name for index, name in enumerate(names) if index not in columns.values()]

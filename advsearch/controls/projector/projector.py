@@ -350,6 +350,9 @@ class ProjectorControl(PictureControl):
             self.flashes = max(map(float, self.list_allowed_values("flicker", 0.0)))
 
     def read_picture(self) -> Tensor | None:
+        """Return the image of the `picture` file. Raises InputError: a side has one
+        texel.
+        """
         picture = super().read_picture()
         if picture is not None and min(picture.shape[:2]) < 2:
             got = f"{picture.shape[1]} x {picture.shape[0]}"
@@ -407,7 +410,8 @@ class ProjectorControl(PictureControl):
         if rate and (rate * self._time_shift + phase) % 1.0 >= DUTY_CYCLE:
             light = 0.0 * light  # still depends on the pattern, for its derivative
         distance_in_units = values["distance"].detach() / self.scene.metres
-        # times the ambient light, at a distance of one unit
+        # white in units of the ambient light, at a distance of one unit: light falls
+        # off with the squared distance
         brightness = self._relative_to_ambient(values) * distance_in_units**2
         white = brightness * self.scene.metered_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
@@ -483,9 +487,9 @@ def blur_light(light: Tensor, blur: Tensor) -> Tensor:
 def make_projector_pose(
     scene: SceneDescription, azimuth: float, elevation: float, distance: float
 ) -> Tensor:
-    """Return a pose (4, 4) that looks at the object's middle along its own +z.
+    """Return a pose (4, 4) that looks at the object's center along its own +z axis.
 
-    Do not write into it.
+    The result is cached: do not write into it.
 
     Args:
         scene: with the object.

@@ -142,8 +142,8 @@ class SpotControl(ProjectorControl):
         """Return a parameter; lumens are searched up to what is bright in this scene.
 
         That is `MAX_AMBIENT_FACTOR` times the ambient light, for a spot of the default
-        width. They are 0 by default; but as many if only other parameters are searched,
-        which would not show otherwise.
+        width. The default of the lumens is 0; but it is that maximum if only other
+        parameters are searched, which would not show without light.
         """
         if parameter.name != "lumens":
             return super().resolve_parameter(parameter)
@@ -169,12 +169,14 @@ class SpotControl(ProjectorControl):
         It is a Gaussian in the plane through the object's center, scaled so that its
         light does not depend on the width.
         """
+        # of the projector's image in the plane through the object's center
         half_width = (
             math.tan(math.radians(self.part.fov) / 2.0)
             * values["distance"].detach()
             / self.scene.metres
         )
         rows, columns = self.part.sides
+        # positions of the texels' centers in that plane
         right, up = (
             torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half_width) * half_width
             for count in (columns, rows)
@@ -183,6 +185,8 @@ class SpotControl(ProjectorControl):
         # rows go downwards
         squared = (right[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
         spot = (
+            # The integral of the Gaussian is divided out, and the area of the image
+            # multiplied: the mean of the image is about 1.
             torch.exp(-0.5 * squared / std**2)
             * (2.0 * half_width) ** 2
             / (2.0 * math.pi * std**2)

@@ -35,7 +35,7 @@ def resize_to_square(image: Tensor, side: int) -> Tensor:
 def enlarge(pixels: Tensor, factor: int) -> Tensor:
     """Return an image (h, w, 3) sRGB at a whole multiple of its size.
 
-    It is interpolated as the renderer does it.
+    It is interpolated linearly in light, as the renderer interpolates textures.
     """
     larger = F.interpolate(
         to_planes(srgb_to_linear(pixels)),
@@ -120,9 +120,9 @@ def resized(
 def draw_noise(
     height: int, width: int, seed: int, stream_name: str, *, normal: bool = True
 ) -> Tensor:
-    """Return the noise (height, width, 3) of a stream of random numbers.
+    """Return noise (height, width, 3) from a named stream of random numbers; cached.
 
-    Standard normal, or uniform in [0, 1).
+    It is standard normal, or uniform in [0, 1).
     """
     generator = torch.Generator().manual_seed(seeds.stream(seed, stream_name))
     sample = torch.randn if normal else torch.rand

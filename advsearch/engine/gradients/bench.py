@@ -26,13 +26,13 @@ PERIODIC_OFFSET = 0.0317
 
 
 def find_interior_point(renderer: Renderer, fraction: float = 0.12) -> Tensor:
-    """Return the point (d,) at which gradients are measured, near the start.
+    """Return a point (d,) near the start at which gradients are measured.
 
-    Continuous coordinates with a range are at least `fraction` of it off its bounds.
-    Periodic ones are turned a little: starts are often symmetric. Groups with a norm
-    ball stay at their start, and so do discrete choices. But a group that starts at a
-    bound with all its coordinates, as a projector's black image does, is measured in
-    the middle: at the bound there is a kink, and no difference to either side.
+    Discrete choices and groups of more than 64 coordinates stay at their start. But a
+    large group that starts at its bounds with all coordinates, as a projector's black
+    image does, is measured in the middle: a bound has a kink, and no difference to
+    either side. Periodic coordinates are turned a little, as starts are often
+    symmetric. All others are at least `fraction` of their range off its bounds.
     """
     u = renderer.start.clone()
     for group in renderer.plan.groups:
@@ -129,6 +129,7 @@ class Bench:
                 measurement = measure()
             else:
                 measurement = self.store(f"{label} gradient {index}", measure)
+            # as `_measure_gradient` has written it
             buffer = bytearray(base64.b64decode(measurement["numbers"]))
             derivatives = torch.frombuffer(buffer, dtype=torch.float32).split(sizes)
             for coordinates, values in zip(slices, derivatives, strict=True):
@@ -141,8 +142,10 @@ class Bench:
     def _measure_gradient(
         self, plan: GradientPlan, stream: str, index: int
     ) -> dict[str, Any]:
-        """Return the derivatives of a gradient as JSON, with the seconds that it
-        took.
+        """Return a gradient as JSON: its seconds, and its numbers as base64 of float32.
+
+        Only the coordinates for which the plan has an estimator are written, group by
+        group.
         """
         started = time.perf_counter()
         gradient = self.compute_gradient(plan, seeds.stream(self.seed, stream, index))

@@ -84,12 +84,11 @@ class Estimate(NamedTuple):
 
 
 def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
-    """Return a linear loss with smooth weights: a sum of a few waves of the picture's
-    size, other in each channel.
+    """Return a linear loss with smooth weights, a few random waves in each channel.
 
-    They fall to zero at the picture's edge (a Hann window). With a hard edge the loss
-    would be as rough as whatever moves across it, a photographed interior above all,
-    and its differences would depend on the step.
+    The waves are about as long as the image, and fall to zero at its edge (a Hann
+    window). With a hard edge the loss would be as rough as whatever moves across it, a
+    photographed interior above all, and its differences would depend on the step.
     """
     generator = torch.Generator().manual_seed(seeds.stream(seed, "smooth loss"))
     height, width = resolution
@@ -190,11 +189,12 @@ def list_planned(group: Group) -> list[tuple[str, float]]:
 
 
 def list_attempts(group: Group) -> list[tuple[str, float]]:
-    """Return every estimator to measure on a group, with a factor on its step.
+    """Return the estimators to measure on a group, each with a factor on its step.
 
-    First come the estimators with the planned step, only one if it is forced. Then one
-    that takes differences, if there is any, with wider steps, as far as these differ:
-    differences of the loss and of the image are the same for a linear loss.
+    First come all estimators with the planned step, or the only one if it is forced.
+    Then one that takes differences, if there is any, with wider steps, as long as these
+    differ. One is enough, since differences of the loss and of the image agree for a
+    linear loss.
     """
     if group.is_forced:
         attempts = list_planned(group)
@@ -214,11 +214,11 @@ def list_attempts(group: Group) -> list[tuple[str, float]]:
 
 
 def find_probes(bench: Bench) -> list[Probe]:
-    """Return the directions to measure derivatives along, for each group of coordinates
-    that is differentiated.
+    """Return the directions along which derivatives are measured, for all groups.
 
-    A small group has one for each coordinate, with its planned step; a group of more
-    than `MAX_SINGLE_PROBES` has a single direction through all of them.
+    A small group has one for each coordinate, with its planned step. A group of more
+    than `MAX_SINGLE_PROBES` coordinates has a single direction through all of them.
+    Groups that are not differentiated have none.
     """
     probes = []
     for group in bench.renderer.plan.groups:
@@ -239,9 +239,11 @@ def find_probes(bench: Bench) -> list[Probe]:
 
 
 def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
-    """Return a direction (d,) in a group: the signs of the estimator's own gradient,
-    along which the derivative is large, plus half of random signs, so that what the
-    estimator leaves out counts too. The largest element is 1.
+    """Return a direction (d,) through all coordinates of a group, whose largest element
+    is 1.
+
+    It is the signs of the estimator's own gradient, along which the derivative is
+    large, plus half of random signs, so that what the estimator leaves out counts too.
     """
     plan = restrict_plan(bench.renderer.plan, [group.name])
     gradient = bench.compute_gradient(plan, seeds.stream(bench.seed, "probe"))[
@@ -266,13 +268,15 @@ def measure_reference(
     repeats: tuple[int, int] = (3, 16),
     factors: Sequence[float] = (1.0,),
 ) -> Reference:
-    """Return the derivative along a probe by central differences at two steps, with its
-    noise.
+    """Return the derivative along a probe by central differences, and its noise.
 
-    Seeds are added until the standard error is below `MAX_REFERENCE_ERROR` of the
-    value, between the two numbers of `repeats`. With several `factors`, each gets the
-    smaller number of seeds, both steps so many times wider, until one is sure enough;
-    if none is, the one with the least noise goes on.
+    Each seed gives two differences, at a step and at half of it, from which the value
+    at a step of 0 is extrapolated. Seeds are added until the standard error of the mean
+    is below `MAX_REFERENCE_ERROR` of its value, between the two numbers of `repeats`.
+
+    With several `factors`, steps that many times wider are tried in turn, each with the
+    smaller number of seeds, until one is sure enough; if none is, more seeds are added
+    for the one with the least noise.
     """
     pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
 
@@ -289,12 +293,14 @@ def measure_reference(
                     _compute_difference(bench, probe, 0.5 * step, noise),
                 )
             )
+        # Richardson: the error of a central difference falls with the squared step
         extrapolated = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairs[factor]]
         coarse_mean = statistics.fmean(coarse for coarse, _ in pairs[factor])
         fine_mean = statistics.fmean(fine for _, fine in pairs[factor])
         error = math.inf
         if len(extrapolated) > 1:
             error = statistics.stdev(extrapolated) / math.sqrt(len(extrapolated))
+        # the standard error, and a part of what the step changes
         noise_of_both = math.hypot(error, 0.25 * (coarse_mean - fine_mean))
         return Reference(
             statistics.fmean(extrapolated),
@@ -320,8 +326,9 @@ def measure_reference(
 
 
 def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> float:
-    """Return one central difference of the loss along a probe, with one seed on both
-    sides.
+    """Return one central difference of the loss along a probe.
+
+    Both sides have the noise of the same seed.
     """
     move = step * probe.direction
     width = 2.0 * step
@@ -332,6 +339,7 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
         above = (bench.u + move).clamp(0.0, 1.0)
         below = (bench.u - move).clamp(0.0, 1.0)
         if probe.group.size <= MAX_SINGLE_PROBES:
+            # less than two steps if a bound of the range has cut one off
             width = float((above - below) @ probe.direction)
     with torch.no_grad():
         high, low = (

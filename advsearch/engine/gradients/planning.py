@@ -59,12 +59,12 @@ of the working one's, only makes the measured cosine smaller: what is called `ok
 
 
 def rate_cosine(cosine: float, agreement: float) -> GradientStatus:
-    """Return whether a cosine with the converged gradient is good enough.
+    """Return whether a gradient agrees well enough with the converged one, as a status.
 
-    "ok" if it reaches the goal, "noisy" if it does not. `agreement` is the smallest
-    cosine of two converged gradients. If it is below `MIN_AGREEMENT`, or below the goal
-    where the cosine is too, the answer is "reference unusable": the fault may be the
-    converged gradient's.
+    It is "ok" if the cosine reaches `GOAL_COSINE`, and otherwise "noisy". But it is
+    "reference unusable" where the fault may be the converged gradient's: if
+    `agreement`, the smallest cosine of two converged gradients, is below
+    `MIN_AGREEMENT`, or if both it and the cosine are below the goal.
     """
     if not agreement >= MIN_AGREEMENT:
         return "reference unusable"
@@ -92,12 +92,15 @@ def list_comparable_sets(
 def list_contested(
     plan: GradientPlan, *, with_all: bool = False
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
-    """Return groups of one control with the estimators to compare on them.
+    """Return sets of groups for which several estimators are to be compared.
 
-    There is more than one estimator, and none was forced. If `with_all`, these are all
-    such groups; else only those for which the interior adjoint is preferred so far:
-    over poses, the model's loss is so rough that no estimator has won, and over shapes
-    the material form is the quietest.
+    The groups of a set belong to one control. None of them has a forced estimator. With
+    `with_all` these are all such groups. Otherwise they are only those for which the
+    interior adjoint is preferred so far: over poses, the model's loss is so rough that
+    no estimator has won, and over shapes the material form is the quietest.
+
+    Returns:
+        The sets, each with its estimators.
     """
     open_groups = []
     for group in plan.groups:
@@ -168,11 +171,12 @@ def _score_estimators(
     repeats: int,
     counted: bool,
 ) -> dict[str, float]:
-    """Return squared error x seconds of each estimator on groups of one control.
+    """Return the squared error times the seconds of each estimator on groups of a
+    control.
 
-    The reference is the mean gradient of the estimator that takes finite differences,
-    whose own noise is subtracted from the errors of the others. If `counted`, the
-    number of renders stands for the seconds.
+    Errors are differences from the mean gradient of the estimator that takes finite
+    differences, whose own noise is subtracted. If `counted`, the number of renders
+    stands for the seconds.
     """
     group_names = {group.name for group in groups}
     gradients_of = dict[str, Tensor]()
@@ -200,9 +204,11 @@ def _score_estimators(
 def _compute_squared_errors(
     gradients_of: Mapping[str, Tensor], noise_of: Mapping[str, float], repeats: int
 ) -> dict[str, float]:
-    """Return the mean squared error of each estimator, at least its own noise.
+    """Return the mean squared error of the gradients of each estimator.
 
-    The reference's error is its noise: it counts as unbiased.
+    The mean gradient by finite differences is the reference, and counts as unbiased:
+    its own error is its noise. From the others' errors the noise of the reference's
+    mean is subtracted; what is left is at least their own noise.
 
     Args:
         gradients_of: (repeats, d) of each estimator; one of them takes differences.
@@ -245,10 +251,9 @@ def _explain_scores(
 def count_cosine_samples(
     plan: GradientPlan, *, counts: Sequence[int] = SAMPLE_COUNTS
 ) -> int:
-    """Return the maximum number of samples per pixel that the gradients of
-    `measure_cosines` take, in all.
-    """
+    """Return how many samples per pixel `measure_cosines` takes at most."""
     working_samples = REPEATS * sum(counts)
+    # once, and once more with more samples
     converged_samples = N_CONVERGED * (1 + CONVERGED_SPP_FACTOR) * CONVERGED_SPP
     n_steps = sum(len(factors) for _, factors in _list_controls(plan))
     return (working_samples + converged_samples) * n_steps
@@ -311,11 +316,11 @@ def _measure_cosines(
     factor: float,
     counts: Sequence[int],
 ) -> Iterator[Measured]:
-    """Measure the cosine of one control at one width of its differences.
+    """Measure the cosine of one control's gradients at one width of its differences.
 
-    Sample counts are tried until one reaches the goal. The converged gradient is
-    computed again with more samples, once, if it is noisy or a working gradient has
-    more samples.
+    Sample counts are tried in turn, until one reaches the goal. The converged gradient
+    is computed again, once, with more samples if its repeats do not agree well enough
+    or if a working gradient has more samples than it.
     """
     control = groups[0].control
     estimators = ", ".join(dict.fromkeys(group.estimator for group in groups))
@@ -520,10 +525,11 @@ def _render_with_depth(
 def _compare_depths(
     full: Sequence[_Rendering], shorter: Sequence[_Rendering]
 ) -> tuple[float, float]:
-    """Return the fraction of light that shorter paths lose, and the change of the image.
+    """Return the fraction of light that shorter paths lose, and the change of the
+    image.
 
-    The change is a root mean square in 8-bit levels. `full` and `shorter` have two
-    renderings each, with the same two seeds; noise does not count as a change.
+    The change is a root mean square in 8-bit levels, without noise. Both arguments have
+    two renderings, with the same two seeds.
     """
     difference_a, difference_b = (
         full_rendering.image - shorter_rendering.image
@@ -539,7 +545,10 @@ def _compare_depths(
 
 
 def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
-    """Return why a path length was chosen."""
+    """Return why light paths of `depth` segments were chosen, as a clause.
+
+    It has what they leave out, and what the next shorter ones would have.
+    """
     texts = []
     for cut in cuts:
         if cut.depth == depth:

@@ -87,18 +87,20 @@ def denoise_image(
     *,
     quick: bool = False,
 ) -> Tensor:
-    """Return a denoised image (H, W, C) of 3, 4 or 7 channels.
+    """Denoise a rendered image (H, W, C), where C is 3, 4 or 7.
 
     Args:
-        rendered: radiance; coverage, which stays as it is; and the change of the
-            radiance of the plane that takes the shadow in a photograph.
+        rendered: channels 0 to 2 are radiance; 3 is coverage, which stays as it is; 4
+            to 6 are the change of the radiance of the plane that takes the shadow in a
+            photograph.
         albedo, normal: as for `denoise`.
-        plane_radiance: (3,) without the object; None if there is no plane.
+        plane_radiance: (3,) of the plane without the object; None if there is no plane.
         quick: as for `denoise`.
     """
     color = rendered[..., :3].contiguous()
     channels = [denoise(color, albedo, normal, quick=quick), rendered[..., 3:4]]
     if plane_radiance is not None:
+        # nothing else has a normal
         is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
         channels.append(
             plane_radiance
@@ -115,21 +117,24 @@ def denoise_image(
 def _denoise_shade(
     change: Tensor, visible: Tensor, remove_noise: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """Return the denoised relative change (H, W, 3) of the plane.
+    """Denoise the change (H, W, 3) of the plane, relative to its radiance.
 
-    It is zero wherever nothing near it changes. What is denoised is continued below the
-    object, so that the shadow at its contact does not get lighter.
+    Before denoising, the change is continued below the object, so that the shadow at
+    its contact does not get lighter. Afterwards it is faded to zero where nothing near
+    it changes.
 
     Args:
         change: (H, W, 3) relative change times the visible fraction.
-        visible: (H, W, 1) visible fraction of a pixel.
+        visible: (H, W, 1) fraction of a pixel in which the plane is visible.
         remove_noise: denoises an image (H, W, 3) of numbers of at least 0.
     """
     both = torch.cat([change, visible], dim=-1)
+    # two box filters; the quotient is the mean change of what is visible nearby
     for _ in range(2):
         both = _average(both, FILL_RADIUS)
     filled = both[..., :3] / both[..., 3:].clamp_min(1e-4)
     full_change = (change + FILL_WEIGHT * filled) / (visible + FILL_WEIGHT)
+    # one more, since a change may be negative
     clean = remove_noise((1.0 + full_change).clamp_min(0.0).contiguous()) - 1.0
     magnitude = _average(change.abs().mean(dim=-1, keepdim=True), FADE_RADIUS)
     return clean * visible * (magnitude / MIN_CHANGE).clamp_max(1.0)
@@ -146,10 +151,10 @@ def _average(image: Tensor, radius: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _get_buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
-    """Return the buffers in which images of a size are denoised, in a thread.
+    """Return four buffers (H, W, 3) for images of one size in one thread.
 
-    With other memory the filter would be set up anew, which takes longer than to run
-    it.
+    They are cached: with other memory the filter would be set up anew, which takes
+    longer than to run it.
     """
     return [torch.zeros(*resolution, 3) for _ in range(4)]
 
@@ -158,8 +163,9 @@ def _compute_gain(radiance: Tensor) -> float:
     """Return the factor that gives an image the mean logarithmic luminance
     `KEY_LUMINANCE`.
 
-    The denoiser would find it by itself, but adds up in an order that depends on the
-    number of threads: by a few units in the last place. The image is (H, W, 3).
+    The mean is over bins of the image (H, W, 3), black ones left out, as the denoiser
+    itself computes it. Its own sum depends on the number of threads, by a few units in
+    the last place; this one does not.
     """
     luminance = (radiance.cpu().numpy() * LUMINANCE_WEIGHTS).sum(axis=-1)
     height, width = luminance.shape

@@ -113,7 +113,10 @@ def find_libraries(
 
 
 def _list_conda_patterns(prefix: str) -> list[str]:
-    """Return patterns for an active conda environment, relative to the root."""
+    """Return patterns of libLLVM files in a conda environment, relative to the root.
+
+    `prefix` is the environment's folder; there are no patterns if it is empty.
+    """
     if not prefix:
         return []
     relative = Path(prefix).relative_to(Path(prefix).anchor).as_posix()

@@ -184,6 +184,7 @@ def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> An
     attached = view.attach_hit(hit)[:3]
     local_values = [type(value)(dr.detach(value)) for value in attached]
     dr.enable_grad(local_values)
+    # local copies, at which the first step ends
     point, scaled_normal, shading_normal = local_values
 
     # Sum of W L J / J over all samples, attached to these points and normals.
@@ -213,11 +214,13 @@ def _sample_first_hits(
 ) -> tuple[Any, Any, Any]:
     """Sample film positions that see a moving mesh.
 
-    The film is cut into cells between pixel centers, with `spp` stratified samples in
-    each. Cells in a tile, `tile` cells wide, share their random numbers.
+    The film is cut into cells of one pixel between pixel centers, one more than pixels
+    along each side, with `spp` stratified samples in each. Cells in the same tile,
+    `tile` cells wide, have the same random numbers.
 
     Returns:
-        Film positions, their hits, and a sampler with the random numbers from there on.
+        Film positions in pixels; their hits; and a sampler that goes on with their
+        random numbers. Positions that see no moving mesh are left out.
     """
     n_columns = view.camera.width + 1
     n_rows = view.camera.height + 1
@@ -238,6 +241,7 @@ def _sample_first_hits(
     strata_across = _find_largest_divisor(spp)
     strata_shape = mi.Point2f(strata_across, spp // strata_across)
     stratum = mi.Point2f(sample % strata_across, sample // strata_across)
+    # the first cell begins half a pixel outside of the film
     film = mi.Point2f(column, row) - 0.5 + (stratum + sampler.next_2d()) / strata_shape
     hit = view.scene.ray_intersect_preliminary(
         view.camera.make_ray(film), coherent=True
@@ -259,9 +263,10 @@ def _find_largest_divisor(count: int) -> int:
 
 
 def _with_relative_gradient(value: Any) -> Any:
-    """Return 1 with the relative gradient of a value.
+    """Return 1, with the derivative of `value` divided by the value itself.
 
-    There is no gradient where the value is all but zero.
+    A factor f of an integrand can so be differentiated without changing the sample: 1
+    has the derivative df / f. Where the value is all but zero, there is no derivative.
     """
     constant = dr.detach(value)
     is_usable = dr.abs(constant) > 1e-20
@@ -373,17 +378,19 @@ def _sample_incoming(
 def _reflect_light(
     view: FilmView, moving_si: Any, si: Any, ds: Any, em_weight: Any, active: Any
 ) -> Any:
-    """Return reflected light that was sampled at emitters, from the moving point.
+    """Return the reflected light of emitters that were sampled, attached to the moving
+    point.
 
-    The emitter's point stays; the direction to it, the falloff with its distance and
-    the BSDF change, unless the emitter is infinitely far.
+    The point on the emitter stays. With the moving point the direction to it, the
+    falloff with distance and the BSDF change; of an infinitely far emitter only the
+    BSDF does.
 
     Args:
         view: the scene.
-        moving_si, si: the interaction, attached and detached.
-        ds: direction sample to the emitter.
-        em_weight: its radiance over its density.
-        active: where there is one.
+        moving_si, si: the surface interaction, attached and detached.
+        ds: Mitsuba's direction sample of the emitter.
+        em_weight: its radiance divided by the sample's density.
+        active: where there is a sample.
     """
     flags = ds.emitter.flags()
     is_near = active & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
@@ -394,6 +401,7 @@ def _reflect_light(
     attached_weight = dr.select(
         is_near, attached_weight / dr.select(is_near, ds.pdf, 1.0), em_weight
     )
+    # cosine at the emitter over the squared distance
     falloff = dr.dot(ds.n, ds.d) / dr.select(
         is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0
     )

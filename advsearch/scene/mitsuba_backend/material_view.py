@@ -33,6 +33,7 @@ class Camera:
     """
 
     def __init__(self, sensor: Any) -> None:
+        """Read size, position and projections of a Mitsuba sensor."""
         to_world = sensor.world_transform()
         self.width, self.height = (int(size) for size in sensor.film().crop_size())
         self.pixels = self.width * self.height
@@ -102,7 +103,7 @@ class TriMesh:
         return dr.fma(second_end - first_end, to_drjit_float(fraction), first_end)
 
     def get_gradients(self) -> dict[str, Tensor]:
-        """Return the gradients by vertices and by normals, (V, 3) each."""
+        """Return the gradients by `NAME.vertices` and `NAME.normals`, (V, 3) each."""
         arrays = {
             f"{self.name}.vertices": self.positions,
             f"{self.name}.normals": self.normals,
@@ -181,7 +182,7 @@ class FilmView:
             dr.clip(cell_position.x, 0, width), dr.clip(cell_position.y, 0, height)
         )
         fraction = padded_film - mi.Point2f(cell)
-        # index of the cell's upper left corner in the padded image
+        # index of its upper left corner in the padded image, two columns wider
         corner = cell.y * (width + 2) + cell.x
         cell_corners = [
             dr.gather(mi.Color3f, self.padded_cotangent, corner + offset, active)
@@ -393,6 +394,7 @@ def compute_outline_term(
     point_behind, _, _, moves_behind = view.attach_hit(hit)
     film_behind = dr.select(moves_behind, view.camera.project(point_behind), 0.0)
     speed = dr.dot(film_normal, edge_film - film_behind)
+    # minus: where the outline moves outwards, the radiance behind is lost
     return dr.sum(strength * speed) * -sampled.pixels_per_sample
 
 
@@ -406,13 +408,13 @@ class _OutlineSamples(NamedTuple):
 
 
 def _to_space_fraction(film_fraction: Tensor, depth: Tensor) -> Tensor:
-    """Return how far along edges in space points are: halfway on the film is not
-    halfway.
+    """Convert positions along edges on the film to positions along edges in space.
 
-    Fractions (N,) grow from the first end of an edge to the second.
+    Both are fractions (N,) from the first end of an edge to the second. They differ as
+    the nearer half of an edge is longer on the film.
 
     Args:
-        film_fraction: (N,) how far along the edges they are on the film.
+        film_fraction: (N,) fractions on the film.
         depth: (N, 2) of both ends.
     """
     weighted = film_fraction * depth[:, 0]
@@ -420,11 +422,14 @@ def _to_space_fraction(film_fraction: Tensor, depth: Tensor) -> Tensor:
 
 
 def _measure_on_film(camera: Camera, a: Tensor, b: Tensor, depth: Tensor) -> Tensor:
-    """Return the lengths (N,) of edges on the film; 0 outside of it or too near.
+    """Return the lengths (N,) of edges on the film, in pixels.
+
+    The length is 0, which leaves the edge out, if an end is too near to the camera, or
+    if the edge is outside of the film by more than half a pixel.
 
     Args:
         camera: the camera.
-        a, b: (N, 2) ends of the edges on the film.
+        a, b: (N, 2) ends of the edges on the film, pixels.
         depth: (N, 2) of both ends.
     """
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
@@ -450,9 +455,13 @@ def _find_film_normals(edge: Tensor, outwards: Tensor) -> Tensor:
 def _sample_outline(
     camera: Camera, mesh: TriMesh, random: Tensor
 ) -> _OutlineSamples | None:
-    """Sample the outline evenly by its length on the film, hidden parts included.
+    """Sample points on a mesh's outline, evenly by its length on the film.
 
-    The random numbers are (n,) in [0, 1). None if no outline is in the image.
+    Points that something else hides are among them. `random` are (n,) numbers in [0,
+    1).
+
+    Returns:
+        The samples; None if no outline is in the image.
     """
     eye = torch.tensor([axis[0] for axis in camera.eye], dtype=torch.float64)
     forward = torch.tensor([axis[0] for axis in camera.forward], dtype=torch.float64)
@@ -475,6 +484,7 @@ def _sample_outline(
     normal = _find_film_normals(
         b[edge_index] - a[edge_index], outwards_on_film[edge_index]
     )
+    # even on the film is not even in space
     fraction = _to_space_fraction(film_fraction, depth[edge_index])
     pixels_per_sample = float(length.sum()) / len(random)
     return _OutlineSamples(ends[edge_index], fraction, normal, pixels_per_sample)
@@ -565,13 +575,16 @@ def compute_shadow_term(
     """Return a value whose gradient is the shadow term of one mesh.
 
     A line that touches the mesh at an edge separates light that passes from light that
-    is blocked, and ends at a lit point, where the shadow's border lies. That point
-    counts by what the light past the edge adds to the image, and by the border's speed,
-    relative to the lit surface if that moves too.
+    is blocked. It ends at a lit point, where the border of a shadow lies. That point
+    counts by what the light past the edge adds to the image, and by the speed of the
+    border, relative to the lit surface if that moves too.
+
+    Of all sampled lines (`sampled`), `shadow` has those that end in a point which the
+    camera sees; its `sample_index` selects them from `sampled`.
 
     Args:
         view, seed, mesh_index, spp: as for `compute_outline_term`.
-        mesh: one that moves, or one that stands still and may shade it.
+        mesh: one that moves, or one that stands still and may cast a shadow.
     """
     stream = make_stream(seed, _SHADOWS, mesh_index)
     random = sample_uniform(stream, spp * view.camera.pixels, 4)
@@ -583,7 +596,7 @@ def compute_shadow_term(
     if shadow is None:
         return mi.Float(0)
     lit_point, _, _, lit_point_moves = view.attach_hit(shadow.hit)
-    # of the angle between each line and its edge
+    # of the angle between each line and its edge: an edge along the line sweeps no area
     sine = torch.linalg.cross(
         sampled.direction, _compute_edge_directions(mesh.vertices, sampled.ends)
     ).norm(dim=1)
@@ -594,6 +607,8 @@ def compute_shadow_term(
         shadow.edge_normal, edge_point - dr.select(lit_point_moves, lit_point, 0.0)
     )
     return (
+        # minus: where the edge moves outwards, light is blocked; the last factor is the
+        # measure of lines that one sample stands for
         dr.sum(shadow.strength * to_drjit_float(sine[shadow.sample_index]) * speed)
         * -sampled.measure_per_sample
     )
@@ -611,9 +626,11 @@ class _ShadowBorders(NamedTuple):
 def _sample_shadow_borders(
     view: FilmView, mesh: TriMesh, sampled: _TangentSamples, stream: int
 ) -> _ShadowBorders | None:
-    """Return where lines that touch a mesh end in lit points; None if none does.
+    """Find the lines whose end is lit and seen by the camera; None if there is none.
 
-    Arguments are those of `compute_shadow_term`.
+    A line comes from the light, touches the mesh at an edge and ends at the next
+    surface. Arguments are those of `compute_shadow_term`; `stream` is that of its
+    random numbers.
     """
     edge_points = torch.lerp(
         mesh.vertices[sampled.ends[:, 0]],
@@ -652,12 +669,13 @@ def _sample_shadow_borders(
 
 
 def _eval_lit_points(view: FilmView, si: Any, d: Any) -> Any:
-    """Return how lit points count in the image, for light from direction d.
+    """Return the factor (RGB) by which light from direction d at lit points counts in
+    the image.
 
-    That is the cotangent at the point's pixel, times the BSDF and its cosine, times the
-    area on the film of what a line's spread in space and angle covers at the point; 0
-    where the camera does not see it. (W, f and J' of the formula in
-    `material_adjoint`.)
+    It is the cotangent at the point's pixel, times the BSDF with its cosine, times the
+    area on the film of what one unit of a line's spread in space and angle covers
+    around the point: W, f and J' of the formula in `material_adjoint`. It is 0 where
+    the camera does not see the point.
     """
     camera = view.camera
     film = camera.project(si.p)
@@ -734,14 +752,15 @@ def _orient_outwards(vectors: Tensor, directions: Tensor) -> Tensor:
 
 
 def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
-    """Sample points on edges and lines through them that touch the mesh there, evenly.
+    """Sample lines that touch the mesh at points of its edges, evenly.
 
-    The lines through a point of an edge that have both faces on one side fill the
-    exterior angle of the edge, to either side. An edge with one face lets every line
-    pass.
+    Lines through a point of an edge have both of its faces on one side if they lie
+    within the edge's exterior angle, or opposite to it. At an edge with one face every
+    line does.
 
     Args:
-        random: (n, 4) in [0, 1).
+        mesh: the mesh.
+        random: (n, 4) in [0, 1), for the edge, the point, and both angles of the line.
 
     Returns:
         The samples; None if there is nothing to sample.
@@ -762,7 +781,8 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
     perpendicular = (
         torch.cos(angle) * along_second + torch.sin(angle) * edges.opening[edge_index]
     )
-    # The sign chooses the side, the rest is the cosine with the edge.
+    # from -2 to 2: the sign chooses the exterior angle or its opposite, and the
+    # magnitude minus 1 is the cosine with the edge
     edge_cosine = 4.0 * random[:, 3:4] - 2.0
     perpendicular = torch.where(edge_cosine < 0.0, -perpendicular, perpendicular)
     edge_cosine = edge_cosine.abs() - 1.0
@@ -779,6 +799,7 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
         fraction=random[:, 1],
         direction=direction,
         normal=normal,
+        # two sides, and cosines from -1 to 1
         measure_per_sample=4.0 * float(measure.sum()) / len(random),
     )
 
@@ -805,9 +826,10 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     """
     vertices = mesh.vertices
     ends, owner, across = _find_edges(vertices, mesh.corners)
-    # Sides of faces edge by edge; those of an edge end at entry `last`.
+    # sides of faces, edge by edge
     order = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
+    # of each edge, in that order
     last_entry = n_faces.cumsum(dim=0) - 1
     length = (vertices[ends[:, 1]] - vertices[ends[:, 0]]).norm(dim=1)
     is_measured = (n_faces <= 2) & (length > 0.0)
@@ -838,17 +860,20 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
 def _measure_between_faces(
     along_first: Tensor, along_second: Tensor, axis: Tensor, is_single: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return where the exterior angles of edges open to (N, 3), and their sizes (N,).
+    """Measure the exterior angles of edges: pi minus the angle between both faces.
 
-    The directions of an exterior angle are cos(t) along_second + sin(t) opening, with t
-    from 0 to the angle: it is pi minus the angle between the faces, and pi at a single
-    face.
+    At an edge with a single face it is pi.
 
     Args:
         along_first, along_second: (N, 3) unit vectors along both faces, perpendicular
             to the edge.
         axis: (N, 3) unit vectors along the edges.
         is_single: (N,) whether an edge has only one face.
+
+    Returns:
+        (N, 3) unit vectors `opening`, and (N,) angles: the directions within an
+        exterior angle are cos(t) along_second + sin(t) opening, for t from 0 to the
+        angle.
     """
     cosine = (along_first * along_second).sum(dim=1, keepdim=True)
     perpendicular = along_first - cosine * along_second

@@ -114,8 +114,8 @@ def make_emitter(part: MeshPart) -> Plugin | None:
 def compute_sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
     """Return how often light is sampled from each mesh that emits some, by its name.
 
-    The environment has a weight of 1. All meshes together have 1 too, by their power;
-    however small that is, each has at least `MIN_WEIGHT_FRACTION` of an equal fraction.
+    The environment has the weight 1, and all meshes together have 1 too. They share it
+    by their power, but each has at least `MIN_WEIGHT_FRACTION` of an equal part.
     """
     powers: dict[str, float] = {}
     for part in parts:
@@ -157,7 +157,9 @@ def make_texture(linear: Float32Array) -> Plugin:
 def map_inner_plugins(
     plugin: Mapping[str, object], change: Callable[[Mapping[str, object]], object]
 ) -> Plugin:
-    """Return a plugin whose inner plugins are changed, those directly in it."""
+    """Return a plugin in which each of its direct inner plugins is replaced by its
+    change.
+    """
     return {
         key: change(entry) if isinstance(entry, Mapping) else entry
         for key, entry in plugin.items()
@@ -170,8 +172,10 @@ def fill_base_color(
     """Return one of Mitsuba's surfaces with its base color put in.
 
     Args:
-        surface: a dictionary that has `BASE_COLOR` as a type.
-        fill: makes the base color's texture from how it is looked up.
+        surface: a dictionary, in which a plugin of the type `BASE_COLOR` stands for the
+            base color.
+        fill: makes the texture from the other entries of that plugin, which say how it
+            is looked up.
     """
 
     def fill_in(plugin: Mapping[str, object]) -> object:
@@ -268,8 +272,9 @@ def make_mitsuba_mesh(
 def to_loadable(plugin: Mapping[str, object]) -> Plugin:
     """Return a dictionary that Mitsuba loads.
 
-    It has Mitsuba's transforms for arrays (4, 4) and (3, 3), its bitmaps for images
-    (H, W, C), and principled surfaces without the values of `BLACK_METAL_VALUES`.
+    Arrays of shape (4, 4) and (3, 3) become Mitsuba's transforms, others its bitmaps
+    (H, W, C). Principled surfaces get the nearest values that Mitsuba takes in place of
+    those in `BLACK_METAL_VALUES`.
     """
     entries = {key: _to_loadable_entry(value) for key, value in plugin.items()}
     if entries.get("type") == "principled":

@@ -36,25 +36,27 @@ DIFFERENCES_FIRST = (*DIFFERENCES_ONLY, "adjoint")
 def find_plugin_numbers(
     description: SceneDescription, name: str, keys: tuple[str, ...]
 ) -> tuple[PluginNumber, ...]:
-    """Return some numbers and colors of a scene by Mitsuba's keys, each once.
+    """Return the numbers and colors of a scene that have some of Mitsuba's keys, each
+    once.
 
-    `KEY.red` is a channel of the color KEY.
+    For `KEY.red`, a channel of the color KEY, the full color is returned.
 
     Args:
         description: the scene.
-        name: of the part that they will be in, with which their inputs begin, but for
-            those that the scene has as other inputs.
-        keys: Mitsuba's.
+        name: of the part that will hold them: an input is called `name.KEY`, unless the
+            scene has an input for this number already.
+        keys: Mitsuba's keys.
 
     Raises:
         UnknownNameError: the scene has no such key; the message has near ones.
-        InputError: it is something else than a number or a color.
+        InputError: there is something else than a number or a color.
     """
     numbers, other_types = _find_numbers(description)
     color_of_channel: dict[str, str] = {}
     for key, plugin_number in numbers.items():
         if len(plugin_number.values) > 1:
             color_of_channel |= {f"{key}.{channel}": key for channel in CHANNELS}
+    # in the requested order, a color with several channels once
     keys = tuple(dict.fromkeys(color_of_channel.get(key, key) for key in keys))
     for key in keys:
         if key in other_types:
@@ -75,11 +77,11 @@ def find_plugin_numbers(
 def _find_numbers(
     description: SceneDescription,
 ) -> tuple[dict[str, PluginNumber], dict[str, str]]:
-    """Find all numbers and colors of a scene; that of the last description is
-    remembered.
+    """Find all numbers and colors of a scene; the result for the last scene is cached.
 
     Returns:
-        Them by their key, with an input if they have one; and the type of the rest.
+        The numbers and colors by Mitsuba's key, with the name of the scene's own input
+        if there is one; and the type of everything else by its key, for messages.
     """
     scene = MitsubaScene(description, SMALL_RESOLUTION)
     inputs = {

@@ -87,9 +87,11 @@ def _compute_cap_height(
 
 
 def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
-    """Return the index of the highest drop in each cell, as in `sample_raindrops`.
+    """Return the index (GRID, GRID) of the highest drop in each cell, as
+    `sample_raindrops`.
 
-    Drops (count, 4) and the half width of the sheet are as there too.
+    `drops` (count, 4) and the half width of the sheet are those of `sample_raindrops`.
+    A cell without a drop has the index `count`.
     """
     cell_centers = (
         np.arange(GRID_SIZE) + 0.5
@@ -308,11 +310,17 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
     def _find_haze_segment(
         self, origin: Any, direction: Any, max_distance: Any
     ) -> tuple[Any, Any]:
-        """Return where the haze starts on a segment, and its length (0 for a miss).
+        """Find where a segment is in the haze, a ball around the coordinates' origin.
 
-        The segment begins at an origin in a unit direction; the haze fills the ball
-        around the coordinates' origin.
+        Args:
+            origin, direction: of the segment; the direction has length 1.
+            max_distance: length of the segment.
+
+        Returns:
+            The distance at which the haze begins, and the length in it, 0 if there is
+            none.
         """
+        # along the ray, where it is nearest to the center of the ball
         closest_distance = -dr.dot(origin, direction)
         # 0 where the ray passes the ball: then the length is 0 too
         half_chord = dr.sqrt(
@@ -379,7 +387,11 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
 
 
 def _make_event(ray: Any, si: Any, scattered: Any, distance: Any) -> Any:
-    """Return the interaction at a surface, or where the haze scatters the light."""
+    """Return the interaction of one event of a path.
+
+    Where `scattered`, that is the point of the haze at `distance` along the ray, else
+    the surface hit `si`.
+    """
     event = dr.zeros(mi.Interaction3f)
     event.t = dr.select(scattered, distance, si.t)
     event.p = dr.select(scattered, ray(distance), si.p)
@@ -409,6 +421,13 @@ class _PlaneHits:
     """
 
     def __init__(self, scene: Any, sampler: Any, ray: Any, active: Any) -> None:
+        """Intersect camera rays with the plane, and sample what it does to the light.
+
+        `is_hit` is where a ray meets the plane, `direct_change` the change of its
+        direct light, `path_ray` the ray by which the path goes on: bounced there,
+        unchanged elsewhere. `is_traced` is where there is such a ray, and `weight` its
+        factor after the bounce.
+        """
         plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
@@ -427,11 +446,12 @@ class _PlaneHits:
         self.is_traced = active & (~self.is_hit | (bounce.pdf > 0.0))
 
     def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
-        """Sample an emitter, and return its radiance over the density.
+        """Sample an emitter from the plane, and return its radiance over the density.
 
-        The factor by which that changes the plane is stored: what the plane reflects of
-        it, with -1 for the environment where something is in between, and 0 where
-        nothing is; for lamps it is the other way around, 0 and 1.
+        `_factor` is set to what the object changes: the light that the plane reflects,
+        times -1 for light of the environment that something blocks and 0 for what
+        passes; for a lamp, which the photograph does not have, 0 for what is blocked
+        and 1 for what passes.
         """
         si = self._si
         ds, light = scene.sample_emitter_direction(
@@ -448,7 +468,10 @@ class _PlaneHits:
         return light
 
     def backpropagate(self, scene: Any, cotangent: Any) -> None:
-        """Add the derivative of `cotangent * direct_change` by lights."""
+        """Add the derivatives of `cotangent * direct_change` by the lights' parameters.
+
+        The emitter sample is that of the primal pass, evaluated again with gradients.
+        """
         ds = self._emitter_sample
         is_sampled = self.is_hit & (ds.pdf != 0.0)
         with dr.resume_grad():
@@ -489,7 +512,13 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
         δaovs: Any = None,
         **rest: Any,
     ) -> Any:
-        """Sample paths, or replay them; see `mi.ad.integrators.common.RBIntegrator`."""
+        """Sample paths of light, or in the adjoint modes replay them.
+
+        Where a ray meets the plane that takes the shadow, the color is 0, and the
+        change of the plane's radiance is returned in three further channels (`δaovs`
+        are their cotangents). Arguments and results are those of
+        `mi.ad.integrators.common.RBIntegrator`.
+        """
         plane = _PlaneHits(scene, sampler, mi.Ray3f(dr.detach(ray)), mi.Bool(active))
         if mode != dr.ADMode.Primal:
             change = mi.Spectrum(*δaovs)
@@ -606,6 +635,7 @@ def _refract_through_drop(
         The direction behind the drop, not normalised; the fraction of the light that
         passes; and whether the ray is lost by total reflection.
     """
+    # Snell's law at the flat side, whose normal is z
     inside_direction = mi.Vector3f(
         direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0
     )
@@ -618,6 +648,7 @@ def _refract_through_drop(
     # From the center of curvature: where the ray enters, and where it leaves.
     entry = mi.Vector3f(dx, dy, dr.safe_sqrt(drop.w * drop.w - drop.z * drop.z))
     entry_cosine = dr.dot(entry, inside_direction)
+    # along the ray inside, to the sphere of the cap
     exit_distance = (
         dr.safe_sqrt(
             entry_cosine * entry_cosine - dr.squared_norm(entry) + drop.w * drop.w
@@ -628,6 +659,7 @@ def _refract_through_drop(
     normal = exit_point / drop.w
 
     cos_inside = dr.dot(inside_direction, normal)
+    # Snell's law at the cap; below 0 is total reflection
     cos_outside_squared = 1.0 - WATER_IOR * WATER_IOR * (1.0 - cos_inside * cos_inside)
     cos_outside = dr.safe_sqrt(cos_outside_squared)
     outside_direction = (
@@ -755,11 +787,13 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             self._sheet_half_width = half_width
 
     def _bend_by_drops(self, direction: Any, sample: Any) -> tuple[Any, Any]:
-        """Refract the rays that meet a drop.
+        """Refract the rays that pass through a raindrop on the sheet before the camera.
+
+        `sample` chooses the point of the aperture: drops are near, and so out of focus.
 
         Returns:
-            The unit directions, and the fraction of the light that passes (1 without a
-            drop, 0 where a drop reflects it inside).
+            The unit directions, and the fraction of the light that passes: 1 without a
+            drop, 0 where a drop reflects all of it inside.
         """
         aperture_point = APERTURE_RADIUS * mi.warp.square_to_uniform_disk_concentric(
             sample
@@ -817,9 +851,11 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         dr.eval(self.rays)
 
     def _look_up_direction(self, position: Any) -> tuple[Any, Any]:
-        """Return the unit direction at a position in [0, 1]^2 of the image.
+        """Return the ray direction at a position in [0, 1]^2 of the image, from the ray
+        table.
 
-        The second value is whether the lens has a direction there at all.
+        It is interpolated between the four nearest points of the table. The second
+        value is whether the lens has a direction there at all.
         """
         n_columns, n_rows = self._grid_cells
         x = position.x * n_columns

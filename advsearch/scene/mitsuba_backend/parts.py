@@ -119,7 +119,8 @@ class SceneInput:
 def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
     """Return the one parameter of Mitsuba that an input means; None without one.
 
-    Raises RuntimeError if there are several.
+    The input's key may have an asterisk for any text. If the input has an owner, only
+    that object's parameters count. Raises RuntimeError if there are several.
     """
     prefix, asterisk, suffix = scene_input.key.partition("*")
 
@@ -345,7 +346,11 @@ def _translate_spot_lamp(part: parts.SpotLamp) -> Translation:
 
 @translate_part.register
 def _translate_ball_lamp(part: parts.BallLamp) -> Translation:
-    """Return a ball that shines; its pose scales a unit sphere, without a surface."""
+    """Return a lamp that is a shining ball.
+
+    It is a unit sphere under a pose that scales and moves it. It has no surface of its
+    own ("null"), so that light passes it.
+    """
     pose = mi.ScalarTransform4f().translate(list(part.center)).scale(part.radius)
     ball = {
         "type": "sphere",
@@ -631,13 +636,14 @@ CAMERA_KEYS = {
 def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
     """Return the inputs of camera, environment and ground.
 
-    Our field of view is along the larger side of the image, Mitsuba's along the width.
+    `resolution` is (height, width): `camera.fov` is along the image's larger side, and
+    is converted to Mitsuba's, which is along the width.
     """
     height, width = resolution
 
     def to_horizontal_fov(value: Any) -> Any:
         half_angle = dr.deg2rad(value.array) / 2.0
-        # of the width, which is not the larger side of an upright image
+        # an upright image is narrower than its larger side
         half_tangent = dr.tan(half_angle) * min(1.0, width / height)
         return mi.Float(2.0 * dr.rad2deg(dr.atan(half_tangent)))
 

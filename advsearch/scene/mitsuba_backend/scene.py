@@ -109,6 +109,7 @@ class MitsubaScene:
         sampler: str = SAMPLER,
         integrator: str = "prb",
     ) -> None:
+        """Load a description into Mitsuba; arguments are those of the class."""
         with mitsuba_lock:
             # it registers the plugins, which needs the variant
             import advsearch.scene.mitsuba_backend.own_plugins  # noqa: F401
@@ -182,9 +183,9 @@ class MitsubaScene:
 
     def _load_scene(self) -> list[parts.SceneInput]:
         """Load Mitsuba's scene, and return the inputs that it may have."""
-        description, filter = self.definition
+        description, filter_name = self.definition
         plugins = parts.make_scene_dict(
-            description, self.resolution, filter, self.sampler
+            description, self.resolution, filter_name, self.sampler
         )
         with parts.convert_refusals(description):
             lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
@@ -209,7 +210,11 @@ class MitsubaScene:
         return inputs
 
     def _declare_inputs(self, inputs: Sequence[parts.SceneInput]) -> None:
-        """Set `declared`, `names` and `interior` by the inputs that the scene has."""
+        """Set `declared_inputs` and what follows from it, by the inputs that the scene
+        really has.
+
+        An input is left out if Mitsuba has no parameter for it.
+        """
         self.declared_inputs = dict[str, tuple[str, parts.SceneInput]]()
         for scene_input in inputs:
             key = parts.find_key(self.parameters, scene_input)
@@ -244,14 +249,16 @@ class MitsubaScene:
 
         What may change is `max_depth`, `sampler`, `integrator` and `leave_out`.
         """
-        description, filter = self.definition
+        description, filter_name = self.definition
         settings = {
             "max_depth": self.max_depth,
             "leave_out": self._leave_out,
             "sampler": self.sampler,
             **changes,
         }
-        other = MitsubaScene(description, self.resolution, filter=filter, **settings)
+        other = MitsubaScene(
+            description, self.resolution, filter=filter_name, **settings
+        )
         # An integrator that is loaded later makes the recordings of all scenes stale.
         for method in ("path", "guides"):
             other._integrator(method)
@@ -410,9 +417,10 @@ class MitsubaScene:
             return self._scene
 
     def set_geometry(self, inputs: Mapping[str, Tensor]) -> None:
-        """Set the vertices and normals of these inputs, if others are set.
+        """Set the vertices and normals among some inputs, unless they are set already.
 
-        All other inputs may then have any value.
+        If anything has to be set, all of `inputs` are; otherwise other inputs keep the
+        values that they have.
         """
         requested = {name: inputs[name] for name in inputs if name in self._buffers}
         applied = {
@@ -516,7 +524,12 @@ class MitsubaScene:
     def _tracked(
         self, names: Sequence[str], inputs: Mapping[str, Tensor]
     ) -> Iterator[dict[str, Any]]:
-        """Set inputs as Dr.Jit tensors with gradients, and put the old values back."""
+        """Set inputs as Dr.Jit tensors with gradients inside the `with`; then restore
+        them.
+
+        `inputs` gives their values; those of other `names` stay as they are. Yields the
+        tensors by name.
+        """
         old_values = dict[str, Any]()
         tracked = dict[str, Any]()
         level = mi.log_level()
@@ -524,6 +537,7 @@ class MitsubaScene:
             for name in names:
                 key, scene_input = self.declared_inputs[name]
                 value = self.parameters[key]
+                # a copy: the parameter itself is replaced below
                 old_values[key] = type(value)(value)
                 if name in inputs:
                     tracked[name] = mi.TensorXf(scene_input.to_rendered(inputs[name]))
@@ -553,11 +567,15 @@ class MitsubaScene:
         *,
         meshes: Collection[str],
     ) -> dict[str, Tensor]:
-        """Return the gradient by the vertices and normals of some meshes.
+        """Return the gradient by the vertices and normals of some meshes, by the
+        material form.
 
-        It is that of the material form. The inputs have `NAME.vertices` and
-        `NAME.normals` of each mesh, `spp` is the number of samples of the interior
-        term; other arguments as for `adjoint`.
+        Args:
+            inputs: as in `render_images`; they include `NAME.vertices` and
+                `NAME.normals` of each of the meshes.
+            cotangent, seed: as for `render_adjoint`.
+            spp: samples per pixel of the interior term.
+            meshes: names of the meshes.
         """
         with mitsuba_lock:
             # few scenes search a material
@@ -592,11 +610,11 @@ class MitsubaScene:
     def collect_paths(
         self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int
     ) -> Paths:
-        """Collect light paths for an input that is a base color or a projector's
-        pattern.
+        """Trace light paths, and collect where they depend on one texture.
 
-        Their vertices have the change of their pixel for a unit more of the input, and
-        the paths have an image. Other arguments as for `pictures`.
+        The texture `name` is a base color or a projector's pattern. Each vertex has the
+        change of its pixel for a unit more of the texture; and the paths have an image.
+        Other arguments as for `render_images`.
         """
         with mitsuba_lock, self._crop_film():
             self._set(inputs)
@@ -646,9 +664,10 @@ class MitsubaScene:
     def _set(self, inputs: Mapping[str, Tensor]) -> None:
         """Set exactly these inputs, and everything else to its base value.
 
-        It does nothing for what is set already. Vertices are written into the memory
-        where they are: recordings refer to it. Numbers that Mitsuba takes for constants
-        are part of a recording, so that every change makes all recordings stale.
+        What is set already is not touched. Vertices are overwritten in their memory, to
+        which recordings refer. Numbers that Mitsuba takes for constants are part of the
+        recordings, so that a change of one makes all recordings stale
+        (`population.changes`).
         """
         self._check_known(inputs)
         if self._every:
@@ -682,7 +701,10 @@ class MitsubaScene:
             )
 
     def _find_changes(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor | None]:
-        """Return the values that differ from what is set; None means the base value."""
+        """Return the inputs whose values differ from those that are set.
+
+        None as a value means that the input goes back to its base value.
+        """
         reset = [name for name in self._applied if name not in inputs]
         changes: dict[str, Tensor | None] = dict.fromkeys(reset)
         for name, tensor in inputs.items():
@@ -698,7 +720,12 @@ class MitsubaScene:
         return changes
 
     def _write(self, name: str, fresh: Tensor | None) -> None:
-        """Write a value, or None for the base value, to Mitsuba's parameter."""
+        """Write the value of an input, or its base value if `fresh` is None, to
+        Mitsuba.
+
+        At the first write the base value is stored. Vertices and normals are written
+        into the memory that they have.
+        """
         key, scene_input = self.declared_inputs[name]
         current = self.parameters[key]
         if fresh is not None and scene_input.shape is not None:
@@ -728,8 +755,10 @@ class MitsubaScene:
             self.parameters[key] = value
 
     def _integrator(self, method: str) -> Any:
-        """Return the integrator of a method, at the current depth; load it on first
-        use.
+        """Return the integrator of a method at the current depth, loaded on first use.
+
+        The methods are "path", "hidden", which hides the environment, "guides" for the
+        denoiser, and "boundary" with the terms of moving outlines.
         """
         key = method, self.depth
         if key not in self._integrators:
@@ -761,10 +790,13 @@ class MitsubaScene:
 def _to_repeating(
     uv: Tensor, surface: Mapping[str, object] | None, size: tuple[int, int]
 ) -> Tensor:
-    """Return where look-ups that repeat at the border find what is shown at `uv`.
+    """Convert texture coordinates so that a look-up which repeats shows the same.
 
-    The surface is one of Mitsuba's own; None stands for a projector's image (rows,
-    columns), which ends at the border.
+    Args:
+        uv: (n, 2) texture coordinates.
+        surface: one of Mitsuba's own surfaces; None for a projector's image, which ends
+            at its border instead.
+        size: rows and columns of the texture.
     """
     if surface is None:
         half_texel = 0.5 / torch.tensor(size[::-1])

@@ -109,10 +109,11 @@ def read_scene_dict(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[st
 
 
 def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
-    """Raise InputError unless entries are numbers where they are read here.
+    """Check that some entries of a plugin are numbers, since they are read here.
 
-    Mitsuba checks all other entries. Colors count as numbers of their own; other
-    plugins are checked inside. `where` is the beginning of an error.
+    All other entries are checked by Mitsuba. A color counts as an entry; other inner
+    plugins are checked like this one. `where` is the beginning of an error. Raises
+    InputError.
     """
     for key, value in plugin.items():
         is_color = isinstance(value, Mapping) and value.get("type", "rgb") in (
@@ -258,9 +259,10 @@ def import_mitsuba_scene(
 def _find_shape(
     named: Mapping[str, Mapping[str, object]], object_id: str, where: str
 ) -> str:
-    """Return the id of a shape, or that of the only one with the same letters.
+    """Return the id of a shape, or that of the only one whose letters and digits are
+    the same.
 
-    Case and signs do not count. Raises UnknownNameError: there are none, or several.
+    Case and signs do not count. Raises UnknownNameError: there is none, or several.
     """
 
     def letters_of(name: str) -> str:
@@ -276,7 +278,11 @@ def _find_shape(
 
 
 def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
-    """Return whether the first camera's upwards axis is rather z than y; else y is."""
+    """Return whether z is the upward axis of a scene, and not y.
+
+    The first camera that has a pose decides: which axis is its own upward axis nearer
+    to?
+    """
     posed_sensors = [
         plugin
         for plugin in named.values()
@@ -328,7 +334,7 @@ def _paint(
         where: the scene, for errors.
     """
     if surface.is_textured or surface.is_bound:
-        # the transform is that of coordinates with v downwards
+        # flip v, transform, and flip it back
         file_uvs = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
         file_uvs = file_uvs @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
         uvs = (file_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
@@ -370,10 +376,12 @@ def _rename_references(plugin: Mapping[str, object]) -> Plugin:
 def _find_surface(
     shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]
 ) -> Mapping[str, object]:
-    """Return the surface of a shape, with its references resolved.
+    """Return the surface of a shape, with its references replaced by what they refer
+    to.
 
-    It is the shape's first entry that is neither a light nor a medium, or Mitsuba's
-    default. Raises UnknownNameError: a reference leads nowhere, or round in a circle.
+    It is the shape's first inner plugin that is neither a light nor a medium; without
+    one, Mitsuba's default. Raises UnknownNameError: a reference leads nowhere, or in a
+    circle.
     """
     n_plugins = 0
 
@@ -388,6 +396,7 @@ def _find_surface(
             )
         if plugin["type"] == "ref":
             name = str(plugin["id"])
+            # more references than plugins: they go in a circle
             if name not in named or depth > len(named):
                 raise UnknownNameError("material of the scene", name, list(named))
             return resolve(named[name], depth + 1)
@@ -445,8 +454,8 @@ def _describe_left_out(
     Args:
         tree: the scene.
         shape: the object's.
-        hazy: the camera's medium is the scene's haze.
-        lit: the object keeps its light.
+        hazy: whether the camera's medium is rendered, as the scene's haze.
+        lit: whether the object keeps its light.
     """
     for name, plugin in _list_plugins(tree):
         if plugin["type"] in INTEGRATOR_TYPES:
@@ -591,7 +600,11 @@ class _ObjectFrame:
         return entries
 
     def _move_lamp(self, plugin: Mapping[str, object]) -> Plugin:
-        """Move a lamp and scale its power, which is a quantity of squared lengths."""
+        """Move a lamp, and scale its power.
+
+        Lengths become smaller by the object's size; the intensity of a lamp is
+        irradiance times a squared length, so it is divided by the squared size.
+        """
         kind = str(plugin["type"])
         entries = dict(plugin)
         if "position" in entries:

@@ -139,6 +139,7 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     # v points up in our meshes, and down in Mitsuba's
     uvs = uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
     normal_sign = -1.0 if shape.get("flip_normals") else 1.0
+    # NaN where a face has no area
     normals = np.nan_to_num(normals)[used_vertices] * normal_sign
     if (
         np.einsum("fk,fck->", compute_area_vectors(vertices[faces]), normals[faces])
@@ -159,7 +160,10 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
 def _select_vertices(
     attributes: Mapping[str, Float32Array], index: IntArray
 ) -> dict[str, Float32Array]:
-    """Return attributes in which those of vertices are selected by an index."""
+    """Return attributes with the rows of those vertices that an index selects.
+
+    Attributes of faces ("face_...") stay as they are.
+    """
     return {
         key: values[index] if key.startswith("vertex_") else values
         for key, values in attributes.items()
@@ -272,9 +276,10 @@ def _get_radius(shape: Mapping[str, object]) -> float:
 
 
 def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
-    """Return the (4, 4) pose of the unit cylinder along z that is a given cylinder.
+    """Return the pose (4, 4) that makes the unit cylinder along z the cylinder of a
+    shape.
 
-    It has `radius`, and goes from `p0` to `p1`.
+    The shape has `radius`, and goes from `p0` to `p1`.
     """
     start = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), np.float64)
     end = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), np.float64)
@@ -375,13 +380,14 @@ def find_haze(
 def _read_haze_medium(
     medium: Mapping[str, object], matrix: Float64Array
 ) -> tuple[float, tuple[float, float, float]] | None:
-    """Return extinction, in the object's lengths, and albedo of a medium.
+    """Return the extinction, per length of the object, and the albedo of a medium.
 
-    None if it is not grey, or out of range (comparisons with NaN are false); `matrix`
-    is as in `find_haze`.
+    None if it is not grey or out of range; numbers that are not understood are NaN, for
+    which all comparisons are false. `matrix` is as in `find_haze`.
     """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
+    # how many lengths of the object one length of the scene has
     object_size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / object_size
     is_grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MAX_EXTINCTION
@@ -614,16 +620,18 @@ def _apply_uv_transform(
 def _with_transform(
     plugin: Mapping[str, object], before: Float64Array, *kinds: str
 ) -> Plugin:
-    """Return a plugin whose textures of some kinds have one more transform (3, 3).
+    """Return a plugin whose textures of some kinds have one more transform of
+    coordinates.
 
-    Texture coordinates go through it before the texture's own. Inner plugins are
-    changed too, at any depth.
+    Texture coordinates go through `before` (3, 3) and then through the texture's own
+    transform. Inner plugins are changed too, at any depth.
     """
     changed = map_inner_plugins(
         plugin, lambda inner: _with_transform(inner, before, *kinds)
     )
     if changed["type"] in kinds:
         transform = np.eye(4)
+        # (3, 3) into Mitsuba's (4, 4), whose third axis is not used
         transform[np.ix_((0, 1, 3), (0, 1, 3))] = (
             to_uv_matrix(plugin.get("to_uv", np.eye(3))) @ before
         )
@@ -673,8 +681,10 @@ def _parse_base_color(value: object) -> _Color | None:
 
 
 def _repeat_texels(texture: Float32Array) -> Float32Array:
-    """Repeat texels so that none is blurred where a control keeps the texture's
-    size.
+    """Enlarge a texture by repeating texels, to at least `MIN_NEAREST_SIZE` a side.
+
+    It is for textures that are not interpolated: a control may keep the texture's size
+    and interpolate, which then blurs only the borders of texels.
     """
     row_repeats, column_repeats = (
         -(-MIN_NEAREST_SIZE // size) for size in texture.shape[:2]

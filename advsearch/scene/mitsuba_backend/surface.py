@@ -190,6 +190,8 @@ class ViewTracer:
                 [_make_camera_numbers(inputs, height, width) for inputs in cameras]
             ).astype(np.float32)
 
+            # Maps are arguments of the recorded function, so that it works for other
+            # light of the same sizes.
             def trace(
                 mitsuba_scene: Any,
                 lane: Any,
@@ -296,8 +298,10 @@ class ViewTracer:
     def _make_rays(self, lane: Any, cameras: Any, lens: Any) -> tuple[Any, Any]:
         """Return the ray of each lane, and whether the lens has one there.
 
-        `cameras` and `lens` are as for `_trace`. See `_make_camera_numbers` for a camera's
-        numbers.
+        A lane is (view, row, column, ray of the pixel), the last fastest. `cameras` and
+        `lens` are as for `_trace`. A camera's 16 numbers, see `_make_camera_numbers`: 0
+        to 8 are its axes to the left, up and forward, 9 to 11 its position; for a
+        pinhole 12 and 13 are half its extent at distance 1, and 14 and 15 its center.
         """
         height, width = self._scene.resolution
         pixel = lane // RAYS_PER_PIXEL
@@ -310,6 +314,7 @@ class ViewTracer:
             for index in range(CAMERA_SIZE)
         ]
         if self._lens is None:
+            # in pixels from the left and from the top; x goes to the left, y up
             column = mi.Float(pixel % width) + x_offset
             row = mi.Float(pixel // width) + y_offset
             x = (camera[14] - 2.0 * column / width) * camera[12]
@@ -317,6 +322,7 @@ class ViewTracer:
             z = mi.Float(1.0)
             active = mi.Bool(True)
         else:
+            # the lens's table has four numbers for each ray
             entry = 4 * (pixel * RAYS_PER_PIXEL + ray_index)
             x = dr.gather(mi.Float, lens, entry)
             y = dr.gather(mi.Float, lens, entry + 1)
@@ -380,16 +386,21 @@ class ViewTracer:
     def _look_up_lobes(
         self, masks: Sequence[Any], cosine: Any, tables: Any
     ) -> list[Any]:
-        """Look up the tables of `Lobes` for a cosine of the angle of view.
+        """Look up the tables of `Lobes` at a cosine of the angle of view.
 
-        A value lies between the two entries next to the cosine. `masks` tell which
-        surface was hit; where none was, the values are those of the first.
+        Between its entries a table is interpolated linearly. `masks` tell for each
+        surface whether it was hit; where none was, the values are those of the first
+        surface.
+
+        Returns:
+            One value for each of `LOBE_TABLES`.
         """
         n_tables = len(texel_rays.LOBE_TABLES)
         table_start = mi.UInt32(0)
         for index, mask in enumerate(masks):
             first_entry = mi.UInt32(index * n_tables * texel_rays.N_ANGLES)
             table_start = dr.select(mask, first_entry, table_start)
+        # entry i is for the cosine (i + 0.5) / N_ANGLES
         position = dr.clip(
             cosine * texel_rays.N_ANGLES - 0.5, 0.0, texel_rays.N_ANGLES - 1.0
         )
@@ -478,11 +489,13 @@ class ViewTracer:
         )
 
     def _correct_parallax(self, si: Any, direction: Any) -> Any:
-        """Return the direction in which the blurred maps have what is seen from a hit.
+        """Return the direction in which to look up the blurred maps for a ray from a
+        hit.
 
-        The maps are those seen from the object's center: what matters is the direction
-        in which the center sees the same point of the ground, z = 0. A direction that
-        is level or goes up, or a scene without ground, needs no correction.
+        The maps show what surrounds the object as seen from its center. Where the ray
+        meets the ground (z = 0), the result is the direction from the center to the
+        same point. A direction that is level or goes up, or a scene without ground,
+        needs no correction.
         """
         if all(grid.warp is None for grid in self._grids):
             return direction
@@ -507,9 +520,9 @@ class ViewTracer:
         return radiance
 
     def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: LightMaps) -> Any:
-        """Return what the texels around a hit have, bilinear; 0 on no grid.
+        """Look up the radiance of the texels around a hit, bilinearly; 0 on no grid.
 
-        `masks` tell, for each grid, whether the hit is on it.
+        `masks` tell for each grid whether the hit is on it.
         """
         first_cell = mi.UInt32(0)
         n_rows = mi.UInt32(1)
@@ -556,10 +569,12 @@ def _make_camera_numbers(
 def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
     """Copy what the kernel has computed into memory of torch.
 
-    The size is the number of cameras, rows and columns.
+    `channels` are those of `ViewTracer._trace`: three of radiance, coverage, and then
+    u, v and weight for each layer. `size` is the number of cameras, rows and columns.
+    Samples without weight are left out.
     """
     with mitsuba_lock:
-        # three channels a layer, all layers of a ray, ray by ray
+        # each (rays x layers,), all layers of a ray side by side
         u, v, weight = (
             np.stack(
                 [layer.numpy() for layer in channels[first_channel::3]], axis=1
@@ -647,15 +662,17 @@ def _look_up_sky(lit: LightMaps, direction: Any, to_local: Any) -> Any:
 def _look_up_blurred(
     lit: LightMaps, direction: Any, to_local: Any, spread: Any, widths: Sequence[float]
 ) -> Any:
-    """Look up the environment blurred by a root mean square angle `spread`.
+    """Look up the environment blurred by a root mean square angle `spread`, in radians.
 
-    The value lies between the two maps whose widths are next to it, by the logarithm; a
-    spread outside of all widths has the first or the last map.
+    There is a map for each of `widths`; each width is double the one before, so that
+    the logarithm to base 2 finds the two maps between which the value is interpolated.
+    A spread outside of all widths has the first or the last map.
     """
     n_rows, n_columns = lit.blurred_shape
     level = dr.clip(
         dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0
     )
+    # at most the last but one, so that there is a next map
     lower_level = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
     x, y = texel_rays.compute_map_position(direction, to_local)
     row = y * n_rows - 0.5

@@ -112,9 +112,9 @@ def trace_texel_rays(
 def _find_sky_cell(
     scene: MitsubaScene, direction: Any, sky_shape: tuple[int, int]
 ) -> Any:
-    """Return the index of the environment's cell that directions meet.
+    """Return the index of the environment's cell that lies in a direction.
 
-    `sky_shape` is its number of rows and columns of cells.
+    The environment is cut into cells, `sky_shape` (rows, columns), counted row by row.
     """
     n_rows, n_columns = sky_shape
     column, row = compute_map_position(direction, world_to_map(scene))
@@ -287,7 +287,11 @@ def _sample_chances(n_layers: int, count: int, seed: tuple[int, ...]) -> Any:
 def find_hit_grids(
     mitsuba_scene: Any, grids: Grids, si: Any, direction: Any
 ) -> list[Any]:
-    """Return for each grid a mask of the hits of rays that lie on it."""
+    """Return for each grid a mask of the hits that lie on it.
+
+    A grid has a shape and perhaps one side of its faces; `direction` is that of the
+    rays.
+    """
     is_front = dr.dot(si.n, direction) < 0.0
     shapes = {shape.id(): shape for shape in mitsuba_scene.shapes()}
     side_masks = {0: True, 1: is_front, -1: ~is_front}
@@ -418,9 +422,16 @@ def measure_lobes(
     position: Float32Array,
     normal: Float32Array,
 ) -> Lobes:
-    """Measure the BSDF of a shape at one of its texels, by sampling it.
+    """Measure how a shape reflects at one of its texels, by sampling its BSDF.
 
-    The texel has a (3,) position `position` and a (3,) unit normal.
+    For each angle of view it finds the diffuse fraction, the fraction of the gloss, the
+    mean direction of the gloss (up and along), and the angles by which it spreads.
+
+    Args:
+        scene: the scene.
+        inputs: of the scene; the base color is replaced.
+        grid: of the shape.
+        position, normal: (3,) of the texel; the normal has length 1.
     """
     cosine = (np.arange(N_ANGLES) + 0.5) / N_ANGLES
     with mitsuba_lock:
@@ -441,6 +452,7 @@ def measure_lobes(
         0.0, 1.0 - samples.x * along[:, None] - samples.z * up[:, None]
     )
     core, tail = _measure_spreads(samples.weight, squared_angle)
+    # the base colors were 0.5 and 0: their difference is what the color reflects
     diffuse = (
         np.maximum(samples.grey.mean(axis=1) - samples.black.mean(axis=1), 0.0) / 0.5
     )

@@ -204,9 +204,13 @@ def _accumulate_radiance(
 def _find_weighted_samples(
     vertices: list[tuple[Any, Any, Any]], n_samples: int
 ) -> list[Any]:
-    """Return for each vertex which samples have a weight that is finite and not 0."""
+    """Return for each vertex of a path which samples count there: (n_samples,) bool.
+
+    Those are the ones with a weight that is finite and not 0.
+    """
     every_sample = dr.full(mi.Bool, True, n_samples)
     return [
+        # a weight may be one number for all samples
         every_sample & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight))
         for _, weight, _ in vertices
     ]
@@ -250,9 +254,10 @@ def _fetch_paths(
 
 
 def _fetch_vertices(uv: Any, weight: Any, sharp: Any, mask: Any, spp: int) -> Vertices:
-    """Fetch the vertices of the samples that a mask selects.
+    """Fetch one vertex of those paths that a mask selects.
 
-    `uv`, `weight` and `sharp` are those of all samples; weights are divided by `spp`.
+    `uv`, `weight`, `sharp` and the mask are of all samples. Weights are divided by
+    `spp`, so that they add up to the mean of a pixel.
     """
     index: Any = dr.compress(mask)
     if dr.width(index) == 0:
@@ -307,10 +312,12 @@ class Bounce:
         return slope_em, slope_bsdf / pdf
 
     def _compute_slope(self, wo: Any, value_before: Any, active: Any) -> Any:
-        """Return the change of a BSDF value over the change of the base color.
+        """Return the derivative of a BSDF value by the base color, as a difference
+        quotient.
 
-        It is 0 where the change is no larger than rounding, since the BSDF there may
-        not depend on the color at all.
+        The base color is larger by `COLOR_STEP` now; `value_before` is the value
+        before. A change that is no larger than rounding errors counts as 0: the BSDF
+        may not depend on the color.
         """
         value = self.bsdf.eval(mi.BSDFContext(), self.si, wo, active)
         change = value - value_before
@@ -320,10 +327,11 @@ class Bounce:
         return dr.select(active & exceeds_rounding, change / COLOR_STEP, 0.0)
 
     def eval_projector(self, scene: Any, projector: Any) -> tuple[Any, Any]:
-        """Return which part of a projector's image lights the vertex.
+        """Return how a projector lights the vertex with a white image.
 
-        The first value is the position in the image, the second the projector's light
-        that leaves the vertex along the path.
+        Returns:
+            The position in the projector's image, and the light that the vertex
+            reflects along the path; 0 where the projector does not reach it.
         """
         is_lit = self.si.is_valid()
         ds, light = projector.sample_direction(self.si, mi.Point2f(0.5), is_lit)
@@ -542,7 +550,10 @@ def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Sur
 
 
 def _sample_center_rays(sensor: Any, resolution: tuple[int, int]) -> tuple[Any, Any]:
-    """Return the ray and weight through the center of each pixel, without raindrops."""
+    """Return the ray and weight through the center of each pixel.
+
+    They are in the order of rows. Raindrops before the camera are left out.
+    """
     height, width = resolution
     pixel = dr.arange(mi.UInt32, height * width)
     position = mi.Point2f(
@@ -556,14 +567,14 @@ def _sample_center_rays(sensor: Any, resolution: tuple[int, int]) -> tuple[Any, 
 
 
 def _passes_camera_ray(scene: Any, si: Any, active: Any) -> Any:
-    """Return where a camera ray goes on behind what it hit.
+    """Return where a camera ray goes on through what it hit.
 
-    Most of the light passes, as through a hole in a leaf, and nothing shines.
+    That is so if more than half of the light passes, as in a hole of a leaf, or if the
+    surface does nothing but let light pass; and if nothing shines there.
     """
     bsdf = si.bsdf()
     shining = dr.max(si.emitter(scene, active).eval(si, active)) > 0.0
     is_clear = dr.max(bsdf.eval_null_transmission(si, active)) > 0.5
-    # nothing is there but what lets light pass
     only_passes = ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     return (
         active

@@ -132,7 +132,8 @@ class Recordings(dict[Any, Callable[..., Any]]):
     ) -> Callable[..., Any]:
         """Return the recording for a key; other arguments as for `record_on_first_use`.
 
-        If there is none yet, the first call of the returned function makes it.
+        A new one is made at the first call of the returned function. All recordings are
+        dropped if scenes or the number of threads have changed since.
         """
         state = (population.changes, dr.thread_count())
         if self._recorded_at != state:

@@ -61,11 +61,13 @@ def write_scene(
 ) -> None:
     """Write a scene with its inputs set as XML that stock Mitsuba loads.
 
-    Meshes and images are written next to it.
+    Meshes and images are written next to it. Inputs are taken from `remaining_inputs`
+    one by one as they are put into the dictionary: first those of the camera and of the
+    parts, then the others by Mitsuba's keys; if any is left, that is an error.
 
     Args:
         scene: the scene.
-        inputs: as for `MitsubaScene.pictures`.
+        inputs: as for `MitsubaScene.render_images`.
         path: of the XML file, in a folder that exists.
         note: becomes a comment.
         hide_environment: hide the visible environment.
@@ -73,7 +75,7 @@ def write_scene(
     Raises:
         InputError: something in it is no part of stock Mitsuba.
     """
-    description, filter = scene.definition
+    description, filter_name = scene.definition
     if description.camera_model is not None:
         raise InputError(
             "camera: stock Mitsuba has no sensor with distortion; export "
@@ -88,9 +90,9 @@ def write_scene(
     }
     xml_scene: Plugin = {
         "integrator": integrator,
-        **make_scene_dict(description, scene.resolution, filter, scene.sampler),
+        **make_scene_dict(description, scene.resolution, filter_name, scene.sampler),
     }
-    # inputs that are not yet in what is written
+    # inputs that are not in the dictionary yet: `_put_part` takes some of them out
     remaining_inputs = {
         name: value.detach().cpu().numpy().astype(np.float32)
         for name, value in inputs.items()
@@ -98,6 +100,7 @@ def write_scene(
     if "camera.fov" in remaining_inputs:  # along the larger side, as in the dictionary
         xml_scene["camera"]["fov"] = float(remaining_inputs.pop("camera.fov")[0])
     if "environment.padded" in remaining_inputs:
+        # without the copied columns at both ends, which only the loaded scene has
         padded = remaining_inputs["environment.padded"]
         remaining_inputs["environment.padded"] = padded[:, 1:-1]
     if description.photograph is not None:
@@ -110,6 +113,7 @@ def write_scene(
     unset_names = [
         name
         for name in sorted(remaining_inputs)
+        # it puts the input into the dictionary; False if there is no place for it
         if not _put_input(
             xml_scene, scene.declared_inputs[name][0].split("."), remaining_inputs[name]
         )
@@ -133,7 +137,11 @@ def _put_part(
     part: parts.ScenePart,
     remaining_inputs: Plugin,
 ) -> None:
-    """Put a part into a scene's dictionary, and take its inputs from the remaining."""
+    """Put a part into a scene's dictionary, and take its inputs out of the remaining
+    ones.
+
+    Both dictionaries are changed. Raises InputError: stock Mitsuba has no such part.
+    """
     if isinstance(part, parts.HazePart):
         _put_haze(xml_scene, part, remaining_inputs)
     elif isinstance(part, parts.MeshPart):
@@ -149,10 +157,11 @@ def _put_part(
 
 
 def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> None:
-    """Fill a ball and the camera in it with haze, unless its density is 0.
+    """Put haze into a scene's dictionary: a ball filled with a medium, and the camera
+    in it.
 
-    The haze's inputs are taken from the remaining ones. Paths get `EXTRA_DEPTH` more
-    segments.
+    The haze's inputs are taken out of the remaining ones. Nothing is put in if its
+    density is 0. Light paths may have `EXTRA_DEPTH` more segments then.
     """
     density = remaining_inputs.pop(
         f"{haze.name}.density", np.array([haze.density])
@@ -214,10 +223,10 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
 
 
 def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
-    """Return a mesh's plugin, and take its inputs from the remaining ones.
+    """Return a mesh's plugin, and take its inputs out of the remaining ones.
 
-    Base color, light and the surface's numbers are set here; vertices and normals are
-    in the file that is written. Other inputs of the mesh stay among the remaining ones.
+    Base color, light and the numbers of the surface are set here. Vertices and normals
+    are dropped: the file that is written has them. Other inputs are put back.
     """
     part_inputs = {
         name.partition(".")[2]: remaining_inputs.pop(name)
@@ -247,7 +256,7 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
         surface = fill_base_color(
             part.surface, lambda options: make_base_texture(base_color, options)
         )
-    # The written mesh has them.
+    # they are in the file of the mesh
     part_inputs.pop("vertices", None)
     part_inputs.pop("normals", None)
     remaining_inputs |= {

@@ -125,9 +125,10 @@ class _SceneText:
     lines_before: int = 0
 
     def parse(self, data: bytes) -> ElementTree.Element:
-        """Return the tree of a file.
+        """Parse a file, and return the root of its tree.
 
-        Comments and blanks are included, so that lines stay the same.
+        Comments and blanks stay in the tree, so that the numbers of lines stay the
+        same. The sizes of all parsed files count together.
         """
         self.size += len(data)
         if self.size > scale_limit(MAX_BYTES):
@@ -166,10 +167,11 @@ class _SceneText:
     def _set_handlers(
         self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
     ) -> None:
-        """Have a parser build a tree and refuse what no scene needs.
+        """Have a parser build a tree, and refuse what no scene needs.
 
-        Document types, entities and the elements alias and path; and more elements, or
-        deeper ones, than the limits. What stands outside of the root is left out.
+        Refused are document types, entities, the elements alias and path, and more or
+        deeper elements than the limits. Texts and comments outside of the root are left
+        out.
         """
         depth = 0
 
@@ -253,7 +255,10 @@ class _SceneText:
         return list(root)
 
     def fill_text(self, text: str) -> str:
-        """Replace the `$names` in a text by their values."""
+        """Replace every `$name` in a text by its value.
+
+        Raises FileFormatError: a name has no value, or the text becomes too long.
+        """
         filled = ""
         # of the pieces, every second one is a name
         for index, piece in enumerate(re.split(r"\$(\w+)", text)):
@@ -336,11 +341,11 @@ def _get_node_name(node: Any, argument: str, *, at_top: bool) -> str:
 
 
 def _convert_value(where: str, kind: Any, value: Any) -> object:
-    """Return a number, a string, a color or a transform.
+    """Return a number, a string, a color or a transform of a plugin as Python has it.
 
-    Numbers are finite and in float32's range, and transforms affine and invertible;
-    others raise FileFormatError, which `where` begins. A color or a spectrum is a
-    plugin.
+    A color or a spectrum becomes a plugin. Raises FileFormatError, which begins with
+    `where`, for a number that is not finite or out of float32's range, and for a
+    transform that is not affine or cannot be inverted.
     """
     types = mi.Properties.Type
     entry: object = value
@@ -446,6 +451,7 @@ class _FileReader:
     """
 
     def __init__(self, path: Path, notes: list[str]) -> None:
+        """Prepare to read the files of a scene file; `notes` gets the readers' remarks."""
         self._path = path
         self._notes = notes
         self._references = References(path)
@@ -495,12 +501,14 @@ class _FileReader:
         return self._readers[kind](entries)
 
     def _find_file(self, kind: str, name: object) -> Path:
-        """Return the path of a file that is in the folder of the scene.
+        """Return the path of a file that a scene names, which is in the scene's folder.
 
-        The name may be that of a file elsewhere: then one with its last part counts.
-        `kind` is what needs it, for errors.
+        If there is no file of the full name in the folder, one with the last part of
+        the name counts. `kind` says what needs it, for errors. Raises FileFormatError:
+        there is none.
         """
         try:
+            # checks that the name is allowed; its content is not needed
             self._references.get(str(name))
         except FileNotFoundError:
             refused = self._references.refused
@@ -531,7 +539,10 @@ class _FileReader:
         return {**plugin, "filename": str(file)}
 
     def _read_bitmap(self, plugin: Plugin) -> Plugin:
-        """Read a texture as linear values."""
+        """Return a texture's plugin with its file read, as linear values.
+
+        A large file of linear values is averaged down to `TEXTURE_LIMIT`.
+        """
         file = self._find_file("a texture", plugin.pop("filename"))
         if file.suffix.lower() not in RADIANCE:
             is_raw = bool(plugin.get("raw"))

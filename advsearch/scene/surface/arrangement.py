@@ -76,7 +76,13 @@ class SurfaceView:
         shape: tuple[int, int],
         sides: int = 1,
     ) -> None:
-        """Make the matrix of one camera's samples: four entries for each ray that hits."""
+        """Make the sparse matrix from light on the surface to the pixels of one camera.
+
+        Its rows are the pixels, its columns the cells of the fine grid (`shape`); with
+        two `sides`, those of the back follow those of the front. Each ray that hits
+        adds four entries to its pixel's row: the weights of a bilinear look-up times
+        the ray's own.
+        """
         self.base_radiance = samples.radiance[camera_index]
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
@@ -111,7 +117,11 @@ class SurfaceView:
 
 
 def multiply_sparse(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
-    """Return a sparse matrix (n, k) times columns (k, 3); differentiable in these."""
+    """Multiply a sparse matrix (n, k) by columns (k, 3); differentiable in the columns.
+
+    PyTorch has no derivative for scipy's matrices, so that the backward pass multiplies
+    by the transpose.
+    """
 
     def multiply(factor: scipy.sparse.csr_matrix, values: Tensor) -> Tensor:
         return torch.from_numpy(factor @ values.numpy())
@@ -299,7 +309,10 @@ class Arrangement:
         return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
     def _get_object_buffer(self, buffer: str) -> Float32Array:
-        """Return the object's vertices or normals (V, 3)."""
+        """Return the object's "vertices" or "normals" (V, 3).
+
+        They are those of the inputs, or else of the scene as it was loaded.
+        """
         name = f"{OBJECT}.{buffer}"
         values = (
             self.inputs[name]
@@ -312,7 +325,11 @@ class Arrangement:
     def _make_object_texels(
         self, charts: Charts, vertices: Float32Array, normals: Float32Array
     ) -> list[texels.LitTexels]:
-        """Return the texels of the object; of both sides if its back is visible."""
+        """Return the texels of the object, as one surface.
+
+        If its back is visible from outside there are two: the front and the back, whose
+        normals are reversed.
+        """
         single = texels.make_mesh_texels(OBJECT, charts, vertices, normals)
         if not is_visible_from_behind(self._scene, OBJECT, single.positions):
             return [single]
@@ -328,10 +345,11 @@ class Arrangement:
         return self._scene.definition[0].number("ground.size") / 2.0
 
     def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
-        """Return which texels of a side of the object lie inside something.
+        """Return which texels (n,) of one side of the object lie inside something.
 
-        They see nothing but backs; where backs have light of their own, they see many
-        of them and no sky.
+        `met_cells` has what each texel's rays met: a cell, or a negative number for a
+        back without light of its own. A texel is buried if most of its rays meet backs.
+        Where the backs have texels too (two sides), it also has to see no sky.
         """
         cells = met_cells[self.texels.select_grid(side)]
         if self.n_sides == 1:
@@ -344,9 +362,10 @@ class Arrangement:
         return np.asarray((is_back.mean(axis=1) > BURIED_FRACTION) & ~sees_sky)
 
     def _measure_object(self) -> Lobes:
-        """Measure the object's BSDF at one of its most opaque texels.
+        """Measure how the object reflects, at one texel that stands for all.
 
-        It is taken for that of the full surface.
+        With cut-outs it is one of the most opaque texels: where the surface is cut out
+        there is nothing to measure.
         """
         front = self.texels.select_grid(0)
         opacity = self._scene.definition[0].meshes[OBJECT].opacity
@@ -368,16 +387,19 @@ class Arrangement:
         )
 
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
-        """Find the ground in the blurred maps, seen from the object's center.
+        """Find where the ground is in the blurred maps, seen from the object's center.
 
         Returns:
-            (h, w) which cells the ground hides; and (h, w, 3) the directions in the
-            map's axes in which its photograph has what is seen there.
+            (h, w) whether the ground is seen in each direction; and (h, w, 3) where a
+            photographed ground takes its color from: the direction from the camera that
+            took the photograph to the same point, in the map's axes. Both mean nothing
+            without a ground.
         """
         directions = texels.compute_directions(texels.BLURRED_SHAPE)
         world_directions = directions @ self.world_to_map
         if not self._has_ground:
             return torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool), directions
+        # directions that do not go down: the point is far off, and left out below
         distance = float(center[2]) / (-world_directions[..., 2]).clamp_min(1e-6)
         points = (
             torch.from_numpy(center).float() + world_directions * distance[..., None]
@@ -386,6 +408,7 @@ class Arrangement:
         is_in_reach = (points[..., :2].abs() <= reach).all(dim=-1)
         capture_position = torch.tensor([0.0, 0.0, self._capture_height or 0.0])
         from_camera = (points - capture_position) @ self.world_to_map.T
+        # only directions that go down meet the ground
         return (world_directions[..., 2] < -1e-3) & is_in_reach, from_camera
 
     @property
@@ -443,6 +466,7 @@ class Arrangement:
             )
             leaving = reflectance * irradiance / math.pi
             surroundings = sky.map
+            # without a ground it is read, but does not count
             far_ground = torch.ones(1, 3)
             if self._has_ground:
                 ground = self.texels.select_grid(self.n_sides)
@@ -481,10 +505,12 @@ class Arrangement:
     def _compute_ground_radiance(
         self, irradiance: Tensor, leaving: Tensor, padded: Tensor
     ) -> Tensor:
-        """Return what leaves the ground's texels (n, 3), smoothed.
+        """Return what the camera sees of the ground's texels (n, 3), smoothed.
 
-        It is radiance; of a photographed ground the fraction of its photograph that it
-        shows. `irradiance` and `leaving` are those of all texels.
+        That is the radiance that leaves them. For a photographed ground it is the
+        fraction of the photograph that is left: the irradiance, divided by that under
+        the open sky. `irradiance` and `leaving` (radiance) are those of all texels, the
+        ground's last.
         """
         ground = self.texels.select_grid(self.n_sides)
         if self._capture_height is None:
@@ -506,7 +532,8 @@ class Arrangement:
     ) -> Tensor:
         """Put the ground into a map (h, w, 3) of what surrounds the object.
 
-        It is that far off; of a photographed one the fraction of its photograph.
+        All of the ground has the value `far_ground` (1, 3) of its far end: a radiance,
+        or for a photographed ground a fraction of the photograph there.
         """
         is_hidden, photograph_directions = self._ground_below
         ground = far_ground
@@ -518,9 +545,10 @@ class Arrangement:
         return torch.where(is_hidden[..., None], ground, surroundings)
 
     def _compute_reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
-        """Return the reflectance (n, 3) of all texels for even light.
+        """Return which fraction (n, 3) of even light each texel reflects.
 
-        That is the base color times the diffuse fraction, plus the gloss.
+        That is the base color times the diffuse fraction, plus the fraction of the
+        gloss.
         """
         n_rows, n_columns = self.texels.grids[0].shape
         fine = self.upsample(color).reshape(*self.fine_shape, 3).permute(2, 0, 1)[None]
@@ -539,7 +567,8 @@ class Arrangement:
     def _compute_ground_color(self, padded: Tensor) -> Tensor:
         """Return the base color (n, 3) of the ground's texels.
 
-        A photographed one has that which shows the photograph under the open sky.
+        A photographed ground has the color with which it looks like its photograph when
+        it is lit by the whole sky, radiance = color E / pi.
         """
         ground = self.texels.positions[self.texels.select_grid(self.n_sides)]
         if self._capture_height is None:
@@ -557,9 +586,10 @@ class Arrangement:
 def _make_upsampling_matrix(
     texture: tuple[int, int], fine: tuple[int, int]
 ) -> scipy.sparse.csr_matrix:
-    """Return the matrix from the texels of a small texture to the fine grid.
+    """Return the matrix from the texels of a small texture to those of the fine grid.
 
-    Bilinear, so that each row has four entries.
+    Both shapes are (rows, columns). The interpolation is bilinear: each row of the
+    matrix has four entries.
     """
     n_rows, n_columns = fine
     y, x = np.meshgrid(

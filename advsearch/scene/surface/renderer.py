@@ -67,9 +67,9 @@ class MapFingerprint:
         return cls(mean, texels[::stride] / mean.clamp_min(1e-12))
 
     def find_factor(self, other: MapFingerprint) -> Tensor | None:
-        """Return how many times as bright (3,) another map is.
+        """Return the factor (3,), by channel, with which this map becomes another one.
 
-        None if it differs in more than that.
+        None if the other map is no multiple of it.
         """
         if self.texels.shape != other.texels.shape or not torch.allclose(
             self.texels, other.texels, rtol=1e-5, atol=1e-6
@@ -104,7 +104,10 @@ class SurfaceRenderer(Predictor):
     n_traced_images = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
-        """Fix everything as it is at u but cameras, environment and base color."""
+        """Fix everything as it is at u, but cameras, environment and base color.
+
+        The arrangement of texels is made for it; `seed` is that of its rays.
+        """
         super().__init__(traced)
         self.n_dropped = 0
         self.stored_lights: dict[MapFingerprint, ArrangementLight] = {}
@@ -132,7 +135,11 @@ class SurfaceRenderer(Predictor):
         return inputs.get(COLOR_INPUT, self._base[COLOR_INPUT])
 
     def is_applicable(self, inputs: Mapping[str, Tensor]) -> bool:
-        """Return whether only cameras and environment differ in some scene inputs."""
+        """Return whether the arrangement holds for some scene inputs.
+
+        They may differ from its own in cameras and environment only, not in the base
+        color.
+        """
         expected = {**self.arrangement.inputs, COLOR_INPUT: self.base_color}
         fixed_inputs = {
             name: inputs[name] for name in inputs if name not in FREE_INPUTS
@@ -169,8 +176,8 @@ class SurfaceRenderer(Predictor):
     def n_bytes(self) -> int:
         """Memory of the arrangement and the stored lights.
 
-        With a fixed light only that counts, since the arrangement is another renderer's
-        too.
+        A renderer with a fixed light shares the arrangement with another renderer, so
+        that only its light counts.
         """
         if self.fixed_light is not None:  # the rest is shared
             return self.fixed_light.bytes
@@ -185,10 +192,12 @@ class SurfaceRenderer(Predictor):
     def get_light(
         self, inputs: Mapping[str, Tensor]
     ) -> tuple[ArrangementLight, Tensor]:
-        """Return the light under the environment of scene inputs, and its factor (3,).
+        """Return the light under the environment of some scene inputs, and its factor
+        (3,).
 
-        Exposures and tints of one map have one light. It is computed on first use, and
-        up to `MAX_BYTES` of lights are stored: the oldest go first.
+        Exposures and tints of one map share one light, and differ by the factor. A
+        light is computed on first use. Up to `MAX_BYTES` of lights are stored; the
+        oldest go first.
         """
         fingerprint = MapFingerprint.compute(
             inputs.get(ENVIRONMENT_INPUT, self._base[ENVIRONMENT_INPUT]).detach()
@@ -221,10 +230,11 @@ class SurfaceRenderer(Predictor):
     def trace_views(
         self, inputs: Sequence[Mapping[str, Tensor]]
     ) -> Iterator[LitCameraView]:
-        """Yield what the cameras of scene inputs see, environment by environment.
+        """Yield what each camera sees, in groups of cameras under the same environment.
 
-        Those under one environment are traced in one launch, while the results of the
-        launch before are used.
+        `inputs` are the scene inputs of each camera. A group is traced in one launch;
+        the next launch is started before the results of this one are used, so that both
+        go on at once.
         """
         lights = [self._choose_light(camera_inputs) for camera_inputs in inputs]
         cameras_of_light: dict[ArrangementLight, list[int]] = {}
@@ -233,6 +243,7 @@ class SurfaceRenderer(Predictor):
         cameras = [
             self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
         ]
+        # lazy: asking for the next element starts a launch
         launches = (
             self.arrangement.start_tracing(
                 [cameras[camera_index] for camera_index in camera_indices], light
@@ -310,14 +321,14 @@ class SurfaceRenderer(Predictor):
 
 
 def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
-    """Return why light on surfaces cannot predict images of a space; None if it may.
+    """Return why light on surfaces cannot predict a space's images; None if it may.
 
-    How far it is off is then for measurement.
+    None does not say how good the prediction is: that is measured afterwards.
 
     Args:
         renderer: of the space.
-        varying: names of the controls that vary; the others are searched, and may
-            change base colors alone.
+        varying: names of the controls that vary, which may change cameras and the
+            environment. The others are searched, and may change base colors alone.
     """
     refusal = find_scene_refusal(renderer)
     if refusal is not None:
@@ -339,7 +350,11 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
 
 
 def find_scene_refusal(renderer: Renderer) -> Refusal | None:
-    """Return why light cannot be stored on a scene's surfaces; None if it may be."""
+    """Return why light cannot be stored on a scene's surfaces; None if it may be.
+
+    It may be for an object with one texture, on a ground and under an environment, if
+    images are denoised.
+    """
     description = renderer.scene.definition[0]
     mesh_part = description.meshes[OBJECT]
     if mesh_part.mesh.repeats or mesh_part.surface is not None:
@@ -361,9 +376,9 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
 def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:
     """Return the names of the scene inputs that some controls change.
 
-    Their coordinates are set to some fractions of their ranges, all at once, and the
-    inputs compared with those at the start. `varying` has the names of controls, or of
-    groups of coordinates.
+    `varying` has names of controls or of groups of coordinates. Their coordinates are
+    set to one fraction of their ranges after another, all at once, and the inputs are
+    compared with those of the start.
     """
     changed: set[str] = set()
     with torch.no_grad():

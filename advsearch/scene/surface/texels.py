@@ -108,7 +108,7 @@ def make_mesh_texels(
         side: of its faces, as `TexelGrid` has it.
     """
     position, normal = _interpolate(charts, vertices, normals)
-    # right in cells that are covered: texels have the order of these
+    # number of the texel in each covered cell: row by row; elsewhere it means nothing
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
     rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(
@@ -126,14 +126,16 @@ def make_ground_texels(
 ) -> LitTexels:
     """Return the texels over a level plane, small under the object and large far off.
 
+    An axis position p from -1 to 1 lies `scale * sinh(rate * p)` from the center.
+
     Args:
         name: of the ground.
         height: of the plane.
-        reach: half its width.
+        reach: half its width, cut to `MAX_GROUND_REACH`.
         center: x and y of the object's center.
     """
     reach = min(reach, MAX_GROUND_REACH)
-    # so that the texels at the center are `MIN_TEXEL_WIDTH` wide
+    # the ratio of an even texel's width to that at the center, `MIN_TEXEL_WIDTH`
     rate = _find_warp_rate(reach / (MIN_TEXEL_WIDTH * GROUND_TEXELS / 2.0))
     scale = reach / math.sinh(rate)
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
@@ -158,9 +160,9 @@ def make_ground_texels(
 
 
 def _find_warp_rate(ratio: float) -> float:
-    """Bisect for the rate with sinh(rate) / rate = ratio.
+    """Find the rate with sinh(rate) / rate = ratio, by bisection.
 
-    The rate stays small where the ratio is 1 or less.
+    A ratio of 1 or less gives the lower end, 0.001: a grid that is all but even.
     """
     lower = 1e-3
     upper = 20.0
@@ -198,6 +200,7 @@ def _weigh_neighbours(
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
+    # (rows, columns) texel of each cell: covered cells are counted row by row
     texel_at = np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
     texel_at = np.where(charts.is_covered, texel_at, -1)
 
@@ -231,10 +234,11 @@ def _use_nearest_texel(
     texel_index: IntArray,
     weights: Float64Array,
 ) -> None:
-    """Give the nearest texel all the weight where no neighbour counts.
+    """Give all the weight to the nearest texel where no neighbour has any.
 
-    `texel_index` and `weights` are changed in place, in their first column. Arguments
-    are those and the results of `_weigh_neighbours`.
+    The first columns of `texel_index` and `weights`, the results of
+    `_weigh_neighbours`, are overwritten in these rows. Other arguments are those of
+    `_weigh_neighbours`.
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
@@ -307,15 +311,13 @@ def _make_sparse(
     weights: Float64Array,
     size: tuple[int, int],
 ) -> Tensor:
-    """Return a sparse matrix of weights (N, neighbours) that are not negligible.
-
-    Weights of 0.001 and less are left out.
+    """Return a sparse matrix of weights, without those of 0.001 and less.
 
     Args:
-        fine_cell: (N,) rows of the matrix.
+        fine_cell: (N,) row of the matrix for each row of the weights.
         texel_index: (N, neighbours) its columns.
-        weights: its entries.
-        size: of the matrix.
+        weights: (N, neighbours) its entries.
+        size: rows and columns of the matrix.
     """
     is_entry = weights > 1e-3
     cell = np.broadcast_to(fine_cell[:, None], texel_index.shape)[is_entry]
@@ -324,10 +326,10 @@ def _make_sparse(
 
 
 def _compute_texel_width(charts: Charts, vertices: Float32Array) -> float:
-    """Return the mean width of a texel in world space, for vertices (V, 3) there.
+    """Return the mean width of a texel in world space.
 
-    The mesh is scaled evenly to the world, so that the ratio of extents is that of
-    widths.
+    `vertices` are (V, 3) in world space, while the charts' areas are in the mesh's own
+    coordinates. The mesh is scaled evenly, by the ratio of the largest extents.
     """
     extent = float(np.ptp(charts.mesh.vertices, axis=0).max())
     scale = np.ptp(vertices, axis=0).max() / max(extent, 1e-12)
@@ -338,7 +340,11 @@ def _compute_texel_width(charts: Charts, vertices: Float32Array) -> float:
 def _iter_neighbourhood(
     y: Float64Array, x: Float64Array
 ) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield rows and columns of texels around positions, one offset at a time."""
+    """Yield rows and columns (N,) of the neighbours of positions in a grid.
+
+    A position's neighbours are the texels up to `FILTER_REACH` from the nearest one;
+    each step yields one neighbour of all positions.
+    """
     for row_offset in range(-FILTER_REACH, FILTER_REACH + 1):
         for column_offset in range(-FILTER_REACH, FILTER_REACH + 1):
             row = np.round(y).astype(int) + row_offset
@@ -361,6 +367,7 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
         Sparse, (cells, texels).
     """
     width = ground.grids[0].shape[0]
+    # if no texel sees the sky, all of `~sees_sky` is true
     is_used = (sees_sky if sees_sky.any() else ~sees_sky).reshape(width, width)
     nearest_used = _find_nearest(is_used)
     axis_weights = scipy.sparse.diags_array(
@@ -378,7 +385,11 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
 def _interpolate(
     charts: Charts, vertices: Float32Array, normals: Float32Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Return the position and the unit normal of each cell, both (h, w, 3)."""
+    """Return the position and the unit normal of the surface in each cell, both (h, w,
+    3).
+
+    `vertices` and `normals` are (V, 3).
+    """
     corners = charts.mesh.faces[charts.face]
     position = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])
     normal = np.einsum("hwk,hwkc->hwc", charts.weights, normals[corners])
@@ -388,7 +399,10 @@ def _interpolate(
 
 
 def _find_nearest(covered: BoolArray) -> IntArray:
-    """Return for each cell of a grid the flat index of the nearest covered one."""
+    """Return for each cell (h * w,) the flat index of the nearest covered cell.
+
+    A covered cell is its own nearest.
+    """
     # takes long to import
     from scipy import ndimage
 
@@ -471,23 +485,25 @@ def prepare_sky(padded: Tensor) -> SkyLight:
 
 
 def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
-    """Sample directions to what is hot by its power, and what comes from each.
+    """Sample directions towards hot light, and the light that comes from each.
 
-    A map is looked up between its texels, so that each shines over a tent that reaches
-    its neighbours. Directions are spread over that by `HOT_LATTICE`: a sun of one texel
-    has a soft shadow.
+    Hot texels get rays in proportion to their power. The map is interpolated between
+    its texels, so that a texel shines over a tent of two texels' width: its rays are
+    spread over the tent by a lattice (`HOT_LATTICE`), and even a sun of one texel has a
+    soft shadow.
 
     Args:
         radiance: (H, W, 3) of what is hot.
         power: (H, W) luminance times solid angle.
 
     Returns:
-        (k, 3) unit directions, and (k, 3) radiance times solid angle.
+        (k, 3) unit directions in the map's axes, and (k, 3) radiance times solid angle;
+        k is `HOT_RAYS`, and all have the same luminance.
     """
     n_rows, n_columns = power.shape
     cumulative = torch.cumsum(power.double().reshape(-1), 0)
     index = torch.arange(HOT_RAYS, dtype=torch.float64)
-    # Texels evenly by their power: a texel with half of it has half of the rays.
+    # even steps through the cumulative power: half of the power gets half of the rays
     texel = torch.searchsorted(
         cumulative, (index + 0.5) / HOT_RAYS * cumulative[-1]
     ).clamp_max(power.numel() - 1)
@@ -528,9 +544,9 @@ def _to_direction(polar: Tensor, azimuth: Tensor, dim: int) -> Tensor:
 
 
 def _average_cells(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return mean radiance by solid angle in the cells of a coarser map.
+    """Return the mean radiance in each cell of a coarser map, weighted by solid angle.
 
-    Radiance is (H, W, 3), the solid angles (H, W); the result is (*size, 3).
+    Radiance is (H, W, 3), `sine` the solid angles (H, W); the result is (*size, 3).
     """
     # The solid angles are pooled as a fourth channel.
     weighted = torch.cat([radiance * sine[..., None], sine[..., None]], dim=-1)
@@ -542,9 +558,10 @@ def _average_cells(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Ten
 def blur_map(radiance: Tensor) -> Tensor:
     """Blur a map (h, w, 3) by each of `BLUR_WIDTHS`.
 
-    They are root mean squares over both directions. Columns are blurred by a Gaussian
-    over the polar angle, then rows, which go round, in the frequency domain: more
-    towards the poles, where a row is short.
+    A width is the root mean square angle over both directions, hence each direction has
+    it divided by the square root of 2. Columns are blurred first, by a Gaussian over
+    the polar angle. Rows go round, and are blurred in the frequency domain: by more
+    columns towards the poles, where a row is short.
 
     Returns:
         (widths, h, w, 3).
@@ -556,6 +573,7 @@ def blur_map(radiance: Tensor) -> Tensor:
     for blur_width in BLUR_WIDTHS:
         sigma = blur_width / math.sqrt(2.0)
         exponent = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
+        # rows near the poles have less solid angle, and count less
         column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
         column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
         row_filter = torch.exp(
@@ -588,11 +606,11 @@ def compute_irradiance(
     """Return the irradiance (n, 3) of texels.
 
     Args:
-        view_matrices: views of the sky (n, cells) and of each other (n, n), sparse,
-            times the cosine and pi.
+        view_matrices: sparse, from radiance to irradiance: of the sky's cells (n,
+            cells), and of the texels on each other (n, n).
         sky: the environment.
-        direct: (n, k) cosines towards what is hot where it is visible; None if nothing
-            is hot.
+        direct: (n, k) cosines towards hot light where it is visible; None if nothing is
+            hot.
         reflectance: (n, 3) of the texels.
         bounces: how often light goes from texel to texel.
     """
@@ -611,8 +629,13 @@ def make_view_matrices(
 ) -> tuple[Tensor, Tensor]:
     """Return the sparse matrices that `compute_irradiance` needs, from what rays met.
 
+    A texel's rays have the density of the cosine, so that its irradiance is pi times
+    the mean radiance of what they meet.
+
     Args:
-        met_cells: (n, rays) as of `trace_texel_rays`.
+        met_cells: (n, rays) of `trace_texel_rays`: a cell of the grids, from
+            `len(texel_of_cell)` on a cell of the sky, or negative for nothing that
+            shines.
         texel_of_cell: index of the texel of each cell, see `LitTexels`.
         n_texels: of all grids.
     """
@@ -637,11 +660,13 @@ def make_view_matrices(
 
 
 def look_up_environment(padded: Tensor, directions: Tensor) -> Tensor:
-    """Look an environment up in given directions, at the nearest texel.
+    """Look up an environment in some directions, at the nearest texel: (n, 3).
+
+    In the map's axes y is up, and row 0 is straight up.
 
     Args:
-        padded: (H, W + 2, 3) map.
-        directions: (n, 3) directions in the map's own axes.
+        padded: (H, W + 2, 3) map, with a copied column at each end.
+        directions: (n, 3) in the map's own axes, of any length.
     """
     n_rows = padded.shape[0]
     n_columns = padded.shape[1] - 2

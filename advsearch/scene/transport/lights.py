@@ -99,12 +99,18 @@ class Lighting:
 
 
 def find_lighting(renderer: Renderer) -> Lighting:
-    """Find the groups of coordinates that change nothing but light and finished images.
+    """Find the groups of coordinates that change only light and the finished image.
 
-    The inputs of configurations are compared, so that it holds for whatever sets them:
-    each group is varied alone, the others staying in the middle between the start and
-    the center of the unit cube. A light that is no input would be in every basis image:
-    if there is one, only groups that change the finished image are returned.
+    Each group is varied alone, the others staying in the middle between the start and
+    the center of the unit cube, and the scene inputs are compared: so it holds for
+    whatever sets them. Some lights of a Mitsuba scene are no inputs. They cannot be
+    switched off, and would count again in the image of every single light; with such
+    lights only the groups are returned that change the finished image alone.
+
+    Returns:
+        The inputs that each group changes, the groups that add spherical harmonics to
+        the environment, and the coordinates with which each other group makes the
+        environment brightest.
     """
     reference = 0.5 * renderer.start + 0.25
     groups = {}
@@ -114,8 +120,10 @@ def find_lighting(renderer: Renderer) -> Lighting:
         base_inputs = renderer.scene.assembly(renderer.space.inputs(reference))
         for group in renderer.space.groups:
             effect = _measure_effect(renderer, group, reference, base_inputs)
+            # the group changes something else than light
             if effect is None:
                 continue
+            # it changes light, not only the finished image
             if not effect.changed <= IMAGE_INPUTS and has_fixed_lights(renderer):
                 continue
             groups[group.name] = effect.changed
@@ -138,10 +146,11 @@ class _Effect(NamedTuple):
 def _measure_effect(
     renderer: Renderer, group: Group, reference: Tensor, base_inputs: Inputs
 ) -> _Effect | None:
-    """Return what a group changes; None if that is more than light.
+    """Return which inputs a group changes; None if that is more than light.
 
-    `base_inputs` are those of the configuration `reference`, with which others are
-    compared.
+    Several configurations, which differ from `reference` in this group alone, are
+    compared with `base_inputs`, the scene inputs at `reference`. The brightest is the
+    one whose environment has most light.
     """
     changed: set[str] = set()
     is_harmonic = False
@@ -168,12 +177,11 @@ def _measure_effect(
 
 
 def _sample_configurations(group: Group, reference: Tensor) -> Iterator[Tensor]:
-    """Yield configurations in which a group has several values, and others those of
-    `reference`.
+    """Yield copies of a configuration in which one group has other values.
 
-    All coordinates of the group have the same value: some fractions of its range, or
-    the options of a choice, of which at most `MAX_OPTIONS` are taken, evenly. A group
-    of several coordinates has a random point as well.
+    All coordinates of the group have the same value: one of a few fractions of the
+    range, or the middle of an option of a choice, of which at most `MAX_OPTIONS` are
+    taken, evenly. For a group of several coordinates a random point is added.
     """
     fractions = list(PROBE_FRACTIONS)
     if group.options:
@@ -202,11 +210,12 @@ class _Change(Enum):
 def _find_change(
     name: str, before: Tensor | None, after: Tensor | None, n_coordinates: int
 ) -> _Change:
-    """Return how a group of coordinates changes an input.
+    """Return in which way a group of coordinates changes one input.
 
-    A map of the environment is compared with multiples of itself, then with those of
-    spherical harmonics too; any other input may only be the light of a lamp, or one of
-    the finished image.
+    `before` and `after` are the input's values. An environment may become a multiple of
+    itself (POWER), or one with spherical harmonics added (HARMONICS); any other input
+    may only be the light of a lamp or belong to the finished image (POWER). All else is
+    OTHER.
     """
     if before is None or after is None:
         return _Change.OTHER
@@ -231,10 +240,10 @@ def _find_change(
 
 
 def _is_explained(basis: Tensor, target: Tensor) -> bool:
-    """Return whether a map (H, W, 3) is a sum of basis maps (k, H, W, 3).
+    """Return whether a map (H, W, 3) is a weighted sum of basis maps (k, H, W, 3).
 
-    Only texels count where it and the first basis map are lit: what is added may be cut
-    off at zero elsewhere.
+    Only texels count in which the map and the first basis map are both positive: where
+    harmonics made a sum negative, it was cut off at zero.
     """
     is_lit = ((basis[0] > 0.0) & (target > 0.0)).to(torch.float32)
     basis_maps = BasisMaps(basis * is_lit)
@@ -267,15 +276,15 @@ class BasisMaps:
     maps: Tensor  # (k, H, W, 3), all at least zero
 
     def fit_weights(self, target: Tensor) -> Tensor:
-        """Return the weights (k, 3) with which the maps come nearest to a map (H, W,
-        3).
+        """Return the weights (k, 3) with which the maps add up to a map (H, W, 3).
 
-        With several maps it is the weighted least squares fit; a single map is taken
-        for proportional to the target. The weights are differentiable.
+        With several maps they are a least squares fit, weighted by solid angle. A
+        single map is taken for proportional to the target. The weights are
+        differentiable.
         """
         flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)
-        # Exact and cheap: the factor of a channel, at the map's brightest texel.
         if len(self.maps) == 1:
+            # of each channel; the quotient at one texel is the factor of all
             texel, brightness = self._brightest
             return (flat_target[..., 0].gather(1, texel) / brightness.clamp_min(TINY)).T
         weights: Tensor = (self._inverse @ flat_target)[..., 0].T
@@ -325,8 +334,12 @@ class LightBasis:
     """
 
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
-        """Split the light of the inputs: what stays, lamps that change, the
-        environment.
+        """Split the light of scene inputs into lights of which each has its own image.
+
+        The first is what does not change (with the patterns of projectors); then comes
+        each lamp that changes, with a power of 1; then the basis maps of a changing
+        environment. For each `inputs_of_light` has the inputs with which it shines
+        alone.
         """
         patterns = {
             name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
@@ -367,9 +380,7 @@ class LightBasis:
             ]
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
-        """Return the weight (lights, 3) of each light in scene inputs;
-        differentiable.
-        """
+        """Return the factor (lights, 3) of each light in scene inputs; differentiable."""
         weights = [torch.ones(1, 3)] if self._has_fixed_light else []
         weights += [inputs[name].reshape(1, 3) for name in self._lamps]
         if self._basis_maps is not None:
@@ -378,9 +389,10 @@ class LightBasis:
 
 
 def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> Tensor:
-    """Return the environment's basis maps (k, H, W, 3), the first of which is `first`.
+    """Return the environment's basis maps (k, H, W, 3).
 
-    The others are spherical harmonics, if some group adds them.
+    The first is `first`. If some group adds spherical harmonics, they are the others,
+    set to zero in texels where no harmonics are added.
     """
     if not lighting.harmonic_groups:
         return first[None]
@@ -418,13 +430,15 @@ class BasisRenderer(Predictor):
         *,
         changing: Lighting | None = None,
     ) -> None:
-        """Trace a basis image for each light, with the matrices of base colors under
-        it.
+        """Trace an image for each light, and the matrices of base colors under it.
+
+        `changing` is the result of `find_lighting`, which is called if it is None;
+        other arguments as for `LinearRenderer`.
         """
         super().__init__(traced)
         with torch.no_grad():
             changing = changing or find_lighting(traced)
-            # with as much light of the environment as there can be
+            # the basis map of the environment is the brightest that there can be
             brightest = u.detach().clone()
             for coordinates, values in changing.brightest_values:
                 brightest[coordinates] = values
@@ -432,7 +446,7 @@ class BasisRenderer(Predictor):
             self._lights = LightBasis(traced, changing, inputs)
             set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
             linear = set_inputs & find_linear_inputs(traced)
-            # projectors are in the first light alone
+            # patterns of projectors shine in the first light alone
             base_colors = {name for name in linear if not name.endswith(PATTERN_SUFFIX)}
             self._renderers: list[LinearRenderer] = []
             for index, light_inputs in enumerate(self._lights.inputs_of_light):
@@ -554,8 +568,8 @@ def count_lights(renderer: Renderer) -> int:
 def count_samples(renderer: Renderer) -> int:
     """Return the samples per pixel that are traced before anything can be predicted.
 
-    Each light has those of all its matrices, or those of its basis image if it has
-    none.
+    Each light needs the samples of all its matrices, or without a matrix those of one
+    image.
     """
     inputs: set[str] = set()
     for group in renderer.plan.groups:

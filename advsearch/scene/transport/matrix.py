@@ -98,7 +98,7 @@ class ColoredRows:
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
-        """Make an empty matrix."""
+        """Make an empty matrix of rows x columns; `small` is as for the class."""
         self._shape = (rows, columns)
         self._small = small
         self.entries = 0
@@ -114,11 +114,11 @@ class ColoredRows:
 
     @property
     def bytes(self) -> int:
-        """Memory when it is finished.
+        """Memory after `finish`.
 
-        That is a fraction and its column for each entry, and a start and a color for
-        each row. If it is not small, there is the transpose, a fraction and its row for
-        each entry and a start for each column, and the unpacked colors.
+        Packed, an entry has a fraction (2 bytes) and its column, a row its start (4)
+        and color (6). If it is not small, the unpacked matrix and its transpose are
+        kept as well, 10 bytes more for each entry, and float32 colors.
         """
         n_rows, n_columns = self._shape
         packed = (2 + self._column_type.itemsize) * self.entries + (4 + 6) * n_rows
@@ -213,7 +213,9 @@ class ColoredRows:
         return torch.from_numpy(self._unpack().T @ colored.numpy())
 
     def _unpack(self) -> scipy.sparse.csr_matrix:
-        """Return the matrix of fractions in float32."""
+        """Return the matrix of fractions in float32, from the 16 bits in which it is
+        stored.
+        """
         assert self._packed is not None, "finish it first"
         fractions, columns, row_starts = self._packed
         return scipy.sparse.csr_matrix(
@@ -240,7 +242,10 @@ class TextureTransport:
         *,
         small: bool = False,
     ) -> None:
-        """Make empty matrices: from texels, and from cells of `CELL_SIZE` texels."""
+        """Make empty matrices: from texels, and from cells of `CELL_SIZE` texels.
+
+        Shapes are (height, width); `small` is as for the class.
+        """
         self._image_shape = image_shape
         self._texture_shape = texture_shape
         # rounded up: the last cells of rows and columns may have fewer texels
@@ -317,9 +322,9 @@ class TextureTransport:
         self._scattered.finish(self._image_shape, smooth)
 
     def __call__(self, change: Tensor) -> Tensor:
-        """Return the change of radiance (H, W, 3) for a change of the base color.
+        """Return the change of radiance (H, W, 3) for one of the base color (h, w, 3).
 
-        That is (h, w, 3); the result is differentiable.
+        Differentiable: the transposed product is the derivative.
         """
         radiance: Tensor = LinearMap.apply(
             self.multiply, self.multiply_transposed, change
@@ -333,6 +338,7 @@ class TextureTransport:
         fewer.
         """
         n_rows, n_columns = self._cell_shape
+        # the texels that the last cells lack; they are filled with zeros
         bottom = CELL_SIZE * n_rows - self._texture_shape[0]
         right = CELL_SIZE * n_columns - self._texture_shape[1]
         padded = change
@@ -395,7 +401,8 @@ def find_bilinear_weights(
 ) -> tuple[npt.NDArray[np.int32], Float32Array]:
     """Return the four texels of each bilinear look-up, and their fractions.
 
-    Texel centers lie at half numbers; the look-up repeats at the border.
+    The centers of texels are half a texel from the border, across which the texture
+    repeats.
 
     Args:
         uv: (n, 2) texture coordinates.
@@ -681,9 +688,10 @@ def _trace_matrices(
 def _append_plane_change(
     renderer: Renderer, base: Tensor, traced: Inputs, seed: int, spp: int
 ) -> Tensor:
-    """Return a base image with the change of the plane that takes the shadow.
+    """Append to a base image the change of the plane that takes the shadow.
 
-    It stays as it is there. Without such a plane the image stays as it is.
+    The three channels are rendered once, since no base color changes them. Without such
+    a plane the image is returned as it is. Arguments are those of `_trace_matrices`.
     """
     if renderer.scene.plane_radiance is None:
         return base
@@ -729,12 +737,12 @@ def _fill_transports(
 def _make_smooth(
     renderer: Renderer, radiance: Tensor, paths: Paths, quick: bool
 ) -> tuple[Tensor, Smooth | None]:
-    """Denoise the base image; return it, and what removes the noise from a row's image.
+    """Denoise the base image; also return the function that denoises a matrix's colors.
 
-    If quick, that multiplies by the ratio of the denoised and the noisy base image, at
-    most `MAX_CORRECTION` either way; else it denoises, guided by the normals and by
-    where surfaces are. Without a denoiser the image stays as it is, and there is no
-    such function.
+    The function takes and returns an image (H, W, 3). If quick, it multiplies by the
+    ratio of the denoised and the noisy base image, within a factor `MAX_CORRECTION`
+    either way; else it runs the denoiser, guided by the normals and by where surfaces
+    are. Without a denoiser the image is returned as it is, and None.
     """
     if renderer.formation.denoiser != "oidn":
         return radiance, None
