@@ -99,7 +99,10 @@ def measure_gains(
 def _make_variants(
     renderer: gradients.Renderer, depth: int | None
 ) -> dict[str, gradients.Renderer]:
-    """Return the renderer of a search, by "", and others that leave out less, by item.
+    """Return the renderer of a search, by "", and others by the item that they compute.
+
+    The renderer of the search leaves out everything that it can; each of the others
+    computes one item of that, or all (`ALL`).
 
     Args:
         renderer: whose paths have their full length.
@@ -116,6 +119,7 @@ def _make_variants(
         variants[item] = renderer.copy_with(
             scene.copy_with(max_depth=depth, leave_out=leave_out)
         )
+    # It leaves out the same things, but no bounces.
     if depth < scene.max_depth:
         variants[BOUNCES] = renderer
     variants[ALL] = renderer.copy_with(scene.copy_with(leave_out=NOTHING))
@@ -128,10 +132,12 @@ def _compare_item(
     slopes: Mapping[str, list[Tensor]],
     times: Mapping[str, list[float]],
 ) -> GainRow:
-    """Compare the renderer with an item and that without, whose name is "".
+    """Compare the renderer that computes an item with the one that leaves it out.
 
-    The gain in time is for equal noise of the images: the ratio of the seconds times
-    that of the variances.
+    Measurements are by the item that is computed; those under "" are without any.
+
+    `time_gain` is how many times as long the renderer with the item takes to images of
+    the same noise: the ratio of the seconds, times that of the variances.
 
     Args:
         item: its name.
@@ -165,9 +171,14 @@ def _difference(pair: list[Tensor]) -> float:
 
 
 def _relative_difference(without: list[Tensor], with_item: list[Tensor]) -> float:
-    """Return the difference at one seed over the RMS difference that seeds make.
+    """Return how much an item changes an image or gradient, compared with the noise.
 
-    Where seeds make no difference, it is the difference itself.
+    That is the difference at the first seed, divided by the root mean square of the
+    differences between the two seeds; not divided if seeds make no difference.
+
+    Args:
+        without: at two seeds, without the item.
+        with_item: at the same seeds.
     """
     noise = math.sqrt(
         statistics.fmean(_difference(pair) ** 2 for pair in (without, with_item))

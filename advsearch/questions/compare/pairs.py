@@ -74,7 +74,14 @@ def compare_sides(
 
 
 def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPart]:
-    """Yield the counts of pairs for each value of a parameter, or part of its range."""
+    """Yield the counts of pairs for each value of a parameter, or part of its range.
+
+    Values that no pair has are left out.
+
+    Args:
+        first, second: the sides, with rows in the same order.
+        name: of the parameter.
+    """
     column = first.rows[name]
     unit = "" if column.dtype == "category" else first.rows.attrs["units"][name]
     units = first.rows["unit"].to_numpy()

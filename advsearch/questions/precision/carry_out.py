@@ -173,6 +173,7 @@ class QuantityMeasurer:
         self._renderer = problem.renderer
         self._loss = cast(gradients.Loss, problem.compute_loss)
         if self._is_linear:
+            # A smooth loss of the raw image: differences may be taken per pixel.
             self._renderer = problem.renderer.copy_with(
                 denoiser="none", transfer="linear"
             )
@@ -181,6 +182,7 @@ class QuantityMeasurer:
                 self._renderer.formation.resolution, config.seed
             )
 
+        # name, fraction of the time, and the function that measures it
         self.sittings: list[tuple[str, float, Callable[[TimeBudget], Sitting]]] = []
         if "image" in config.measured_quantities:
             self.sittings.append(
@@ -286,6 +288,7 @@ class QuantityMeasurer:
         """
         if recommended.estimator is None or recommended.spp is None:
             return []
+        # a measured setting, with another sample count
         similar = next(
             setting
             for setting in bench.settings
@@ -395,8 +398,9 @@ def _describe_skipped(title: str, measured: Any) -> list[str]:
 def group_by_line(
     points: Sequence[PrecisionPoint],
 ) -> dict[tuple[str, ...], list[PrecisionPoint]]:
-    """Group points by quantity, control, family and estimator, in ascending order of
-    samples.
+    """Group points by quantity, control, family and estimator.
+
+    The points of a group are in ascending order of samples.
     """
     lines: dict[tuple[str, ...], list[PrecisionPoint]] = {}
     for point in points:

@@ -211,8 +211,12 @@ class ClusteredFraction:
 
     @classmethod
     def from_rows(cls, name: str, rows: Rows, flags: Any = None) -> ClusteredFraction:
-        """Count rows by unit: those that are flagged (n,), by default the correct
-        ones.
+        """Count rows by unit.
+
+        Args:
+            name: of the tally.
+            rows: with a column "unit".
+            flags: (n,) whether each is counted; by default those that are correct.
         """
         if flags is None:
             flags = rows["correct"]
@@ -263,8 +267,9 @@ class ClusteredFraction:
         return f"{verb} in {self.n_counted} of {self.total} ({share})"
 
     def is_below(self, other: ClusteredFraction, n_compared: int = 1) -> bool:
-        """Return whether this interval lies below that of another tally, both
-        widened.
+        """Return whether the interval of this tally lies below that of another one.
+
+        Both are widened for a choice among `n_compared`.
         """
         lower = self.interval(n_compared)
         upper = other.interval(n_compared)
@@ -475,9 +480,13 @@ def _name_columns(options: RatesOptions) -> str:
 def _count_cells(
     rows: Rows, series_values: Sequence[str], options: RatesOptions
 ) -> tuple[dict[str, list[ClusteredFraction]], list[float] | None]:
-    """Count the rows of each group and series; also return the centers of bins.
+    """Count the rows of each group and series.
 
     Bars of names are sorted by the fraction of the first series, the highest first.
+
+    Returns:
+        For each group by its name a tally for each series; and the centers of bins,
+        None if the groups are single values.
     """
     groups, bin_centers = _group_rows(rows, options)
     cells = dict[str, list[ClusteredFraction]]()
@@ -495,7 +504,11 @@ def _count_cells(
 def _count_series(
     name: str, rows: Rows, series_values: Sequence[str], options: RatesOptions
 ) -> list[ClusteredFraction]:
-    """Count right or wrong predictions in each series, in the order of the series."""
+    """Count the right predictions in each series; with `options.wrong` the wrong ones.
+
+    The tallies are in the order of `series_values`; a series without rows has an empty
+    one.
+    """
     rows_of_series = {"": rows}
     if options.series and len(rows):
         rows_of_series = split_rows(rows, options.series)
@@ -612,7 +625,17 @@ def _compare_with_baseline(
     series: Sequence[str],
     verb: str,
 ) -> list[str]:
-    """Compare the part `name` with all other rows, a sentence for each series."""
+    """Compare one part with all other rows, a sentence for each series.
+
+    A difference is shown if the intervals do not overlap.
+
+    Args:
+        name: of the part.
+        tallies: of the part, for each series.
+        totals: of the others, for each series.
+        series: their names.
+        verb: what is counted.
+    """
     text = []
     for series_name, tally, total in zip(series, tallies, totals, strict=True):
         differs = tally.is_below(total) or total.is_below(tally)
@@ -702,10 +725,14 @@ def _draw_rate_lines(
 def _group_rows(
     rows: Rows, options: RatesOptions
 ) -> tuple[Mapping[str, Rows], list[float] | None]:
-    """Split rows by a column's values, or by bins; also return the centers of bins.
+    """Split rows by a column's values, or by bins of them.
 
-    Without `bins` and lines, each value is a group, and there are no centers. Rows
-    outside the `range` are in no bin.
+    Without `bins`, and unless lines are drawn, each value is a group. Rows outside of
+    the `range` are in no bin.
+
+    Returns:
+        The rows by the name of the value or bin; and the centers of the bins, None
+        without bins.
     """
     if options.bins is None and options.form != "lines":
         return split_rows(rows, options.by), None
@@ -752,7 +779,14 @@ def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
 
 
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
-    """Draw the fractions as a matrix of colors with percentages in it."""
+    """Draw the fractions as a matrix of colors with percentages in it.
+
+    Args:
+        axes: of matplotlib.
+        cells: for each row of the matrix a tally for each series.
+        series: names of the columns.
+        label: of the color bar.
+    """
     shares = [
         [math.nan if tally.fraction is None else tally.fraction for tally in tallies]
         for tallies in cells.values()
@@ -767,6 +801,7 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
             f"{100 * share:.0f}",
             ha="center",
             va="center",
+            # readable on a dark color, at either end of the scale
             color="white" if abs(share - 0.5) > 0.3 else "black",
             fontsize=7.5,
         )
@@ -786,7 +821,14 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
 def _draw_lines(
     axes: Any, cells: Cells, series: Sequence[str], bin_positions: Sequence[float]
 ) -> None:
-    """Draw the fractions of each series, with their 95 % intervals as bands."""
+    """Draw the fractions of each series as a line, with their 95 % intervals as bands.
+
+    Args:
+        axes: of matplotlib.
+        cells: for each bin a tally for each series.
+        series: names for the legend.
+        bin_positions: of the bins along the horizontal axis.
+    """
     for index, name in enumerate(series):
         positions = list[float]()
         shares = list[float | None]()
@@ -796,6 +838,7 @@ def _draw_lines(
             tally = tallies[index]
             if not tally.total:
                 continue
+            # Without an interval nothing is known: the band is full.
             interval = tally.interval() or (0.0, 1.0)
             positions.append(position)
             shares.append(tally.fraction)
@@ -911,8 +954,13 @@ def _add_agreement(
     table: list[list[Cell]],
     series_name: str,
 ) -> None:
-    """Add the agreement of pairs to the bars and the table, for all objects and
-    each.
+    """Add the agreement of pairs to the bars and the table, of all objects and of each.
+
+    Args:
+        bars: tallies by object, or `ALL_OBJECTS`; each gets one more.
+        pairs: of renderings and other images.
+        table: which gets a row for each object.
+        series_name: what the other images are.
     """
     for name, tallies in bars.items():
         object_pairs = pairs
@@ -948,7 +996,16 @@ def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
 
 
 def _count_agreement(name: str, pairs: Rows) -> tuple[ClusteredFraction, list[Cell]]:
-    """Count the pairs that agree; also return the cells of the table's row."""
+    """Count the pairs in which both predictions are right, or both are wrong.
+
+    Args:
+        name: of the tally.
+        pairs: with "correct rendered" for the rendering, "correct" for the other image.
+
+    Returns:
+        The tally of these pairs; and the cells of the table's row: pairs by whether the
+        rendering and the other image are right, equal predictions, and the tally.
+    """
     of_rendering = pairs["correct rendered"]
     of_other = pairs["correct"]
     confusion = list[Cell]()
@@ -1064,7 +1121,11 @@ def _compute_gains(run_rates: Any, rates_by_count: Mapping[int, Any]) -> Any:
 
 
 def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
-    """Describe the throughput of each worker count, relative to the fewest workers."""
+    """Describe the throughput of each worker count, relative to the fewest workers.
+
+    Args:
+        rates_by_count: throughput of several runs, by ascending worker count.
+    """
     fewest = next(iter(rates_by_count))
     text = list[str]()
     for workers, run_rates in rates_by_count.items():
@@ -1084,6 +1145,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     if min_runs > 1:
         # The median of the population lies outside the range of n runs only if all n
         # are on one side of it.
+        # The chance of that is 0.5^n for either side.
         confidence = 100 * (1 - 0.5 ** (min_runs - 1))
         text.append(
             f"Medians of {min_runs} runs, one of each object, with the lowest and the "

@@ -62,8 +62,15 @@ def make_renderer(
 ) -> gradients.Renderer:
     """Return `render(u, seed, spp)` of a small image, as `Scene.renderer` does.
 
-    `plugins` are further shapes as Mitsuba's dictionaries. Differences are taken per
-    pixel, since the losses of the cases are smooth.
+    Differences are taken per pixel, since the losses of the cases are smooth.
+
+    Args:
+        controls: what varies.
+        thing: the object, its name, or what makes it.
+        environment: a plain one by default.
+        settings: of the scene.
+        plugins: further shapes, as Mitsuba's dictionaries by name.
+        denoise: the denoiser.
     """
     shape = thing() if callable(thing) else thing
     scene = workbench.load_scene(
@@ -84,9 +91,7 @@ def describe_mug() -> SceneDescription:
 
 
 def make_plain_environment() -> assets.EnvironmentAsset:
-    """Return a sky (16, 32, 3) brighter on one side and above, so that rotation
-    shows.
-    """
+    """Return a sky (16, 32, 3), brighter on one side, so that rotations show, and above."""
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
     azimuthal = 0.6 * np.sin(columns * (2.0 * np.pi / 32.0))
     vertical = 0.8 * np.cos(rows * (np.pi / 16.0))
@@ -279,9 +284,16 @@ def _compare_images(
 def _check_gradient(
     rows: Sequence[results.Measured],
 ) -> tuple[list[Check], float | None]:
-    """Check the largest noise and the largest error; return the latter's bias too.
+    """Check the comparison of derivatives with differences: its noise and the errors.
 
-    Without derivatives there are no checks, and no bias.
+    There is a check of the derivative with the largest noise and one of that with the
+    largest error; without derivatives there is none.
+
+    Args:
+        rows: the compared derivatives.
+
+    Returns:
+        The checks, and the bias of the derivative with the largest error.
     """
     if not rows:
         return [], None
@@ -369,8 +381,9 @@ def measure_inward_slope(
 ) -> tuple[float, float]:
     """Return the derivative of the smooth linear loss along a direction inwards.
 
-    The direction moves values from the start into the range that increase the loss, if
-    `factor` is 1. Other values stay.
+    Values at the ends of the range can only move inwards. The direction is 1 into the
+    range for those that increase the loss this way, and 0 for all others; times
+    `factor`.
 
     Args:
         renderer: of the scene.
@@ -388,6 +401,7 @@ def measure_inward_slope(
     step = 0.04
     loss = gradients.make_smooth_loss(linear.formation.resolution)
     inwards = torch.where(u > 0.5, -1.0, 1.0)
+    # 0.5 - u points inwards.
     increases_loss = gradient * (0.5 - u) > 0.0
     direction = inwards * increases_loss * factor
     slopes = []
@@ -396,6 +410,7 @@ def measure_inward_slope(
             float(loss(render_image(linear, u + count * step * direction, seed, spp)))
             for count in range(3)
         )
+        # one-sided difference of second order, from values at 0, 1 and 2 steps
         slopes.append((4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step))
     return float(gradient @ direction), math.fsum(slopes) / seeds
 

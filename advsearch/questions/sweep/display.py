@@ -740,6 +740,7 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     for name, value, unit, remark in rates:
         if value is None:
             continue
+        # fractions are shown in percent
         factor = 100.0 if unit == " %" else 1.0
         interval = "-"
         if value.interval:
@@ -878,6 +879,7 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
     # The line is fitted beyond the last dip that is not chance.
+    # That is the index of the nearest distance that is left.
     first = max(
         (distances.index(dip.distance) + 1 for dip in dips if dip.is_significant),
         default=0,
@@ -935,11 +937,11 @@ def _bound_distance(
 def _find_crossing(
     distance: NDArray[np.float64], falling: NDArray[np.float64]
 ) -> float | None:
-    """Return where a falling line crosses one half; None if it does not.
+    """Return the distance where a falling line crosses one half; None if it does not.
 
     Args:
         distance: (m,) ascending; the line is linear in its logarithm.
-        falling: (m,) the line.
+        falling: (m,) the line, the fraction of right images at each distance.
     """
     if not falling[0] >= HALF > falling[-1]:
         return None
@@ -1020,11 +1022,18 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
 
 
 def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
-    """Return where an object is detected less often than beyond.
+    """Return a sentence about dips: distances with fewer detections than beyond.
 
-    These are all dips that are not chance. Without any, it is the least likely of those
-    that contradict the estimate: fewer than half of the images are right at a distance
-    nearer than the estimate, or below the rise beyond it.
+    It has all of these dips that are not chance. If all may be chance, it has the least
+    likely one that contradicts the estimate, if any: a dip with fewer than half of the
+    images right, nearer than the estimated distance or before a rise to at least half.
+
+    Args:
+        estimate: of the detection distance.
+        unit: of distances.
+
+    Returns:
+        One sentence, or nothing.
     """
     significant = [dip for dip in estimate.dips if dip.is_significant]
     if significant:

@@ -171,7 +171,8 @@ class Drives:
     """
 
     _units = Units()
-    # from the plan: bounds that the sample has are none of what it is drawn from
+    # Bounds come from the plan. Those of the sampled distances would not bound the
+    # others that could have been drawn.
     _distance_bounds: tuple[float, float] | None = None
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
@@ -181,6 +182,7 @@ class Drives:
         axis = job.axes[axis_index]
         self._units = next(iter(job.load_points(0).values())).units
         self._distance_bounds = compute_distance_bounds(job, axis)
+        # A row has its place in the flat array of this shape by its number.
         shape = (
             len(job.scenes),
             *(len(axis.values) for axis in job.axes),
@@ -188,6 +190,7 @@ class Drives:
             len(job.models),
         )
         flags: Flags = np.full(shape, UNKNOWN, np.int8)
+        # The models of an image have the same distance.
         distance = np.full(shape[:-1], np.nan)
         self._path_of_step: dict[int, str] = {}
         self._frame_of_step: dict[int, DetectedFrame] = {}
@@ -199,7 +202,8 @@ class Drives:
         self.times = times[order]
         self.seconds = float(self.times[-1] - self.times[0])
         steps = np.arange(flags.size).reshape(shape)
-        # The frames become the last axis, in the order of their times.
+        # The frames become the last axis, in the order of their times. The arrays begin
+        # with the axis of the scenes, so that axes of the grid are one further back.
         self._flags = np.moveaxis(flags, axis_index + 1, -1)[..., order]
         self._steps = np.moveaxis(steps, axis_index + 1, -1)[..., order]
         self._distance = np.moveaxis(distance, axis_index + 1, -1)[..., order]
@@ -211,14 +215,17 @@ class Drives:
         flags: Flags,
         distance: npt.NDArray[np.float64],
     ) -> None:
-        """Read what the rows state of each frame.
+        """Fill the arrays of right predictions and of distances from rows.
+
+        Boxes, the name of the path and the unit of distances are kept, too.
 
         Args:
             rows: of the sweep.
             instance: name of the control that travels.
             flags: (scenes, ..., models), which is filled; a row's number is its index
                 in the flat array.
-            distance: (scenes, ...), which is filled; likewise with an image's number.
+            distance: (scenes, ...), which is filled; the number of an image, which is
+                that of its rows divided by the models, is its index in the flat array.
         """
         job = self._job
         right_names = self._find_right_names()
@@ -296,6 +303,8 @@ class Drives:
         drive = np.asarray(self._units.find_draw(first_images))
         n_drives = len(np.unique(drive))
         n_right_drives = len(np.unique(drive[has_right]))
+        # bounds of the values, from the plan: every frame wrong, a change at every
+        # frame
         max_gap = n_frames * self._frame_interval
         max_flicker = (n_frames - 1) / self.seconds
         return DriveRates(
@@ -386,13 +395,14 @@ class Drives:
     ) -> TrackRates | None:
         """Compute what a tracker makes of the boxes of drives.
 
-        A frame that is lost has no track on the object; it is loose if a track would be
-        on it with less overlap.
+        A frame is lost if the object is visible and no track is on it. A lost frame is
+        loose if a track would be on it with less overlap.
 
         Args:
             model: its index.
             steps: (n, frames) numbers of the rows.
-            drive: (n,) the draw of each drive.
+            drive: (n,) the draw of each drive; drives of one draw differ in noise
+                alone.
 
         Returns:
             The rates; None unless the model detects and every frame has its boxes.
@@ -416,6 +426,7 @@ class Drives:
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
             lost=summarize_drives(lost, max, drive_of_value=drive),
+            # lost, but not if less overlap is enough
             loose=summarize_drives(lost - lost_loosely, max, drive_of_value=drive),
             switches=summarize_drives(switches, max, (0.0, n_frames - 1.0), drive),
             longest_gap=summarize_drives(
@@ -454,7 +465,10 @@ class Drives:
 def _compute_lost_loosely(
     task: Detection, tracker: Tracker, frames: Sequence[Sequence[DetectedFrame]]
 ) -> npt.NDArray[np.float64]:
-    """Compute the fraction (n,) of lost frames if tracks may overlap the object less.
+    """Compute for each drive the fraction (n,) of frames that are lost even loosely.
+
+    For that a track needs to overlap the object by `MIN_OVERLAP` only, if that is less
+    than the `iou` of the task.
 
     Args:
         task: of the model; a track is on the object from its `iou` on.
@@ -469,7 +483,8 @@ def _compute_lost_loosely(
 
 
 def find_longest_run(flags: npt.NDArray[np.bool_]) -> int:
-    """Return the length of the longest run of true flags (n,)."""
+    """Return the length of the longest run of true flags (n,); 0 if none is true."""
+    # 0 at both ends: a run may begin with the first flag or end with the last.
     changes = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     bounds = np.flatnonzero(changes)  # begin and end of each run, alternating
     return int((bounds[1::2] - bounds[::2]).max(initial=0))

@@ -146,6 +146,7 @@ class Predictions:
         self.is_known: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.is_right: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.is_hidden: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        # apart from `is_right`: a prediction that is not a number is neither
         self._wrong: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.margin = np.full(n_rows, np.nan)
         self.outcome = np.full(n_rows, UNKNOWN_OUTCOME, np.uint8)
@@ -316,15 +317,16 @@ def make_map(
 ) -> SweepMap | None:
     """Count predictions, and average margins, over every pair of values of two axes.
 
+    The two are the first axes of the grid; if it has fewer, the last ones outside of
+    the scene follow. Only if there are none of either kind, they are sampled ones.
+
     Args:
         axes: all of the tables.
         right: (n,) whether each prediction is right.
         margin: (n,) NaN where it is not a number.
 
     Returns:
-        The map over the first axes of the grid, or the last outside of the scene, or
-        sampled ones if there are none of these; None of fewer than two axes, or of
-        too many values.
+        The map; None of fewer than two axes, or of more than `MAX_CELLS` pairs.
     """
     axes = _order_for_map(axes)
     if len(axes) < 2:

@@ -496,6 +496,9 @@ def _write_smallest(
 ) -> Counterexample:
     """Write the smallest form of a counterexample on which the model fails.
 
+    Forms store the offsets more or less finely. Each is written, read back and tried;
+    the last, finest one is kept whatever the model says.
+
     Args:
         base: path of the file without suffix.
         values: content of the file except for the blocks.
