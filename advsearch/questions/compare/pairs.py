@@ -171,7 +171,10 @@ def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
 
 
 def count_exceptions(pairs: pd.DataFrame) -> CountOf:
-    """Count the pairs that are not `correct`, with the interval of their share."""
+    """Count the pairs that are not `correct`, with their share and its interval.
+
+    Rate and interval of the correct ones are turned around: 1 - rate.
+    """
     lower, upper = rules.estimate_interval(pairs)
     share = None if pairs.empty else 1.0 - rules.estimate_rate(pairs)
     n_exceptions = int((~pairs["correct"]).sum())

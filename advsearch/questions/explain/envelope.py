@@ -80,11 +80,11 @@ def find_best_peel(
     best_box = None
     best_accuracy = -1.0
     for smaller_box in list_peels(box, inside):
-        rest = choosing[rules.find_covered(smaller_box, choosing)]
-        n_draws = len(rest) if is_independent else rest["unit"].nunique()
-        if n_draws >= MIN_BOX_UNITS and rest["correct"].mean() > best_accuracy:
+        remaining = choosing[rules.find_covered(smaller_box, choosing)]
+        n_draws = len(remaining) if is_independent else remaining["unit"].nunique()
+        if n_draws >= MIN_BOX_UNITS and remaining["correct"].mean() > best_accuracy:
             best_box = smaller_box
-            best_accuracy = rest["correct"].mean()
+            best_accuracy = remaining["correct"].mean()
     return best_box
 
 

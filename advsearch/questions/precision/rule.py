@@ -128,11 +128,16 @@ def estimate_reference(
 ) -> ReferenceValue:
     """Return a function of the mean of independent parts, with its jackknife error.
 
-    The jackknife (Efron 1982, chapter 3) of the mean itself is its standard error. A
-    function, (n,) to (m,), is for what is no mean, such as a picture after its tone
-    curve or a model's margin on it. The error combines, as squares, the jackknife's
-    estimates of scatter and of bias (noise through a nonlinear function), and a known
-    `bias`.
+    The jackknife (Efron 1982, chapter 3) computes the function again without each part
+    in turn. How much these values scatter tells the standard error; by how much their
+    mean differs from the value, the bias that noise has through a nonlinear function.
+    The error combines both and the known `bias` as a root of the sum of squares.
+
+    Args:
+        parts: independent values (n,) of the same thing.
+        function: (n,) to (m,), of what is no mean itself, such as a picture after its
+            tone curve or a model's margin on it.
+        bias: a known bias of the value.
 
     Raises:
         ValueError: if there are fewer than two parts.
@@ -144,7 +149,7 @@ def estimate_reference(
         )
     total = np.sum(parts, axis=0)
     value = function(total / count)
-    # the function of the mean of all parts but one, of each part
+    # for each part, the function of the mean of all others
     jackknife_values = [function((total - part) / (count - 1)) for part in parts]
     center = np.mean(jackknife_values, axis=0)
     sum_of_squares = sum(
@@ -155,7 +160,8 @@ def estimate_reference(
     bias_estimate = 0.0
     if count > 2:
         bias_estimate = (count - 1) * float(np.linalg.norm(center - value))
-    # the estimate of the bias scatters as much as the value does
+    # The estimate of the bias scatters as much as the value does: what is less may be
+    # chance, and the scatter counts already.
     bias_estimate = max(0.0, bias_estimate - scatter)
     norm = float(np.linalg.norm(value))
     error = math.hypot(scatter, bias_estimate, bias)
@@ -193,8 +199,8 @@ def summarize_samples(
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
         # standard error of the mean square
-        deviation = statistics.stdev(squares) / math.sqrt(len(squares))
-        factor = _interval_factor(deviation, mean_square, len(squares))
+        standard_error = statistics.stdev(squares) / math.sqrt(len(squares))
+        factor = _interval_factor(standard_error, mean_square, len(squares))
         interval = (error / factor, error * factor)
     cosines = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
     cosine = None
@@ -239,10 +245,12 @@ def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
     than `MIN_ERROR_PIXELS`. False if the pictures are too small to tell. What happens
     in none of the pictures, such as a firefly in every hundredth one, cannot be seen.
     """
-    squares = sum(numbers["error"] ** 2 for numbers in samples)
+    sum_of_squares = sum(numbers["error"] ** 2 for numbers in samples)
     # NaN without fourth powers, which makes the result false
-    fourth = sum(numbers.get("fourth", math.nan) for numbers in samples)
-    return fourth > 0.0 and squares**2 < MIN_ERROR_PIXELS * fourth
+    sum_of_fourths = sum(numbers.get("fourth", math.nan) for numbers in samples)
+    return (
+        sum_of_fourths > 0.0 and sum_of_squares**2 < MIN_ERROR_PIXELS * sum_of_fourths
+    )
 
 
 def median_time(seconds: Sequence[float]) -> float:

@@ -233,7 +233,7 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
         For each part the names of its parameters, which are columns of its rows.
     """
     parameters_of_settings = dict[str, set[str]]()
-    columns = defaultdict[str, set[str]](set)
+    parameters_of_part = defaultdict[str, set[str]](set)
     config_of_run = {run.name: run.config for run in runs}
     for run in runs:
         distinct_settings = {
@@ -246,10 +246,10 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
             # the search around whose distribution this run samples
             search = config_of_run[run.around] if run.around else None
             parameters_of_settings[key] = _check_run(run.config, search)
-        columns[run.part] |= parameters_of_settings[key]
+        parameters_of_part[run.part] |= parameters_of_settings[key]
         if getattr(run.config, WORKERS_COLUMN, None) is not None:
-            columns[run.part].add(WORKERS_COLUMN)
-    return columns
+            parameters_of_part[run.part].add(WORKERS_COLUMN)
+    return parameters_of_part
 
 
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:

@@ -240,7 +240,10 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
 
 
 def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
-    """Return which predictions (n,) are one of the classes, in full or in a list."""
+    """Return which predictions (n,) name one of the classes.
+
+    A label may be a list of synonyms, as in "cup, mug": it matches in full, or by one.
+    """
     names = predictions.map(
         lambda label: {label.strip(), *map(str.strip, label.split(","))}
     )
@@ -285,10 +288,15 @@ def _draw_cues(
 def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     """Count how many predictions the shape and the texture predict, by pair of both.
 
-    A cue predicts the most frequent of the predictions about the same object with
-    other textures, or about the same texture on other objects. Both are sampled to the
-    size of the smaller set. A predicted prediction is in neither set, so that a model
-    that goes by neither cue is predicted equally well by both.
+    To predict what a model says about a pair, a cue takes its most frequent prediction
+    about the same object with other textures, or about the same texture on other
+    objects. Both sets are sampled to the size of the smaller, and neither has the
+    pair's own predictions, so that a model that goes by neither cue is predicted
+    equally well by both.
+
+    Args:
+        rows: predictions with object and texture.
+        options: of the figure, which name the columns of both.
 
     Returns:
         For each pair of object and texture: the number of predictions, those that the
@@ -364,6 +372,7 @@ def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
         _shape_advantage(generator.choices(pairs, k=len(pairs)))
         for _ in range(RESAMPLES)
     )
+    # 2.5 % at either end are outside of the interval
     n_outside = round(RESAMPLES * 0.025)
     lower = resampled[n_outside]
     upper = resampled[-1 - n_outside]

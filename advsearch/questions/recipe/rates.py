@@ -580,10 +580,17 @@ def _describe_series(
     series: Sequence[str],
     options: RatesOptions,
 ) -> list[str]:
-    """Compare the series over all rows, and models by their mean relative error.
+    """Compare the series over all rows.
 
-    That is the mCE of Hendrycks and Dietterich (2019), with the first model as the
-    reference.
+    Where they are models and errors are counted, each but the first also has the mean
+    over rows of its error relative to that of the first model: the mCE of Hendrycks and
+    Dietterich (2019).
+
+    Args:
+        cells: for each row a tally for each series.
+        totals: of each series over all rows.
+        series: their names.
+        options: of the figure.
     """
     if not options.series or len(series) < 2:
         return []
@@ -987,8 +994,9 @@ def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
 def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
     """Join rows with the renderings of the same configuration.
 
-    A row may have more parameters than its rendering. Columns of the rendering that
-    the row has too end in `` rendered``.
+    A configuration is all columns of the renderings but those that say something of a
+    single row. Rows may have more parameters. Columns of a single row come twice: those
+    of the rendering end in `` rendered``.
     """
     per_row = {PREDICTION_COLUMN, PART_COLUMN, "correct", "margin", "time", "unit"}
     configuration = [name for name in renderings if name not in per_row]
@@ -1052,8 +1060,13 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 
 
 def _describe_where(right: bool, pairs: Rows) -> str:
-    """Describe the other image of pairs whose rendering was predicted right or
-    wrong.
+    """Describe how often both predictions are right, or wrong, if the first one is.
+
+    The first is about the rendering, the second about the other image of a pair.
+
+    Args:
+        right: whether the first is right.
+        pairs: of both.
     """
     verb = "right" if right else "wrong"
     is_selected = pairs["correct rendered"] == right

@@ -298,17 +298,17 @@ def model_condition(
         name: of the other model.
         spp: samples per pixel.
     """
-    light = name
+    shared_key = name
     if other_problem.renderer.formation == problem.renderer.formation:
-        light = RUN_LIGHT
+        shared_key = RUN_LIGHT
         other_problem = replace(other_problem, renderer=problem.renderer)
     return ReplayCondition(
         "model",
         name,
         make_problem=partial(replace, other_problem),  # a copy
         spp=spp,
-        light=light,
-        source=light,
+        light=shared_key,
+        source=shared_key,
     )
 
 

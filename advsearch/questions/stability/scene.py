@@ -91,7 +91,7 @@ def describe_mug() -> SceneDescription:
 
 
 def make_plain_environment() -> assets.EnvironmentAsset:
-    """Return a sky (16, 32, 3), brighter on one side, so that rotations show, and above."""
+    """Return a sky (16, 32, 3), brighter above and, to show rotations, on one side."""
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
     azimuthal = 0.6 * np.sin(columns * (2.0 * np.pi / 32.0))
     vertical = 0.8 * np.cos(rows * (np.pi / 16.0))
@@ -113,7 +113,12 @@ def make_gray_environment(
 def make_mesh(
     vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]
 ) -> assets.Mesh:
-    """Return a mesh with UVs from x and z, whose normals face +x."""
+    """Return a mesh with UVs from y and z, whose normals face +x.
+
+    Args:
+        vertices: points (x, y, z), about a plane of constant x.
+        faces: three indices of vertices each.
+    """
     points = np.asarray(vertices, np.float32)
     facing = np.tile([1.0, 0.0, 0.0], (len(points), 1))
     low = points.min(axis=0)
@@ -128,7 +133,7 @@ def make_mesh(
 
 
 def make_checkered_object(mesh: assets.Mesh) -> assets.ObjectAsset:
-    """Return an object with a checkered texture around a display-referred gray."""
+    """Return an object with a checkered texture (4, 4): 0.35 and 0.65, in sRGB."""
     checks = np.indices((4, 4)).sum(axis=0) % 2
     base = np.float32(0.5) + np.float32(0.3) * (checks - np.float32(0.5))
     texels = np.repeat(base[:, :, None], 3, axis=2).clip(0.0, 1.0).astype(np.float32)
@@ -317,8 +322,16 @@ def search_scene(
 ) -> workbench.SearchResult:
     """Search from a configuration with the margin of a linear model of two classes.
 
-    Its logits are 0, and `LOGIT_SCALE` times the increase of the loss over the start,
-    minus 1.
+    One logit is 0, the other `LOGIT_SCALE` times the increase of the loss over the
+    start, minus 1. So the margin is -1 at the start, and above 0 once the loss has
+    increased by 1 / `LOGIT_SCALE`.
+
+    Args:
+        renderer: of the scene.
+        loss: of an image.
+        start: (d,) configuration.
+        spp: samples per pixel.
+        evaluations: with gradients, that the search makes.
     """
     loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
     gradient_cost = make_domain(renderer, start).gradient_cost
@@ -326,6 +339,7 @@ def search_scene(
     def margin(image: Tensor) -> Tensor:
         return LOGIT_SCALE * (loss(image) - loss_at_start) - 1.0
 
+    # counted in renders, of which a gradient takes several
     steps = evaluations * (1 + gradient_cost) + 1
     return run_search(
         renderer, margin, steps, spp=spp, start=start, candidates=1, repeats=1
@@ -351,8 +365,16 @@ def compare_gradient(
     seeds: tuple[int, int] = (3, 12),
     repeats: int = 24,
 ) -> list[results.Measured]:
-    """Compare the plan's gradient of a linear loss with common-random-number
-    differences.
+    """Compare the plan's gradient of a smooth linear loss with differences.
+
+    Differences are between renders with the same random numbers.
+
+    Args:
+        renderer: whose formation is linear meanwhile.
+        u: the configuration (d,).
+        spp: samples per pixel.
+        seeds: minimum and maximum number of seeds of the differences.
+        repeats: gradients that are compared.
     """
     formation = renderer.formation
     bench = gradients.Bench(

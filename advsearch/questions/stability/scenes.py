@@ -247,7 +247,7 @@ register_cases(
 
 
 def make_glass_ball() -> dict[str, dict[str, object]]:
-    """Return a ball of glass between camera and mug, as Mitsuba's dictionary by name."""
+    """Return a glass ball between camera and mug, as Mitsuba's dictionary by name."""
     camera = geometry.camera_to_world(describe_mug())[:3, 3]
     center = [float(value) for value in camera * 0.6 + np.array([0.0, 0.0, 0.2])]
     material = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
@@ -844,8 +844,8 @@ def estimate_hessian(
 ) -> Tensor:
     """Estimate second derivatives (k, k), float64, of an objective f by differences.
 
-    They are central, of steps h: (f(+) - 2 f + f(-)) / h^2 on the diagonal, and elsewhere (f(++) -
-    f(+-) - f(-+) + f(--)) / (4 h_i h_j).
+    They are central, of steps h: (f(+) - 2 f + f(-)) / h^2 on the diagonal, and (f(++)
+    - f(+-) - f(-+) + f(--)) / (4 h_i h_j) elsewhere.
 
     Args:
         value: the objective f.
@@ -919,9 +919,9 @@ def light_rotation_texel() -> Outcome:
     # power and rotation
     u[0] = 0.5
     u[1] = 0.1
-    second = _estimate_three_curvatures(renderer, u)
+    hessian = _estimate_three_curvatures(renderer, u)
     # from the unit box to watts, degrees and sRGB
-    units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
+    from_unit_box = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
     path, _ = _record_path(renderer, u, 1.0)
     scaled_path, ending = _record_path(renderer, u, RATIO)
     distances = (path - path[0]).abs().amax(dim=0)
@@ -935,9 +935,9 @@ def light_rotation_texel() -> Outcome:
         ),
         ending=ending,
         measured={
-            "condition number in u": condition_number(second),
+            "condition number in u": condition_number(hessian),
             "condition number in watts, degrees and sRGB": condition_number(
-                units @ second @ units
+                from_unit_box @ hessian @ from_unit_box
             ),
         },
     )

@@ -583,8 +583,8 @@ class Points:
             large_dimensions, "random", seed, "large draws"
         )
         self.is_sampled = small_dimensions + large_dimensions > 0
-        # If nothing is sampled, the samples of a grid point are repeats of one draw, each
-        # with its own noise.
+        # If nothing is sampled, the samples of a grid point are repeats of one draw,
+        # each with its own noise.
         n_draws = samples if self.is_sampled else 1
         time_axis = next(
             (index for index, axis in enumerate(axes) if axis.is_time), None

@@ -166,6 +166,9 @@ class Job:
     def make_queries(self, numbers: range) -> list[WorkItem]:
         """Return the queries of all models about images of one scene.
 
+        The number of a query is that of its image, times the models, plus the index of
+        its model.
+
         Args:
             numbers: of the images in the sweep.
 
@@ -242,7 +245,7 @@ class Job:
             values: of the controls.
         """
         named_scene = self.scenes[scene]
-        held_names = {control.name for control in named_scene.fixed_controls}
+        fixed_names = {control.name for control in named_scene.fixed_controls}
         names = named_scene.names
         if environment is not None:
             names["environment"] = environment
@@ -252,7 +255,7 @@ class Job:
         }
         for name, value in values.items():
             control_name = name.partition(".")[0]
-            if control_name not in held_names:
+            if control_name not in fixed_names:
                 row_values[name] = value
         return row_values
 
@@ -725,7 +728,7 @@ class SweptScene:
     def _make_images(
         self, size: ImageSize, queries: Sequence[Query]
     ) -> dict[int, SweptImage]:
-        """Return the images of one size, rounded to 8 bits, by their number in the sweep.
+        """Return the images of one size, rounded to 8 bits, by number in the sweep.
 
         The number of a query is that of its image, times the models, plus the index of
         its model.
@@ -810,9 +813,9 @@ def verify_worst(
 ) -> WorstVerified | None:
     """Render the worst configuration again, and count wrong predictions.
 
-    The samples per pixel are chosen first; they have converged if the ladder has one
-    step, or if more samples leave the margin's sign. Renders that the run has stored
-    already are not made again.
+    The samples per pixel are chosen first, on a ladder: up to the count from which on
+    more samples leave the sign of the margin. Then they have converged, as they have if
+    the ladder has one step only. Renders that the run has stored are not made again.
 
     Args:
         problem: of its scene and model.

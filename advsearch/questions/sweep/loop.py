@@ -311,11 +311,11 @@ class Sweep:
         """Yield the queries of missing rows in batches, none over two scenes.
 
         A batch begins at a multiple of its size in the scene, whatever is missing, so
-        that its evaluations don't depend on where a sweep was stopped. Of an image
-        that has some of its rows, only the missing ones are yielded.
+        that its evaluations don't depend on where a sweep was stopped. If only some
+        rows of an image are missing, only these are yielded.
 
         Args:
-            missing: ranges of row numbers.
+            missing: ranges of row numbers; a row is an image and a model.
         """
         batch_size = self.job.config.batch
         for rows in missing:
@@ -337,6 +337,7 @@ class Sweep:
                         for problem_name, u, query in items
                         if query.number in rows
                     ]
+                # the first image of the next scene
                 image = scene_begin + self.images_per_scene
 
     def _report(self, n_rows: int, predictions: Predictions) -> None:
@@ -393,6 +394,9 @@ class Sweep:
 
     def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[TableAxis]:
         """Return what tables are by: all axes with several values.
+
+        These are object, environment and adversarial scene, the model, the axes of the
+        grid, and the parts of sampled numbers.
 
         Args:
             rows: (n,) numbers of the rows, ascending, whose values are looked up.

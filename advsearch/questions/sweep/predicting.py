@@ -113,8 +113,8 @@ class Groups:
         self.n_groups = self._between.count
         self.n_cached_groups = 1
         if True in self._is_within:
-            # Images come in order, the last axis fastest. If an axis after the first one
-            # within lies between groups, the groups along it alternate: all are cached.
+            # Images come in order, the last axis fastest. If an axis after the first
+            # one within lies between groups, groups along it alternate: all are cached.
             first_within = self._is_within.index(True)
             for axis in range(first_within, len(self._is_within)):
                 if not self._is_within[axis]:

@@ -208,17 +208,20 @@ class Predictions:
     def compare_arms(self, models: Sequence[str], units: Units) -> list[PairedRates]:
         """Compare the predictions without and with an adversarial configuration.
 
-        The second half of the rows are those of the first with the adversarial
-        configuration. Only pairs of which both are known are counted.
+        The rows are two arms: the second half repeats the first with the adversarial
+        configuration. Pairs are counted only if both predictions are.
 
         Args:
             models: their names.
             units: how rows follow from draws.
+
+        Returns:
+            The comparison for each model that has pairs.
         """
-        by_arm = (2, -1, len(models))  # arms, images, models
-        right = self.is_right.reshape(by_arm)
-        outcome = self.outcome.reshape(by_arm)
-        both_counted = np.asarray(self.is_counted.reshape(by_arm).all(axis=0))
+        arm_shape = (2, -1, len(models))  # arms, images, models
+        right = self.is_right.reshape(arm_shape)
+        outcome = self.outcome.reshape(arm_shape)
+        both_counted = np.asarray(self.is_counted.reshape(arm_shape).all(axis=0))
         pairs = list[PairedRates]()
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])
