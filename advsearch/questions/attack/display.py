@@ -494,7 +494,10 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
 
 
 def _matrix_text(result: MatrixResult) -> str:
-    """Return the result of a matrix in a sentence."""
+    """Return the result of a matrix in a sentence.
+
+    An adversarial scene counts on a model if its trials there end as "found".
+    """
     same_model = list[str]()
     other_model = list[str]()
     for row in result.table:

@@ -529,7 +529,8 @@ def _printability(problem: Problem, findings: RunState) -> Printability:
 def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
     """Return the adversarial configuration, with clean values and ranges.
 
-    A range has what is a single number: its values where its coordinate is 0 and 1.
+    Only a parameter that is a single number has a range: from its value where its
+    coordinate in u is 0 to that where it is 1.
 
     Args:
         problem: of the attack.

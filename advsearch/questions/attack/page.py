@@ -251,9 +251,7 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
 
 
 def _range_text(changed: FoundValue) -> str:
-    """Return the range of a number, and whether it lies at an end; empty without
-    one.
-    """
+    """Return the range of a number, and whether it is at an end; empty without one."""
     low = changed.low
     high = changed.high
     if low is None or high is None or not isinstance(changed.value, (int, float)):

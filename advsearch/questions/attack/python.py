@@ -224,8 +224,9 @@ def _make_config(
 
 
 def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any:
-    """Return a context with the run directory: a stopped run's, a new one's, or
-    None.
+    """Return a context with the run directory, or None.
+
+    It is that of a stopped run or a new one.
     """
     resumed = None
     if resume and run is not None and is_run(locate_run(run)):

@@ -227,9 +227,8 @@ def evaluate_clean_scene(
 def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     """Return whether the clean scene is wrong, so that there is nothing to search for.
 
-    The full trials decide. They are made if it was wrong in every first look, or
-    `in_any_case`. It never is wrong for a rule that does not compare with the clean
-    scene.
+    The full trials decide. They are made only if every first look was wrong, or with
+    `in_any_case`. A rule that does not compare with the clean scene never has it wrong.
     """
     problem = verifier.problem
     findings = verifier.state

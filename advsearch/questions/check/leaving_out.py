@@ -251,9 +251,20 @@ def _count_visible_texels(
     seed: int,
     spp: int,
 ) -> int:
-    """Count the texels that reach the camera directly: they have a derivative."""
+    """Count the texels of a texture that reach the camera directly.
+
+    These are the ones by which the sum of all pixels has a derivative, if light paths
+    have just two segments: from the light to the surface, and on to the camera.
+
+    Args:
+        renderer: of the scene.
+        inputs: of the scene.
+        name: of the input that is the texture.
+        seed: of the render.
+        spp: samples per pixel.
+    """
     scene = renderer.scene
-    with scene.limit_depth(2):  # light, surface, camera
+    with scene.limit_depth(2):
         ones = torch.ones(*scene.resolution, 3)
         gradient = scene.render_adjoint(inputs, ones, seed, spp, wrt=[name])[name]
     return int((gradient.abs().amax(dim=-1) > 0.0).sum())

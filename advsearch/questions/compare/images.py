@@ -124,8 +124,9 @@ class PairImages:
             self.context.progress.advance(1)
 
     def _render_image(self, image: MissingImage) -> None:
-        """Render an image again; add a warning if its scene or model is not
-        available.
+        """Render an image again, and store it.
+
+        If its scene or model is not available, there is a warning instead.
         """
         sweep = image.side.sweep
         if str(sweep.folder) in self._unavailable:

@@ -225,8 +225,9 @@ def read_table(
 
 
 def find_sweeps(path: Path) -> list[Path]:
-    """Return the directories of the sweeps of a run: its own, or those of a recipe's
-    parts.
+    """Return the directories of the sweeps of a run.
+
+    A recipe has those of its parts; a sweep is its own.
     """
     result = read_result(path)
     if result.command != "recipe":

@@ -90,8 +90,9 @@ def sort_by_distance(points: FloatArray, members: IntArray) -> tuple[int, ...]:
 
 
 def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
-    """Cluster points (n, d) into the number of clusters with the largest mean
-    silhouette.
+    """Cluster points (n, d) by k-means.
+
+    The number of clusters is the one with the largest mean silhouette.
 
     Returns:
         The mean silhouette, -1 if none can be computed; and the cluster of each point

@@ -49,8 +49,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
-    """Estimate how much each factor, and each interacting pair, decides the
-    predictions.
+    """Estimate how much each factor, and each interacting pair, decides predictions.
 
     Numbers are cut into about as many groups as the cube root of the clusters; those of
     pairs more coarsely, so that a cell has `MIN_ROWS_PER_CELL` rows on average.

@@ -335,9 +335,7 @@ class Renders:
         return nearest_index
 
     def _list_thumbnails(self, name: str, numbers: Sequence[int]) -> list[str]:
-        """Return the stored images of a part, as paths relative to the run
-        directory.
-        """
+        """Return the stored images of a part, as paths inside the run directory."""
         sweep = self._rendered.get(name)
         if sweep is None:
             return []
@@ -418,9 +416,7 @@ class Renders:
     def _describe_cluster(
         self, number: int, rows: pd.DataFrame, image: torch.Tensor
     ) -> FailureCluster:
-        """Describe a cluster by its rows, and store its most typical image (H, W,
-        3).
-        """
+        """Describe a cluster by its rows, and store its typical image (H, W, 3)."""
         path = self.context.run.save_image(f"cluster-{number}", image)
         return FailureCluster(
             failures=len(rows),
@@ -430,8 +426,9 @@ class Renders:
         )
 
     def _select_sweeps(self) -> list[int]:
-        """Return the indices of the sweeps of the first model that was swept by
-        itself.
+        """Return the indices of the sweeps whose failures are clustered.
+
+        Features are those of one model: the first one that was swept by itself.
         """
         models = next(
             (

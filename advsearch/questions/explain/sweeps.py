@@ -218,8 +218,9 @@ def make_sweep_along(
 def select_choices(
     config: SweepConfig, grid: Mapping[str, object]
 ) -> dict[str, dict[str, Any]]:
-    """Return the controls whose choices matter though a grid sets all of their
-    parameters.
+    """Return the choices of controls all of whose parameters are in a grid.
+
+    Such a control samples nothing, but its choices still matter.
     """
     controls = {}
     for instance, options in config.controls.items():
@@ -250,8 +251,9 @@ def is_sampled(config: SweepConfig, factor: str) -> bool:
 
 
 def is_settable(config: SweepConfig, name: str) -> bool:
-    """Return whether a value of a row can be set; others follow, as `path.distance`
-    does.
+    """Return whether a value of a row can be set.
+
+    Others follow from what is set, as `path.distance` does.
     """
     instance, dot, parameter = name.partition(".")
     declared = config.declared_parameters(instance)
@@ -277,5 +279,6 @@ def make_minimal_config(config: SweepConfig, **changes: object) -> SweepConfig:
         "aov": None,
         "surface": False,
     }
+    # where nothing is sampled, that is the default
     sampler = {} if changes.get("controls") else {"sampler": "sobol"}
     return SweepConfig(**{**config.to_json(), **quiet, **changes, **sampler})

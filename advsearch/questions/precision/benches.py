@@ -439,9 +439,7 @@ class GradientPart:
         )
 
     def count_renders(self, estimator: str) -> int:
-        """Return the primal renders of a gradient by an estimator, without the image
-        itself.
-        """
+        """Return the renders of a gradient by an estimator, besides the image."""
         return sum(replace(group, estimator=estimator).renders for group in self.groups)
 
 

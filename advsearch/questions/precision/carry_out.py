@@ -219,9 +219,9 @@ class QuantityMeasurer:
     def may_be_steeper(self, point: PrecisionPoint) -> bool | None:
         """Return whether the error may fall faster than that of independent samples.
 
-        None if theory says nothing: differences have the bias of their step, the
-        material form its limits, and the denoiser its own. Stratification never makes
-        the slope shallower, and often steeper (Owen 1997).
+        It may with a stratified sampler (Owen 1997). None if theory says nothing, as
+        where the estimator has a bias: of a step (differences), of an approximation
+        (`material`), or of the denoiser.
         """
         sampler: str = self._config.pixel_sampler
         if point.quantity == "gradient":
@@ -419,10 +419,10 @@ def recommend_settings(
     round_up: RoundUp,
     or_steeper: Callable[[PrecisionPoint], bool | None] = lambda point: None,
 ) -> list[Recommended]:
-    """Return the fastest setting that reaches a goal for each quantity, if any does.
+    """Return the fastest setting for a goal, of each quantity, control and family.
 
-    A recommendation without an estimator says that none does. A setting that was
-    measured again is recommended by these measurements.
+    A recommendation without an estimator says that none does. One of a gradient that
+    was measured again rests on the new measurements.
 
     Args:
         points: measured settings.

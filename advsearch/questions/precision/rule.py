@@ -322,8 +322,9 @@ def fit_line(
 def describe_disagreement(
     slope: PrecisionSlope, points: Sequence[PrecisionPoint]
 ) -> str | None:
-    """Describe how a slope disagrees with theory and the likeliest reason; None if it
-    agrees.
+    """Describe how a slope disagrees with theory, and the likeliest reason.
+
+    None if it agrees.
     """
     if slope.agrees is not False or slope.theory is None:
         return None

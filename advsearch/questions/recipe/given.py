@@ -468,9 +468,7 @@ def _split_by_triangle(
     mixtures: npt.NDArray[np.float64],
     corners: Mapping[Any, Any],
 ) -> list[npt.NDArray[np.bool_]]:
-    """Return which mixtures lie in each triangle of the diagram: a mask (n,) for
-    each.
-    """
+    """Return for each triangle of the diagram which mixtures (n,) lie in it."""
     triangles = pd.Series(
         [find_triangle(mixture, options.side) for mixture in mixtures]
     )

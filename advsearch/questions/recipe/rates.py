@@ -1171,9 +1171,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
 def _draw_scaling(
     figure: Any, rates_by_count: Mapping[int, Any], max_rate: float
 ) -> None:
-    """Draw median and range of the throughput over worker counts, and linear
-    scaling.
-    """
+    """Draw median and range of the throughput by worker count, and linear scaling."""
     axes = figure.subplots()
     counts = list(rates_by_count)
     fewest, slowest = next(iter(rates_by_count.items()))

@@ -367,8 +367,9 @@ def _describe_lamps(
 
 
 def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
-    """Rotate a mesh so that Blender, which imports glTF with -y in front, has our
-    axes.
+    """Rotate a mesh so that it has our axes in Blender.
+
+    Blender imports glTF with -y in front.
     """
     rotation = np.array(
         [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32

@@ -164,8 +164,9 @@ def list_triggering_conditions(result: results.Result) -> list[str]:
 
 
 def evaluate_criterion(criterion: float, interval: results.Interval) -> str:
-    """Return whether an interval is above a criterion (met), below (not met) or
-    open.
+    """Return whether an interval is above a criterion, below it, or neither.
+
+    The words are "met", "not met" and "open".
     """
     lower, upper = interval
     if lower >= criterion:
@@ -518,8 +519,9 @@ def collect_claims(result: results.Result) -> list[views.Claim]:
 
 
 def list_photograph_claims(photos: Any) -> list[views.Claim]:
-    """Return the claim of a table of agreement (`advsearch.photo_agreement`), if not
-    empty.
+    """Return the claim of a table of agreement; none if the table is empty.
+
+    The table is from `advsearch.photo_agreement`.
     """
     if not photos.photos or photos.interval is None:
         return []
@@ -1095,9 +1097,7 @@ def _list_searched(
     result: results.Result,
     sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
 ) -> list[str]:
-    """Describe what varied in the claims of a suite, or in the sweeps that were
-    read.
-    """
+    """Describe what varied in the claims of a suite, or in the sweeps that it read."""
     noted = read_noted_settings(folder, result)
     if noted is not None:
         return _searched_by_claims(noted.get(CLAIM_KIND))

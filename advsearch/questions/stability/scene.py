@@ -150,8 +150,9 @@ def make_checkered_mug() -> assets.ObjectAsset:
 
 
 def make_dark_mug() -> assets.ObjectAsset:
-    """Return the mug in black: only its outline changes in the picture, with little
-    noise.
+    """Return the mug in black.
+
+    Only its outline changes in the picture, with little noise.
     """
     return paint_mug(np.full((4, 4), 0.02))
 
@@ -503,8 +504,9 @@ def run_search(
 def make_domain(
     renderer: gradients.Renderer, start: Tensor | None = None
 ) -> policies.Domain:
-    """Return the domain of a search from a configuration, by default the renderer's
-    start.
+    """Return the domain of a search.
+
+    It starts from a configuration, by default that of the renderer.
     """
     space: Any = renderer.space  # of controls, since `make_renderer` made it
     start = renderer.start if start is None else start

@@ -770,8 +770,7 @@ for control, name in (
 
 
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Run cases of the suite in order, until all are done, the time is over, or an
-    interrupt.
+    """Run cases of the suite in order, until the end, the time is over, or Ctrl-C.
 
     The result of a case is stored at once: a resumed run continues with the next.
     """

@@ -479,8 +479,9 @@ class SampledNumber:
 def choose_n_parts(n_images: int) -> int:
     """Return into how many parts tables and figures cut the range of a parameter.
 
-    As many as leave the map over two parameters `MIN_CELL_DRAWS` draws a cell, but
-    between `MIN_RANGE_PARTS` and `MAX_RANGE_PARTS`.
+    It is the largest number for which a map over two parameters, with that many parts
+    each, has `MIN_CELL_DRAWS` draws in a cell on average; but between `MIN_RANGE_PARTS`
+    and `MAX_RANGE_PARTS`.
 
     Args:
         n_images: images of the full sweep.

@@ -390,7 +390,7 @@ def _run_config(
     if config.run is not None and resumed is None:
         context = create_before_work(config)
     if config.twins is not None:
-        # a check: raises an error before the work if it cannot be read
+        # a check before the work: raises an error if it cannot be read
         read_twins(config.twins)
     with context as directory:
         named_scenes = scenes or load_scenes(config)
@@ -440,6 +440,7 @@ def sweep_from_config(
     """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
+    # a check before the work: raises an error if the run of twins cannot be read
     if config.twins is not None:
         read_twins(config.twins)
     progress = progress or NullProgress()

@@ -164,9 +164,7 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
 
 
 def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
-    """Draw the accuracy at each value of an axis, with intervals, on matplotlib
-    axes.
-    """
+    """Draw the accuracy at each value of an axis, with intervals."""
     values = [row.value for row in rows]
     # A single draw has no interval.
     intervals = [

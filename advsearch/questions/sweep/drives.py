@@ -57,10 +57,10 @@ def add_frames(
 ) -> tuple[tuple[Control, ...], dict[str, object]]:
     """Return the controls and the grid of a sweep over the frames of a path.
 
-    A control that travels along the path is added if there is none, and the times of
-    the frames become the last axis of the grid, unless it has them already: from 0 to
-    the end of the path, `fps` a second, at least two. Of several paths that nothing
-    chooses among, all are swept if nothing is sampled.
+    A control that travels along the path is added if there is none. The times of the
+    frames become the last axis of the grid, unless it has them already: from 0 to the
+    end of the path, `fps` a second, at least two. If there are several paths, nothing
+    chooses among them and nothing is sampled, then all are swept.
 
     Args:
         config: with a `path`.
@@ -182,7 +182,7 @@ class Drives:
         axis = job.axes[axis_index]
         self._units = next(iter(job.load_points(0).values())).units
         self._distance_bounds = compute_distance_bounds(job, axis)
-        # A row has its place in the flat array of this shape by its number.
+        # The number of a row is its index in the flat array of this shape.
         shape = (
             len(job.scenes),
             *(len(axis.values) for axis in job.axes),

@@ -701,8 +701,8 @@ class SweptScene:
     def _render_empty(self, size: ImageSize, queries: Sequence[Query]) -> Tensor:
         """Render the scene without its object, with the noise of each query.
 
-        A renderer of its own does it: a scene in which something was far away has other
-        last bits.
+        It has a renderer of its own: after an object was hidden, a renderer gives
+        images that differ in their last bits from those before.
         """
         if size not in self._empty_renderers:
             self._empty_renderers[size] = self._make_renderer(size)

@@ -219,8 +219,8 @@ def _likelihood_ratio(
     failures in the other images, are with a rate each than with a common rate; at
     least 0. The shapes of `k` and `n` are broadcast.
     """
-    # The table of two by two counts, wrong or not in images with and without the part;
-    # and its sums.
+    # Images by whether they show the part and whether they are failures, and the sums
+    # of this table by row and by column.
     cells = (k, n - k, n_failures - k, n_images - n - n_failures + k)
     margins = (n, n_images - n, np.array(n_failures), np.array(n_images - n_failures))
     log_ratio = (
@@ -292,11 +292,14 @@ class SurfaceCounts:
         self.part_counts = tuple(part_counts)
 
     def add(self, surfaces: Surfaces, wrong_by_model: Mapping[int, bool]) -> None:
-        """Count an image, by its surfaces and whether each model's prediction is wrong.
+        """Count an image for each model.
+
+        Parts are the cells of the map; on a mesh of few faces also the faces, whose
+        indices follow those of the cells.
 
         Args:
             surfaces: what the image shows.
-            wrong_by_model: by the index of the model.
+            wrong_by_model: whether the prediction is wrong, by the index of the model.
         """
         is_object = surfaces.visible_mask(OBJECT)
         face = surfaces.face[is_object].numpy()

@@ -161,6 +161,7 @@ class ClaimTester:
         summary = self.context.run_part(pending.name, search)
         assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
+        # with the number of steps that was chosen, if none was set
         planned = search.model_copy(update={"steps": search.steps or summary.steps})
         verdict, reason, cause = words.evaluate_search(summary, planned)
         image_name = "clean" if summary.ending == "already wrong" else "adversarial"
@@ -656,6 +657,10 @@ def threshold_mean(claim: ShareClaim | NoWorseClaim) -> float:
 def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     """Check a claim's number of pictures; return a remark, or "" if it is enough.
 
+    A model that is always right has to be able to hold the claim with so many pictures,
+    and one that is always wrong to fail it. The remark is about a claim that compares
+    two models, if these are not enough for two that predict alike.
+
     Raises:
         InputError: if no predictions of so many pictures could decide it both ways.
     """
@@ -664,6 +669,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     threshold = threshold_mean(claim)
     needed = max(
         statistics.sequential.count_needed_samples(mean, confidence=confidence)
+        # what it takes to exceed the threshold, and to fall below it
         for mean in (threshold, 1.0 - threshold)
     )
     if claim.pictures < needed:
