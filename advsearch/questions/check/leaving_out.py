@@ -210,6 +210,7 @@ def measure_texels(
             # Halved as long as enough texels per pixel would still be visible.
             enough = size
             while enough > 2:
+                # The number of texels falls with the square of the side.
                 n_visible_of_half = n_visible * (enough / 2 / size) ** 2
                 if n_visible_of_half < TEXELS_PER_PIXEL * n_pixels:
                     break

@@ -55,6 +55,7 @@ def compare_sides(
     better = None
     if with_rules:
         table = rules.make_table(first.rows, shared)
+        # Rules say where `correct` is rare: here where one side alone is right.
         worse = find_pair_rules(table.assign(correct=~only_first), seed)
         better = find_pair_rules(table.assign(correct=~only_second), seed)
     return ComparedPair(

@@ -59,10 +59,10 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
 def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of the draw of each row (n,), equal in all sweeps of the same draw.
 
-    What is drawn follows from the seed and the number of the draw, however many there
-    are and whatever they are placed in: sweeps of one seed share their draws. Where
-    nothing is drawn, images of the same values, or drives that begin with the same,
-    differ in noise alone.
+    Draw k of a seed is the same in all sweeps, however many draws they have, and
+    whatever scenes these are placed in. Where nothing is drawn, images with the same
+    values differ in noise alone, and so do drives whose first frames have the same:
+    these share a name.
     """
     if sweep.summary.sampler is not None:
         return [f"draw {sweep.config.seed} {unit}" for unit in rows["unit"]]
@@ -71,6 +71,7 @@ def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
         for name in ("object", "environment", *rows.attrs["units"])
         if name not in ("model", "answer")
     ]
+    # a drive is named by the values of its first frame
     first_rows = (
         rows.drop_duplicates("unit")
         .set_index("unit")[list(dict.fromkeys(columns))]

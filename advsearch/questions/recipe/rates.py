@@ -533,10 +533,10 @@ def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
 def _describe_cells(
     cells: Cells, series: Sequence[str], is_binned: bool, options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell: over a map, or of each series.
+    """Describe the lowest and the highest cell: over a map, or else of each series.
 
     Args:
-        cells: the counts of each series, by row.
+        cells: for each row by its name, a tally for each series.
         series: names of the series.
         is_binned: whether the rows are bins of a number.
         options: of the figure.

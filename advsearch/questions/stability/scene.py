@@ -404,9 +404,8 @@ def measure_inward_slope(
 ) -> tuple[float, float]:
     """Return the derivative of the smooth linear loss along a direction inwards.
 
-    Values at the ends of the range can only move inwards. The direction is 1 into the
-    range for those that increase the loss this way, and 0 for all others; times
-    `factor`.
+    Values at the ends of their range can only move inwards. The direction moves those
+    that increase the loss this way by `factor` into the range, and leaves all others.
 
     Args:
         renderer: of the scene.

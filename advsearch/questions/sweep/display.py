@@ -857,6 +857,9 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
 def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     """Compute the distance at which an object is first detected.
 
+    A line that falls with the distance is fitted to the fraction of right images; the
+    estimate is where it crosses one half. Binomial tests give its bounds.
+
     Args:
         rows: counts by a distance, or by the bounds of a range of it.
 
@@ -876,8 +879,8 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     significance = 0.025 / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
-    # The line is fitted beyond the last dip that is not chance.
-    # That is the index of the nearest distance that is left.
+    # The index of the nearest distance beyond the last dip that is not chance: nearer
+    # ones contradict a falling line.
     first = max(
         (distances.index(dip.distance) + 1 for dip in dips if dip.is_significant),
         default=0,

@@ -292,7 +292,14 @@ class Drives:
     def _compute_rates(
         self, drives: _CompleteDrives, model: int, answer: str
     ) -> DriveRates:
-        """Compute the rates of one model over drives; `answer` may be empty."""
+        """Compute the rates of one model over drives.
+
+        Args:
+            drives: those with all their frames.
+            model: its index.
+            answer: which scene they have, clean or adversarial, by its name; empty if
+                the sweep has no adversarial one.
+        """
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
         drive_records = self._describe_drives(drives, first_distance)
@@ -520,11 +527,11 @@ def summarize_drives(
     There is no interval if the bounds are not known, or for a single drive.
 
     Args:
-        values: (n,).
+        values: (n,) one for each time that a drive was evaluated.
         worst: selects the worst of them: `min` or `max`.
         bounds: bounds of the values whatever a model predicts, from the plan.
-        drive_of_value: (n,) the drive of each value; values of one differ in noise
-            alone, so that their mean is the drive's. None: each has a drive of its own.
+        drive_of_value: (n,) the drive of each value. Values of one drive differ in
+            noise alone, and are averaged first. None: each has a drive of its own.
     """
     means = values
     if drive_of_value is not None:
