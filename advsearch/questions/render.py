@@ -15,9 +15,7 @@ from advsearch.runs.results import RenderResult
 
 
 def make_view(result: RenderResult) -> ShownResult:
-    """Return the file that was written, and a table of what the model predicts for each
-    view.
-    """
+    """Return the file that was written, and what the model predicts in each view."""
     height, width = result.size
     headline = f"{result.out}: {width} x {height} pixels"
     if result.answered:

@@ -72,9 +72,11 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     while failing_lux <= MAX_LUX and holds(failing_lux):
         holding_lux = failing_lux
         failing_lux = 2.0 * failing_lux
+    # the last one was beyond `MAX_LUX` and not tried
     if failing_lux not in findings.ambient_verifications:
         return  # it holds in direct sun
     for _ in range(N_BISECTIONS):
+        # halfway on a logarithmic scale
         middle_lux = (holding_lux * failing_lux) ** 0.5
         if holds(middle_lux):
             holding_lux = middle_lux

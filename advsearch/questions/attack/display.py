@@ -468,6 +468,7 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
     for row in result.table:
         cells = [words.shorten_name(row.attacked), row.ending]
         for cell in row.tested:
+            # row and column that this cell is about to get
             rate_of_cell[len(rows), len(cells)] = cell.verified.rate
             rate = ", ".join(words.format_rate_cells(cell.verified))
             cells.append(rate + ENDING_MARKS.get(cell.ending, ""))
@@ -493,7 +494,10 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
 
 
 def _matrix_text(result: MatrixResult) -> str:
-    """Return the result of a matrix in a sentence."""
+    """Return the result of a matrix in a sentence.
+
+    An adversarial scene counts on a model if its trials there end as "found".
+    """
     same_model = list[str]()
     other_model = list[str]()
     for row in result.table:

@@ -222,17 +222,18 @@ def _summarize(
     """Return what `summary.json` holds.
 
     Args:
-        findings: of the attack.
+        findings: what the attack found.
         journal: of the run.
         clean: image of the clean scene.
         adversarial: image of the adversarial scene.
-        **fields: those that follow from neither.
+        **fields: of the summary that follow from none of these.
     """
     problem = journal.problem
     task = problem.task
     search = findings.search
     verification = findings.verification
     controls = problem.searched_space.controls
+    # The space has the searched controls first, then those that conditions vary.
     random_controls = problem.space.controls[len(controls) :]
     max_depth = problem.renderer.scene.max_depth
     return AttackSummary(
@@ -366,6 +367,7 @@ def _ambient_light(findings: RunState) -> AmbientLight | None:
     ]
     # The first point is the scene's own light, in which the scene was verified.
     n_holding = 0
+    # What holds beyond the first light in which it does not is not counted.
     while n_holding < len(points) and points[n_holding].holds:
         n_holding += 1
     return AmbientLight(
@@ -392,7 +394,7 @@ def _average_case(findings: RunState) -> AverageCase | None:
     right = count_right(trials, findings.spp)
     scores = [trial.score for trial in trials]
     known_scores = [score for score in scores if not math.isnan(score)]
-    # 0.0 - x and not -x: a margin of 0 has no sign
+    # A score is the negative of a margin. 0.0 - x and not -x, so that 0 has no sign.
     return AverageCase(
         configurations=right.trials,
         correct=right.successes,
@@ -527,7 +529,8 @@ def _printability(problem: Problem, findings: RunState) -> Printability:
 def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
     """Return the adversarial configuration, with clean values and ranges.
 
-    A range has what is a single number: its values where its coordinate is 0 and 1.
+    Only a parameter that is a single number has a range: from its value where its
+    coordinate in u is 0 to that where it is 1.
 
     Args:
         problem: of the attack.
@@ -624,10 +627,19 @@ def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
 
 
 def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
-    """Count the images that were rendered, by what for, and those predicted instead.
+    """Count the images of an attack by what they were rendered for.
 
-    "products" are those that were predicted; what was rendered for the predictor counts
-    for the search.
+    An evaluation of a search takes an image for each of the `n_draws` conditions.
+    Images that were predicted instead of rendered are "products"; what was rendered for
+    the predictor counts for the search.
+
+    Args:
+        findings: of the attack.
+        problem: of the attack.
+
+    Returns:
+        Numbers of images by "search", "gradient", "baseline", "verification",
+        "products" and, if there was such a search, "unprinted".
     """
     predictor = findings.predictor
     counts = dict.fromkeys(
@@ -647,6 +659,7 @@ def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
             n_steps = predictor.count_predicted(kind, len(search.history))
             n_predicted = n_steps * problem.n_draws
         n_rendered = search.renders * problem.n_draws - n_predicted
+        # A predicted image has its gradient without further renders.
         n_gradients = max(0, search.gradients - n_predicted)
         counts["products"] += n_predicted
         if kind == UNPRINTED:
@@ -770,10 +783,14 @@ def _describe_failure(
 def _ranges_of(
     problem: Problem, failure: FoundFailure
 ) -> dict[str, tuple[float, float] | str]:
-    """Return the ranges of a failure by the name of the coordinate.
+    """Return the ranges of a failure and of those that it stands for, by coordinate.
 
-    They are in the parameter's unit, or in u where the parameter is described by other
-    numbers than its coordinates; of a discrete choice its option.
+    A range is in the parameter's unit if the problem describes the coordinate by one
+    number, else in u. A discrete choice has the name of its option instead.
+
+    Args:
+        problem: of the attack.
+        failure: with the bounds of its ranges by column of u.
     """
     ranges: dict[str, tuple[float, float] | str] = {}
     for column, bounds in failure.ranges.items():
@@ -781,6 +798,7 @@ def _ranges_of(
         values = list[Any]()
         for bound in bounds:
             u = failure.u.clone()
+            # A choice stays as the failure has it.
             if not block.options:
                 u[column] = bound
             described = problem.describe(u).get(block.name)
@@ -790,6 +808,7 @@ def _ranges_of(
         if options:
             ranges[name] = options[0]
         else:
+            # A vector is described as a whole, so that its components stay in u.
             numbers = values if block.size == 1 else bounds
             ranges[name] = (min(numbers), max(numbers))
     return ranges

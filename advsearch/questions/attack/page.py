@@ -122,7 +122,8 @@ def _time_text(seconds: Mapping[str, float]) -> str:
 def _frames_data(frames: list[str], objectives: Sequence[float | None]) -> Html:
     """Return the frames of the search for the page's script.
 
-    Each has its step and the objective there; the last frame is the adversarial scene.
+    The frames are evenly spaced over the evaluations, except for the last, which is the
+    adversarial scene. Each of the others has its step and the objective there.
 
     Args:
         frames: data addresses.
@@ -250,9 +251,7 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
 
 
 def _range_text(changed: FoundValue) -> str:
-    """Return the range of a number, and whether it lies at an end; empty without
-    one.
-    """
+    """Return the range of a number, and whether it is at an end; empty without one."""
     low = changed.low
     high = changed.high
     if low is None or high is None or not isinstance(changed.value, (int, float)):
@@ -264,9 +263,10 @@ def _range_text(changed: FoundValue) -> str:
 
 
 def _range_bar(changed: FoundValue) -> tuple[float, ...] | None:
-    """Return the bar from the clean value to the adversarial one, and its mark.
+    """Return the bar from the clean value to the adversarial one: begin, end and mark.
 
-    In [0, 1] of the range; None of what has none.
+    All are in [0, 1] of the range, and the mark is the adversarial value. Without a
+    clean value, the bar has no length. None of what has no range, or several values.
     """
     low = changed.low
     high = changed.high
@@ -320,7 +320,8 @@ def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
 def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
     """Return the table of rates with bars; empty if there are no rates.
 
-    The rates come first, because a phone cuts what is on the right.
+    The rates and all that follows come before the two columns after the name, because a
+    phone cuts what is on the right.
 
     Args:
         summary: of the attack.
@@ -339,6 +340,7 @@ def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
         return ResultPart()
     spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
     note = f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
+    # the name first, then the columns from the fourth on, then the second and third
     heads, *rows = ([row[0], *row[3:], *row[1:3]] for row in (table.heads, *table.rows))
     return replace(
         table, title="Verified rates", heads=heads, rows=rows, bars=bars, note=note

@@ -173,7 +173,11 @@ def _check_can_use_workers(
     session_controls: Sequence[Any],
     options: Mapping[str, Any],
 ) -> None:
-    """Raise an error if workers are requested for objects that they cannot load."""
+    """Raise an error if workers are requested for objects that they cannot load.
+
+    Workers are other processes. They load everything by its name, and do not have the
+    objects of this session.
+    """
     are_named = all(
         isinstance(value, (str, Path)) for value in (scene, *list_models(model))
     )
@@ -212,7 +216,7 @@ def _make_config(
         "policy": to_setting(policy) if isinstance(policy, Policy) else policy,
         "metrics": judging.metrics_to_settings(metrics or {}),
     }
-    if options.get("exposure"):  # the option says it
+    if options.get("exposure"):  # which replaces the exposure of the scene
         described["set"].pop("camera.exposure", None)
     return AttackConfig(
         **{**described, **options, "run": None if run is None else str(run)}
@@ -220,8 +224,9 @@ def _make_config(
 
 
 def _open_run(run: str | Path | None, resume: bool, config: AttackConfig) -> Any:
-    """Return a context with the run directory: a stopped run's, a new one's, or
-    None.
+    """Return a context with the run directory, or None.
+
+    It is that of a stopped run or a new one.
     """
     resumed = None
     if resume and run is not None and is_run(locate_run(run)):

@@ -376,6 +376,7 @@ def choose_stored_trial(findings: RunState) -> int | None:
         # a success, if there are any; else a trial that counts and fails
         is_counted = is_usual and is_success is has_successes
         ranks.append((is_counted, is_usual, clean_label == usual_clean_label))
+    # the first of the trials that rank highest
     return verification.first_index + ranks.index(max(ranks))
 
 
@@ -552,7 +553,11 @@ def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:
 
 
 def _select_near(shapes: Mapping[str, Shape]) -> list[Shape]:
-    """Select the shapes whose center is near that of the object."""
+    """Select the shapes that are near the object.
+
+    Their centers are at most `MAX_NEAR_DISTANCE` times its largest extent from its own
+    center, along every axis.
+    """
     vertices = shapes[OBJECT].mesh.vertices
     center = vertices.mean(axis=0)
     max_distance = MAX_NEAR_DISTANCE * float(np.ptp(vertices, axis=0).max())
@@ -654,7 +659,7 @@ def _make_frames(
     names = list(dict.fromkeys(choices))
     frames = start.repeat(max(1, len(names)), FRAMES, 1)
     frames[..., time_column] = torch.linspace(0.0, 1.0, FRAMES)
-    # The coordinate behind the time selects the path: the center of its part of [0, 1].
+    # The coordinate after the time selects the path: the center of its part of [0, 1].
     for index, name in enumerate(names):
         coordinate = (choices.index(name) + 0.5) / len(choices)
         frames[index, :, time_column + 1] = coordinate

@@ -104,6 +104,7 @@ def run_attack(
         InputError: parts do not fit together, or the run that is continued has others.
     """
     config = parts.config
+    # a check before the work: raises an error if the run of twins cannot be read
     if config.twins is not None:
         read_twins(config.twins)
     model, loading_notes = parts.model_and_warnings
@@ -186,9 +187,7 @@ def _search(
     journal: Journal,
     stages: Stages,
 ) -> Any:
-    """Search for the worst configuration with the settings of the attack, and verify
-    it.
-    """
+    """Search and verify the worst configuration, with the settings of the attack."""
     has_trial_count = config.trials is not None or config.smallest
     return search_and_verify(
         policy,

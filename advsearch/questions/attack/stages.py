@@ -154,10 +154,19 @@ def _measure_gradients(
     deterministic: bool,
     chooses_spp: bool,
 ) -> None:
-    """Choose gradient estimators by measurement, and with `full` step and samples."""
+    """Choose the gradient estimators of a search by measurement, for its plan.
+
+    Args:
+        problem: gets the plan, and perhaps another number of samples.
+        stages: reports what is measured.
+        full: whether all estimators are measured, then steps and samples; else only
+            those that could both be the best.
+        deterministic: whether counted renders decide in place of times.
+        chooses_spp: whether a full measurement may choose the samples per pixel.
+    """
     renderer = problem.renderer
     progress = stages.progress
-    counted = not full or deterministic
+    counts_renders = not full or deterministic
     seed = seeds.stream(problem.seed, "measure")
     bench = Bench(
         renderer,
@@ -177,7 +186,7 @@ def _measure_gradients(
             "setup", "measuring which gradients are best here", gradients, hint=hint
         )
     problem.plan = planning.choose_estimators(
-        bench, with_all=full, count_renders=counted
+        bench, with_all=full, count_renders=counts_renders
     )
     if full:
         samples = planning.count_cosine_samples(problem.plan)
@@ -218,9 +227,8 @@ def evaluate_clean_scene(
 def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     """Return whether the clean scene is wrong, so that there is nothing to search for.
 
-    The full trials decide. They are made if it was wrong in every first look, or
-    `in_any_case`. It never is wrong for a rule that does not compare with the clean
-    scene.
+    The full trials decide. They are made only if every first look was wrong, or with
+    `in_any_case`. A rule that does not compare with the clean scene never has it wrong.
     """
     problem = verifier.problem
     findings = verifier.state
@@ -250,9 +258,10 @@ def choose_predictor(
 ) -> PredictedSearch | None:
     """Prepare and return the cheapest predictor that is accurate here.
 
-    None if there is none: then every step is rendered. Light on surfaces is compared
-    with traced images first. One that takes too much memory ends the choice. Why it is
-    another predictor, or none, is in `findings`, and reported.
+    None if there is none: then every step is rendered. Predictors are tried in turn:
+    one that turns out to be too inaccurate is followed by the next, one that takes too
+    much memory by none. Why images are rendered, or predicted by another predictor, is
+    stored in `findings` and reported.
 
     Args:
         policy: what searches.
@@ -415,6 +424,7 @@ class Searches:
                 search is in `findings` before.
         """
         renders_before = 0
+        # every so many steps an image is kept
         frame_interval = max(1, math.ceil(steps / MAX_FRAMES))
         predictor = self.findings.predictor
 
@@ -497,10 +507,15 @@ class Searches:
 def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     """Verify with fresh seeds what the searches claim, paired with the clean scene.
 
-    The sample count is chosen first. Then the clean configuration, the adversarial one,
-    that without print terms and the random search's are tried with equal seeds. The
-    smallest change lies at the decision, where no sample count settles the margin: it
-    is tried with that of the clean configuration, as on the way to it.
+    First the sample count is chosen, except for a search of the smallest change: that
+    lies where the prediction flips, so that no sample count settles the margin, and it
+    keeps the count that was chosen for the clean scene. Then the clean configuration,
+    the adversarial one, that without print terms and the random search's are tried with
+    equal seeds.
+
+    Args:
+        verifier: of the attack, whose state gets the results.
+        is_smallest: whether the smallest change was searched.
     """
     findings = verifier.state
     problem = verifier.problem
@@ -553,8 +568,13 @@ def _replace_if_random_is_worse(
 ) -> None:
     """Use what the random search found if that is worse for the model.
 
-    It is chosen by its trials, so these are no evidence: it has to be worse in fresh
-    ones, too.
+    Having been chosen for its trials, it may just be lucky in them. So it is tried
+    again, and has to be worse in the fresh trials, too.
+
+    Args:
+        verifier: of the attack, whose state is changed.
+        result: of the policy's search.
+        baseline: result of the random search.
     """
     findings = verifier.state
     policy_verification = findings.verification
@@ -592,9 +612,10 @@ MIN_CONFIRMING_TRIALS = 40
 def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -> None:
     """Bracket the smallest epsilon at which the model is wrong.
 
-    Every claim on the way goes through trials with seeds of its own. There, the fewest
-    trials that can verify anything are enough if none fails. The upper end is tried
-    again in full, and what is verified at the end is the configuration there.
+    Smaller and smaller budgets are searched. What a search claims is tried in trials
+    with seeds of their own. On the way, the fewest trials that can verify anything are
+    enough if none fails; the upper end of the bracket is tried again in full. The
+    result of the search becomes the configuration there.
 
     Args:
         searches: of the attack.

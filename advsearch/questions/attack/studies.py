@@ -402,9 +402,13 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
 def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
     """Return whether a row says anything about an epsilon.
 
-    It does if the object was attacked there, or had flipped before. An attack that
-    ended without a number does not, nor does an object whose own noise makes it wrong
-    too often for any scene to be verified.
+    It does if the object was attacked there, and at every epsilon once it has flipped
+    or is wrong as it is. It does not if the attack ended without a number, or if the
+    noise alone makes the clean scene wrong so often that no scene can be verified.
+
+    Args:
+        row: of the last attack on the object.
+        epsilon: None for the controls' own ones.
     """
     if row.ending in (None, "non-finite objective"):
         return False

@@ -303,12 +303,13 @@ def print_cost_text(summary: AttackSummary) -> str:
 def _error_clause(
     summary: AttackSummary, verified: VerifiedRate, thing: str, claim: str
 ) -> str:
-    """Return "The model calls this mug a vase" if that is known of every trial.
+    """Return what the model gets wrong, as in "The model calls this mug a vase".
 
-    Else it names the most frequent prediction; of detectors with different outcomes,
-    these. Without labels of the trials, it is the prediction in the stored image, and
-    of other tasks than classification no prediction at all. Of a commanded action, or
-    an easier scene, it is the claim, with the direction of the action.
+    If trials have several predictions, it says "most often" and the most frequent one,
+    or the outcomes of a detector. If their labels are not known, it is the prediction
+    in the stored image, and of other tasks than classification none at all. Of a
+    commanded action, or an easier scene, it is the claim, with the direction of the
+    action.
 
     Args:
         summary: of the attack.

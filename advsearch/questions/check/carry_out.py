@@ -92,9 +92,9 @@ def list_parts(config: CheckConfig) -> list[CheckedPart]:
 
 def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
     """Yield the settings of a check of each control, on each bundled scene."""
-    for object, environment in SCENES:
+    for object_name, environment in SCENES:
         skipped = set()
-        if object == "bottle":
+        if object_name == "bottle":
             skipped.add("contents")  # it is closed
         if environment is not None:
             skipped.add("sky")  # it would replace the environment
@@ -103,7 +103,7 @@ def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
             if not control_type.parameters or control in skipped:
                 continue
             scene_fields = {
-                "object": object,
+                "object": object_name,
                 "environment": environment,
                 "label": None,
             }

@@ -99,7 +99,10 @@ def measure_gains(
 def _make_variants(
     renderer: gradients.Renderer, depth: int | None
 ) -> dict[str, gradients.Renderer]:
-    """Return the renderer of a search, by "", and others that leave out less, by item.
+    """Return the renderer of a search, by "", and others by the item that they compute.
+
+    The renderer of the search leaves out everything that it can; each of the others
+    computes one item of that, or all (`ALL`).
 
     Args:
         renderer: whose paths have their full length.
@@ -116,6 +119,7 @@ def _make_variants(
         variants[item] = renderer.copy_with(
             scene.copy_with(max_depth=depth, leave_out=leave_out)
         )
+    # It leaves out the same things, but no bounces.
     if depth < scene.max_depth:
         variants[BOUNCES] = renderer
     variants[ALL] = renderer.copy_with(scene.copy_with(leave_out=NOTHING))
@@ -128,10 +132,12 @@ def _compare_item(
     slopes: Mapping[str, list[Tensor]],
     times: Mapping[str, list[float]],
 ) -> GainRow:
-    """Compare the renderer with an item and that without, whose name is "".
+    """Compare the renderer that computes an item with the one that leaves it out.
 
-    The gain in time is for equal noise of the images: the ratio of the seconds times
-    that of the variances.
+    Measurements are by the item that is computed; those under "" are without any.
+
+    `time_gain` is how many times as long the renderer with the item takes to images of
+    the same noise: the ratio of the seconds, times that of the variances.
 
     Args:
         item: its name.
@@ -165,9 +171,14 @@ def _difference(pair: list[Tensor]) -> float:
 
 
 def _relative_difference(without: list[Tensor], with_item: list[Tensor]) -> float:
-    """Return the difference at one seed over the RMS difference that seeds make.
+    """Return how much an item changes an image or gradient, compared with the noise.
 
-    Where seeds make no difference, it is the difference itself.
+    That is the difference at the first seed, divided by the root mean square of the
+    differences between the two seeds; not divided if seeds make no difference.
+
+    Args:
+        without: at two seeds, without the item.
+        with_item: at the same seeds.
     """
     noise = math.sqrt(
         statistics.fmean(_difference(pair) ** 2 for pair in (without, with_item))
@@ -199,6 +210,7 @@ def measure_texels(
             # Halved as long as enough texels per pixel would still be visible.
             enough = size
             while enough > 2:
+                # The number of texels falls with the square of the side.
                 n_visible_of_half = n_visible * (enough / 2 / size) ** 2
                 if n_visible_of_half < TEXELS_PER_PIXEL * n_pixels:
                     break
@@ -240,9 +252,20 @@ def _count_visible_texels(
     seed: int,
     spp: int,
 ) -> int:
-    """Count the texels that reach the camera directly: they have a derivative."""
+    """Count the texels of a texture that reach the camera directly.
+
+    These are the ones by which the sum of all pixels has a derivative, if light paths
+    have just two segments: from the light to the surface, and on to the camera.
+
+    Args:
+        renderer: of the scene.
+        inputs: of the scene.
+        name: of the input that is the texture.
+        seed: of the render.
+        spp: samples per pixel.
+    """
     scene = renderer.scene
-    with scene.limit_depth(2):  # light, surface, camera
+    with scene.limit_depth(2):
         ones = torch.ones(*scene.resolution, 3)
         gradient = scene.render_adjoint(inputs, ones, seed, spp, wrt=[name])[name]
     return int((gradient.abs().amax(dim=-1) > 0.0).sum())

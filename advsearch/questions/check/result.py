@@ -330,9 +330,9 @@ def _left_out_texts(result: CheckResult) -> list[str]:
 def find_inadequate(rows: Sequence[CheckedRow]) -> list[str]:
     """Return the names of what no estimator is good enough for, each once.
 
-    For each parameter and loss the row with the best status counts: an estimator that
-    no plan would take may fall short. Of the model's loss those of full controls count:
-    what matters is where their gradient points.
+    For each parameter and loss the best row decides, since a plan need not use the
+    estimators of the others. Of the model's loss only gradients of whole controls
+    count, not single derivatives: what matters is where a gradient points.
     """
     order = ("ok", "reference unusable", "noisy", "biased")
     best_rows: dict[tuple[str, ...], CheckedRow] = {}

@@ -45,14 +45,15 @@ class PairImages:
     def list_examples(
         self, first: Side, second: Side, pair: int
     ) -> Iterator[PairPicture]:
-        """Yield pairs that only one side gets right, the largest margin gaps first.
+        """Yield pairs of which one prediction is right, the largest margin gaps first.
 
-        There are at most as many of each side as the settings say, with images as far
-        as all of a pair are available. Two models of one sweep have one image.
+        There are at most as many in favor of either side as the setting `pictures`
+        says. Their images are stored in the run; a pair of which one cannot be has
+        none. Two models of one sweep have the same image.
 
         Args:
-            first, second: the sides.
-            pair: the number of the two sides.
+            first, second: the sides, with rows in the same order.
+            pair: number of these two sides, for the names of the files.
         """
         run = self.context.run
         rows = select_examples(first, second, self.context.config.pictures)
@@ -123,8 +124,9 @@ class PairImages:
             self.context.progress.advance(1)
 
     def _render_image(self, image: MissingImage) -> None:
-        """Render an image again; add a warning if its scene or model is not
-        available.
+        """Render an image again, and store it.
+
+        If its scene or model is not available, there is a warning instead.
         """
         sweep = image.side.sweep
         if str(sweep.folder) in self._unavailable:
@@ -143,9 +145,10 @@ class PairImages:
 
 
 def select_examples(first: Side, second: Side, limit: int) -> list[int]:
-    """Return the indices of pairs that only one side gets right, at most `limit` each.
+    """Return the indices of the pairs in which one side alone is right.
 
-    Those with the largest difference of the margins come first.
+    At most `limit` are those of the first side, and as many those of the second. The
+    largest differences of the margins come first; unknown ones count as 0.
     """
     margin_gap = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
     only_first = first.is_right & ~second.is_right

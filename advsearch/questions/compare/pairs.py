@@ -55,6 +55,7 @@ def compare_sides(
     better = None
     if with_rules:
         table = rules.make_table(first.rows, shared)
+        # Rules say where `correct` is rare: here where one side alone is right.
         worse = find_pair_rules(table.assign(correct=~only_first), seed)
         better = find_pair_rules(table.assign(correct=~only_second), seed)
     return ComparedPair(
@@ -74,7 +75,14 @@ def compare_sides(
 
 
 def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPart]:
-    """Yield the counts of pairs for each value of a parameter, or part of its range."""
+    """Yield the counts of pairs for each value of a parameter, or part of its range.
+
+    Values that no pair has are left out.
+
+    Args:
+        first, second: the sides, with rows in the same order.
+        name: of the parameter.
+    """
     column = first.rows[name]
     unit = "" if column.dtype == "category" else first.rows.attrs["units"][name]
     units = first.rows["unit"].to_numpy()
@@ -164,7 +172,10 @@ def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
 
 
 def count_exceptions(pairs: pd.DataFrame) -> CountOf:
-    """Count the pairs that are not `correct`, with the interval of their share."""
+    """Count the pairs that are not `correct`, with their share and its interval.
+
+    Rate and interval of the correct ones are turned around: 1 - rate.
+    """
     lower, upper = rules.estimate_interval(pairs)
     share = None if pairs.empty else 1.0 - rules.estimate_rate(pairs)
     n_exceptions = int((~pairs["correct"]).sum())

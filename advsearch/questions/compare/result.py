@@ -307,7 +307,8 @@ def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPa
 def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
     """Yield a table for each parameter.
 
-    A terminal shows those over which the difference varies most.
+    A terminal shows the `MAX_TABLES` parameters over whose values the difference varies
+    most, and a sentence about the others.
     """
     tables: dict[str, list[PairPart]] = {}
     for part in pair.parts:

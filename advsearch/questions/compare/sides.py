@@ -117,9 +117,10 @@ def read_sides(paths: Sequence[Path]) -> list[Side]:
 
 
 def name_sides(sides: Sequence[Side]) -> list[str]:
-    """Return a different name for each side.
+    """Return a different name for each side: what it is in the columns that differ.
 
-    It says what differs; if that is not enough, also the directory, or a number.
+    If some names are still equal, the directory of the sweep precedes them; if that is
+    not enough, a number.
     """
     columns = [
         column
@@ -145,14 +146,17 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
 
 
 def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
-    """Yield the sides of one sweep, without names.
+    """Yield the sides of one sweep, without names: the rows of one model and one scene.
 
-    There is one for each model, of the clean scene and then of the adversarial one, if
-    there is one; next to another sweep only the adversarial scene counts.
+    If the sweep has an adversarial scene, its clean scene comes first, but only if no
+    other sweep is compared.
 
     Args:
         path: the run directory of the sweep.
         is_only_sweep: whether no other sweep is compared.
+
+    Raises:
+        FileFormatError: the sweep has not ended, or lacks rows.
     """
     sweep = workbench.StoredSweep.read(path)
     summary = sweep.summary
@@ -247,8 +251,10 @@ def has_same_values(first: pd.Series, second: pd.Series) -> bool:
 
 
 def find_different_settings(sides: Sequence[Side]) -> list[str]:
-    """Return the names of the settings that decide predictions and differ between
-    sides.
+    """Return the names of settings that decide predictions and differ between sides.
+
+    These are settings of their sweeps, and what their rows differ in, as two models of
+    one sweep do. `SECONDARY_SETTINGS` are left out.
     """
     first, *others = (side.sweep.config.get_deciding_settings() for side in sides)
     deciding = {

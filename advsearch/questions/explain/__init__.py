@@ -162,8 +162,13 @@ def _read_sweeps(config: ExplainConfig) -> list[workbench.StoredSweep]:
 def _analyze_rows(
     table: Any, config: ExplainConfig, progress: Any
 ) -> tuple[Any, Any, Any]:
-    """Find rules, the importance of parameters, and the envelope of right
-    predictions.
+    """Find rules, the importance of parameters, and where predictions are right.
+
+    One half of the rows chooses rules and the box of right predictions; the other half
+    counts.
+
+    Returns:
+        The rules, the weights of the parameters, and the box (`find_envelope`).
     """
     # heavy, and the help of the command line reads this module
     from advsearch.extend import rules
@@ -225,8 +230,9 @@ def read_table(
 
 
 def find_sweeps(path: Path) -> list[Path]:
-    """Return the directories of the sweeps of a run: its own, or those of a recipe's
-    parts.
+    """Return the directories of the sweeps of a run.
+
+    A recipe has those of its parts; a sweep is its own.
     """
     result = read_result(path)
     if result.command != "recipe":

@@ -70,10 +70,15 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
 
 
 def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> bool:
-    """Return whether points have a higher silhouette than each reference.
+    """Return whether points (n, d) have a higher silhouette than each reference.
 
-    A reference has as many points (n, d), normal with the same deviation in each
+    References have no clusters: as many points, normal with the same deviation in each
     dimension.
+
+    Args:
+        seed: of the references.
+        points: that were clustered.
+        silhouette: of their clusters.
     """
     generator = np.random.default_rng(seed)
     spread = points.std(axis=0)
@@ -90,8 +95,9 @@ def sort_by_distance(points: FloatArray, members: IntArray) -> tuple[int, ...]:
 
 
 def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
-    """Cluster points (n, d) into the number of clusters with the largest mean
-    silhouette.
+    """Cluster points (n, d) by k-means.
+
+    The number of clusters is the one with the largest mean silhouette.
 
     Returns:
         The mean silhouette, -1 if none can be computed; and the cluster of each point

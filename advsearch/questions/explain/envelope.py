@@ -44,6 +44,8 @@ def find_envelope(
     """
     if choosing.empty:
         return None
+    # At a high accuracy the reserve is half of what is left to 1, so that it can be
+    # reached.
     required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
     box: rules.RuleConditions = ()
     inside = choosing
@@ -66,24 +68,32 @@ def find_best_peel(
 ) -> rules.RuleConditions | None:
     """Return the slightly smaller box with the highest accuracy, the first of several.
 
-    None if too few rows, or draws, are left in each.
+    Boxes with fewer than `MIN_BOX_UNITS` rows, or draws if rows share them, are left
+    out; None if none is left.
+
+    Args:
+        box: the conditions of the box.
+        inside: the choosing rows inside it.
+        choosing: all choosing rows.
     """
     is_independent = choosing["unit"].is_unique
     best_box = None
     best_accuracy = -1.0
     for smaller_box in list_peels(box, inside):
-        rest = choosing[rules.find_covered(smaller_box, choosing)]
-        n_draws = len(rest) if is_independent else rest["unit"].nunique()
-        if n_draws >= MIN_BOX_UNITS and rest["correct"].mean() > best_accuracy:
+        remaining = choosing[rules.find_covered(smaller_box, choosing)]
+        n_draws = len(remaining) if is_independent else remaining["unit"].nunique()
+        if n_draws >= MIN_BOX_UNITS and remaining["correct"].mean() > best_accuracy:
             best_box = smaller_box
-            best_accuracy = rest["correct"].mean()
+            best_accuracy = remaining["correct"].mean()
     return best_box
 
 
 def list_peels(
     box: rules.RuleConditions, inside: pd.DataFrame
 ) -> Iterator[rules.RuleConditions]:
-    """Yield boxes that are slightly smaller than `box`, in one factor each.
+    """Yield boxes that are slightly smaller than `box`, by one narrower condition.
+
+    A factor that the box does not restrict yet gets its first condition.
 
     Args:
         box: the conditions of the box.
@@ -95,6 +105,7 @@ def list_peels(
         for smaller in list_factor_peels(condition, inside[factor]):
             if smaller != condition and smaller.low < smaller.high:
                 conditions = {**condition_of_factor, factor: smaller}
+                # conditions in the order of the factors, whichever came first
                 yield tuple(
                     conditions[name]
                     for name in inside.attrs["units"]

@@ -49,8 +49,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
-    """Estimate how much each factor, and each interacting pair, decides the
-    predictions.
+    """Estimate how much each factor, and each interacting pair, decides predictions.
 
     Numbers are cut into about as many groups as the cube root of the clusters; those of
     pairs more coarsely, so that a cell has `MIN_ROWS_PER_CELL` rows on average.
@@ -134,13 +133,19 @@ class ClusteredPredictions:
         clusters, self.cluster = np.unique(table["unit"], return_inverse=True)
         self.n_clusters = len(clusters)
         self.is_independent = table["unit"].is_unique
+        # The weights of every cluster add up to rows / clusters, so that those of all
+        # add up to the rows.
         cluster_size = np.bincount(self.cluster)
         self.weight = len(self.correct) / self.n_clusters / cluster_size[self.cluster]
         self.mean = float(np.average(self.correct, weights=self.weight))
+        # of a number that is 1 or 0
         self.variance = self.mean * (1.0 - self.mean)
 
     def explained_fraction(self, group: IntArray) -> tuple[float, int]:
-        """Return the fraction of the variance between groups, and how many are used.
+        """Return the fraction of the variance between groups, and the number of groups.
+
+        That is the weighted mean of (rate of the group - mean)^2 over the predictions,
+        over their variance.
 
         Args:
             group: (n,) the group of each prediction; an index that no prediction has is
@@ -158,13 +163,18 @@ class ClusteredPredictions:
     def estimate_weight(self, factors: list[str], group: IntArray) -> ParameterWeight:
         """Estimate the fraction of the variance between groups with its 95 % interval.
 
-        What chance adds to the fraction is subtracted: of independent rows as in the
-        adjusted R squared, of clusters as the expected statistic. Where that is not
-        known, or there is one group, nothing is: 0, from 0 to 1.
+        Groups of a factor without effect differ by chance, too. What that adds to the
+        fraction on average is subtracted: of independent rows as in the adjusted R
+        squared, of clusters by `expected_statistic`. If that is not known, or there is
+        one group only, nothing is shown: the fraction is 0, from 0 to 1.
+
+        For the interval, rows times the fraction, divided by the design effect, is a
+        noncentral chi-squared statistic, or with clusters one of F. Its noncentrality
+        divided by the rows, and times the design effect, is the true fraction.
 
         Args:
             factors: their names.
-            group: (n,) the group of each prediction.
+            group: (n,) the group of each prediction, by the values of the factors.
         """
         share, n_groups = self.explained_fraction(group)
         expected_statistic = self.expected_statistic(group)
@@ -181,6 +191,7 @@ class ClusteredPredictions:
             residual_degrees = max(n_rows - n_groups, 1)
             corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / residual_degrees
         else:
+            # how many times as large the statistic is as that of independent rows
             design_effect = expected_statistic / degrees
             error_degrees = float(self.n_clusters - n_groups)
             corrected_share = share - expected_statistic / n_rows
@@ -200,9 +211,15 @@ class ClusteredPredictions:
     def expected_statistic(self, group: IntArray) -> float:
         """Compute the expected chi-squared statistic of a factor without effect.
 
-        With independent rows it is (groups - 1). With clusters it is multiplied by the
-        design effect (Rao and Scott 1981, section 3). NaN if a group has fewer than two
+        The statistic is the rows times `explained_fraction`. With independent rows, its
+        expectation is (groups - 1). With clusters it is that times the design effect
+        (Rao and Scott 1981, section 3): the variance of the rates of the groups, less
+        that of the overall rate, both from how the residuals of clusters scatter. It is
+        at least `MIN_INFLATION` times (groups - 1); NaN if a group has fewer than two
         clusters.
+
+        Args:
+            group: (n,) the group of each prediction.
         """
         group_weight = np.bincount(group, self.weight)
         is_used = group_weight > 0
@@ -246,8 +263,12 @@ class ClusteredPredictions:
         group_weight: npt.NDArray[Any],
         is_used: npt.NDArray[np.bool_],
     ) -> FloatArray:
-        """Return the weighted difference (n,) of each prediction from the rate of its
-        group.
+        """Return each prediction (n,), less the rate of its group, times its weight.
+
+        Args:
+            group: (n,) the group of each prediction.
+            group_weight: (groups,) sum of the weights.
+            is_used: (groups,) whether a group has any prediction; others have no rate.
         """
         n_correct = np.bincount(group, self.weight * self.correct)
         group_rate = np.divide(
@@ -259,10 +280,18 @@ class ClusteredPredictions:
     def _between_cluster_variance(
         self, cell_cluster: IntArray, cell_residual: npt.NDArray[Any]
     ) -> float:
-        """Return the variance between clusters, for each row."""
+        """Return the variance of the overall rate, times the rows.
+
+        It comes from the scatter of the clusters.
+
+        Args:
+            cell_cluster: (cells,) the cluster of each cell.
+            cell_residual: (cells,) sum of the weighted residuals of the cell.
+        """
         cluster_residual = np.bincount(cell_cluster, cell_residual)
         sum_of_squares = float((cluster_residual**2).sum())
         return (
+            # n / (n - 1), as in an unbiased variance
             sum_of_squares * self.n_clusters / (self.n_clusters - 1) / len(self.correct)
         )
 
@@ -271,9 +300,16 @@ class ClusteredPredictions:
     ) -> float:
         """Return the p-value of the interaction of two factors.
 
-        The statistic of both factors is compared with the sum of each factor's: the
-        difference is chi-squared, or with clusters one of F, if they do not interact. 1
-        if the clusters are too few to tell.
+        Without an interaction, the statistic (rows times the explained fraction) of
+        both factors together is the sum of the statistics of each. What it is more than
+        that is chi-squared of (cells - first - second + 1) degrees of freedom, or, with
+        clusters and after division by its expectation, distributed as F. 1 if the
+        clusters are too few to tell.
+
+        Args:
+            joint_group: (n,) the group of each prediction by both factors.
+            first_group: (n,) by the first factor alone.
+            second_group: (n,) by the second factor alone.
         """
         joint_share, n_cells = self.explained_fraction(joint_group)
         first_share, n_first = self.explained_fraction(first_group)
@@ -297,7 +333,9 @@ def within_group_variance(
     clusters_per_group: IntArray,
     group_weight: npt.NDArray[Any],
 ) -> float:
-    """Return the variance of clusters inside their groups, summed over groups.
+    """Return the sum over groups of the variance of the rate, times the weight.
+
+    Each variance comes from the scatter of the clusters inside the group.
 
     Args:
         squared_residual: (k,) sum of the squared residuals of the clusters.
@@ -325,9 +363,10 @@ def noncentrality_interval(
 def find_noncentrality(
     statistic: float, degrees: int, error_degrees: float, probability: float
 ) -> float:
-    """Find the noncentrality at which a statistic is exceeded with a given probability.
+    """Find the noncentrality that gives values up to a statistic some probability.
 
-    0 if even the central distribution exceeds it more often.
+    The larger the noncentrality, the smaller is the probability of values up to the
+    statistic. 0 if it is too small already without any.
 
     Args:
         statistic: of a noncentral chi-squared distribution, or `degrees` times one of
@@ -354,7 +393,7 @@ def find_noncentrality(
 
     if excess_probability(0.0) <= 0.0:
         return 0.0
-    upper_bound = statistic + 20.0  # a first guess, doubled until it is one
+    upper_bound = statistic + 20.0  # a guess, doubled until it is a bound
     while excess_probability(upper_bound) > 0.0:
         upper_bound *= 2.0
     return float(brentq(excess_probability, 0.0, upper_bound, xtol=1e-6))

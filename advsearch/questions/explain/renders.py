@@ -131,6 +131,8 @@ class Renders:
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
         covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
+        # Configurations that earlier rules cover are left out, so that more are
+        # rendered.
         uncovered_fraction = max(
             float(is_outside(earlier_conditions, covered_rows).mean()),
             MIN_UNCOVERED_FRACTION,
@@ -191,6 +193,7 @@ class Renders:
                 if rows is None:
                     continue
                 inside = select_inside(rows, rule.conditions, earlier_conditions)
+                # draws of other sweeps may have the same numbers
                 unit = inside["unit"].astype(str) + f" of {part}"
                 fresh_frames.append(inside.assign(unit=unit))
         return fresh_frames
@@ -201,11 +204,15 @@ class Renders:
     def find_pairs(
         self, counted_rules: Sequence[rules.CountedRule]
     ) -> Iterator[NearestRight]:
-        """Yield the nearest right configurations to typical failures.
+        """Yield for typical failures the nearest configuration that is predicted right.
 
-        They lie along the parameters of the failure's rule, of which the one with the
-        smallest relative change is taken; or else along the first other parameter that
-        has one. A failure that no parameter by itself puts right has none.
+        It differs in one parameter: of those of the failure's rule the one with the
+        smallest relative change; if none of these puts the failure right, the first
+        other parameter that does. A failure that no parameter by itself puts right has
+        no pair.
+
+        Args:
+            counted_rules: all rules, in their order.
         """
         failures = find_typical_failures(self.table, counted_rules, self.config.pairs)
         for number, (index, conditions) in enumerate(failures, start=1):
@@ -226,8 +233,9 @@ class Renders:
                     break
 
     def _relative_change(self, pair: NearestRight) -> float:
-        """Return the difference of a pair as a fraction of the factor's range; 1 for
-        names.
+        """Return the difference of a pair as a fraction of the factor's range.
+
+        Names have no distance: any other name is a difference of 1.
         """
         column = self.table[pair.parameter]
         if column.dtype == "category":
@@ -240,9 +248,10 @@ class Renders:
     ) -> NearestRight | None:
         """Find the nearest value of a factor at which a failure is predicted right.
 
-        Values along the factor are rendered twice with different noise, and predictions
-        have to be right in both. None if the failure itself is right in either, if no
-        value puts it right, or if nothing could be rendered.
+        The failure is rendered at values along the factor, twice, with different noise.
+        It has to be wrong in both at its own value, and right in both at the other one.
+        None if that is not so, if no value puts it right, or if nothing could be
+        rendered.
 
         Args:
             name: of the pair.
@@ -308,7 +317,13 @@ class Renders:
     ) -> int:
         """Return the index of the right value that is nearest to the wrong one.
 
-        Names are all as near; then it is the first.
+        All names are equally near, so of names it is the first that is right.
+
+        Args:
+            factor: that has the values.
+            is_right: whether each value is predicted right.
+            values: numbers or names.
+            wrong_value: one of them.
         """
         right_indices = np.flatnonzero(is_right).tolist()
         if self.table[factor].dtype == "category":
@@ -320,9 +335,7 @@ class Renders:
         return nearest_index
 
     def _list_thumbnails(self, name: str, numbers: Sequence[int]) -> list[str]:
-        """Return the stored images of a part, as paths relative to the run
-        directory.
-        """
+        """Return the stored images of a part, as paths inside the run directory."""
         sweep = self._rendered.get(name)
         if sweep is None:
             return []
@@ -403,9 +416,7 @@ class Renders:
     def _describe_cluster(
         self, number: int, rows: pd.DataFrame, image: torch.Tensor
     ) -> FailureCluster:
-        """Describe a cluster by its rows, and store its most typical image (H, W,
-        3).
-        """
+        """Describe a cluster by its rows, and store its typical image (H, W, 3)."""
         path = self.context.run.save_image(f"cluster-{number}", image)
         return FailureCluster(
             failures=len(rows),
@@ -415,8 +426,9 @@ class Renders:
         )
 
     def _select_sweeps(self) -> list[int]:
-        """Return the indices of the sweeps of the first model that was swept by
-        itself.
+        """Return the indices of the sweeps whose failures are clustered.
+
+        Features are those of one model: the first one that was swept by itself.
         """
         models = next(
             (

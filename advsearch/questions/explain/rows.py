@@ -19,12 +19,12 @@ prediction.
 
 
 def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
-    """Read the rows of several sweeps as one frame, with the index of their `sweep`.
+    """Read the rows of several sweeps as one frame; the column `sweep` has the index.
 
-    The same draw is one unit (`name_draws`), and the same image, come again in a longer
-    sweep of the same seed, is left out (`name_images`). Object, environment and model
-    have the names that figures give them, and the values of parameters that a sweep
-    does not have are missing.
+    A longer sweep of the same seed repeats the images of a shorter one: an image that
+    came before is left out (`name_images`). Rows of the same draw have the same `unit`
+    (`name_draws`). Object, environment and model have the names that figures give them.
+    The values of parameters that a sweep does not have are missing.
     """
     frames = []
     for index, sweep in enumerate(sweeps):
@@ -48,6 +48,7 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     for name in units:
         if not pd.api.types.is_float_dtype(table[name]):
             table[name] = table[name].astype("category")
+    # the names of draws as numbers
     table["unit"] = np.unique(table["draw"], return_inverse=True)[1]
     table = table.drop(columns=["draw", "image"])
     table["correct"] = (table["correct"] == 1) & rules.is_in_view(table)
@@ -58,10 +59,10 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
 def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of the draw of each row (n,), equal in all sweeps of the same draw.
 
-    What is drawn follows from the seed and the number of the draw, however many there
-    are and whatever they are placed in: sweeps of one seed share their draws. Where
-    nothing is drawn, images of the same values, or drives that begin with the same,
-    differ in noise alone.
+    Draw k of a seed is the same in all sweeps, however many draws they have, and
+    whatever scenes these are placed in. Where nothing is drawn, images with the same
+    values differ in noise alone, and so do drives whose first frames have the same:
+    these share a name.
     """
     if sweep.summary.sampler is not None:
         return [f"draw {sweep.config.seed} {unit}" for unit in rows["unit"]]
@@ -70,6 +71,7 @@ def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
         for name in ("object", "environment", *rows.attrs["units"])
         if name not in ("model", "answer")
     ]
+    # a drive is named by the values of its first frame
     first_rows = (
         rows.drop_duplicates("unit")
         .set_index("unit")[list(dict.fromkeys(columns))]

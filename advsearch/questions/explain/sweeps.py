@@ -26,10 +26,12 @@ def make_sweep_inside(
 ) -> SweepConfig:
     """Return the settings of a sweep whose configurations mostly lie under conditions.
 
-    Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of
-    a grid to the values that the rows have there; names to those that are left. If that
-    leaves more than twice as many configurations, every second value of the longest
-    axis is left out, again and again. The caller has to leave out what cannot be cut.
+    Sampled ranges are cut to the conditions (`cut_controls`). Axes of the grid keep the
+    values, and objects, environments and models the names, that rows under the
+    conditions have. While the grid and the scenes make more than twice as many
+    configurations as wanted, every second value of the longest axis is left out. Where
+    this cannot follow a condition, configurations lie outside, which the caller has to
+    leave out.
 
     Args:
         config: settings of the sweep that it is like.
@@ -97,9 +99,17 @@ def cut_controls(
 ) -> dict[str, dict[str, Any]]:
     """Return the controls of a sweep with their sampled ranges cut to conditions.
 
-    See `make_sweep_inside`. A range beyond the parameter's upper limit, as of an angle
-    that passes 360 degrees, is not cut. Where a control had no ranges, its other
-    parameters get those that the rows have, else they would not vary any more.
+    A range is cut to the bounds of its condition, but is not wider than the rows. It
+    stays as it is where it would pass the parameter's upper limit, as of an angle that
+    passes 360 degrees. If a control had no ranges, all of its parameters were sampled,
+    but would not be beside a range: then those without a condition get the ranges that
+    the rows have.
+
+    Args:
+        config: settings of the sweep.
+        table: its rows.
+        conditions: those of names, and of what was not sampled, are skipped.
+        arc: of an angle that may lie on either side, the index of the side.
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
@@ -152,8 +162,8 @@ def make_sweep_along(
 ) -> SweepConfig:
     """Return the settings of a sweep along one factor, everything else as in a row.
 
-    The row's own value comes first. Then come all names, or `N_VALUES_ALONG` evenly
-    spaced numbers.
+    The factor has the row's own value first, then all names, or `N_VALUES_ALONG` evenly
+    spaced numbers. Every other parameter is an axis of one value, that of the row.
 
     Args:
         config: settings of the sweep that it is like.
@@ -175,6 +185,7 @@ def make_sweep_along(
     grid: dict[str, object] = {
         name: [row[name]] for name in row if "." in name and is_settable(config, name)
     }
+    # settings that are no axes: object, environment and model
     outer = {
         name: next(iter(find_names(config, name, str(row[name]))), None)
         for name in SCENE_SETTINGS
@@ -207,8 +218,9 @@ def make_sweep_along(
 def select_choices(
     config: SweepConfig, grid: Mapping[str, object]
 ) -> dict[str, dict[str, Any]]:
-    """Return the controls whose choices matter though a grid sets all of their
-    parameters.
+    """Return the choices of controls all of whose parameters are in a grid.
+
+    Such a control samples nothing, but its choices still matter.
     """
     controls = {}
     for instance, options in config.controls.items():
@@ -239,8 +251,9 @@ def is_sampled(config: SweepConfig, factor: str) -> bool:
 
 
 def is_settable(config: SweepConfig, name: str) -> bool:
-    """Return whether a value of a row can be set; others follow, as `path.distance`
-    does.
+    """Return whether a value of a row can be set.
+
+    Others follow from what is set, as `path.distance` does.
     """
     instance, dot, parameter = name.partition(".")
     declared = config.declared_parameters(instance)
@@ -266,5 +279,6 @@ def make_minimal_config(config: SweepConfig, **changes: object) -> SweepConfig:
         "aov": None,
         "surface": False,
     }
+    # where nothing is sampled, that is the default
     sampler = {} if changes.get("controls") else {"sampler": "sobol"}
     return SweepConfig(**{**config.to_json(), **quiet, **changes, **sampler})

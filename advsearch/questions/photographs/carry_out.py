@@ -150,7 +150,13 @@ def _count_outcomes(table: pd.DataFrame) -> dict[str, int]:
 def _summarize_rendering(
     name: str, model: str, photos: pd.DataFrame
 ) -> PhotographedRendering:
-    """Summarise the photographs of one rendering, as one model predicts them."""
+    """Summarise the photographs of one rendering, as one model predicts them.
+
+    Args:
+        name: of the rendering.
+        model: its name.
+        photos: from `_read_photos`; the last one states what the rendering is.
+    """
     n_photos = len(photos)
     n_agreeing = int(photos["agrees"].sum())
     latest = photos.iloc[-1]

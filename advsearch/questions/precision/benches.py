@@ -90,13 +90,16 @@ class MeasuredRounds:
     def estimate_needed_seconds(
         self, setting: SampleSetting, seconds_left: float
     ) -> float:
-        """Estimate the seconds for `MIN_CALLS` calls of a new setting and of earlier
-        ones.
+        """Estimate the seconds until new and earlier settings have `MIN_CALLS` calls.
 
-        The first calls of the new setting take longer by the median of what those of
-        earlier ones took. An earlier setting that needs more than a fraction
-        `MAX_SETTING_FRACTION` of the remaining time turned out too expensive, and waits
-        until the end.
+        The first calls of a setting take longer; for the new one that is taken as the
+        median of what it was for earlier ones. An earlier setting that needs more than
+        a fraction `MAX_SETTING_FRACTION` of the remaining time turned out too
+        expensive: it does not count here, and waits until the end.
+
+        Args:
+            setting: the new one.
+            seconds_left: of the budget.
         """
         extra_of_first_calls = list[float]()
         earlier_seconds = 0.0
@@ -157,6 +160,7 @@ def measure_in_rounds(
                 measure_once(setting)
         else:
             measured.skipped.append(setting)
+    # The two calls at once were the first round.
     for _ in range(1, rounds):
         for setting in measured.results:
             if measured.estimate_call_seconds(setting) <= budget.seconds_left:
@@ -270,6 +274,7 @@ class PictureBench:
         self._margin = margin
         self._space = renderer.space
         self._formation = renderer.formation
+        # All samplers, then two of them once more with a denoiser.
         self._lines = list(samplers)
         for name in ("independent", REFERENCE_SAMPLER):
             if name in samplers:
@@ -280,6 +285,7 @@ class PictureBench:
             name: renderer.scene.copy_with(sampler=name)
             for name in {*samplers, REFERENCE_SAMPLER}
         }
+        # The references have renderers, too, whether their lines are measured or not.
         self._renderers = {
             line: renderer.copy_with(
                 scenes[line.removesuffix(OIDN)], denoiser=get_denoiser(line)
@@ -288,6 +294,8 @@ class PictureBench:
         }
         self.settings = list[SampleSetting]()
         for line in self._lines:
+            # The cost decides the order: other lines come later, as if they were
+            # slower.
             cost_factor = 1.0 if line in PREFERRED_LINES else OTHER_LINES_COST
             for count in SAMPLE_COUNTS.get(line, (4, 16, 64, 256)):
                 self.settings.append(
@@ -305,7 +313,18 @@ class PictureBench:
     ) -> list[PrecisionReference]:
         """Render the references, one for each denoiser, within a budget.
 
-        Each is the mean radiance of independent renders, shown as an image.
+        Each is the mean radiance of independent renders, shown as an image. There are
+        two quantities: errors of images are measured against the image without
+        denoiser, and errors of margins against the margin of the image with the same
+        denoiser.
+
+        Args:
+            budget: divided evenly among the denoisers that are left.
+            seed: of the renders.
+            on_done: called after each render.
+
+        Returns:
+            A row of the result for each reference.
         """
         families = list(dict.fromkeys(map(get_denoiser, self._lines)))
         rows = []
@@ -420,9 +439,7 @@ class GradientPart:
         )
 
     def count_renders(self, estimator: str) -> int:
-        """Return the primal renders of a gradient by an estimator, without the image
-        itself.
-        """
+        """Return the renders of a gradient by an estimator, besides the image."""
         return sum(replace(group, estimator=estimator).renders for group in self.groups)
 
 
@@ -431,8 +448,13 @@ def list_gradient_parts(
 ) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them.
 
-    For a linear loss, differences of the loss equal those of the picture, and are left
-    out.
+    A part is the groups of one control that the same estimators can differentiate. If a
+    control has several parts, their names list the parameters.
+
+    Args:
+        groups: of all coordinates.
+        linear: whether the loss is linear; then differences of the loss ("secant")
+            equal those of the picture, and are left out.
     """
     sets = gradients.planning.list_comparable_sets(
         group for group in groups if group.valid
@@ -479,9 +501,11 @@ class GradientBench:
         self._loss = loss
         self._u = u
         self.part = part
+        # of references
         self._exact = renderer.copy_with(
             renderer.scene.copy_with(sampler=REFERENCE_SAMPLER)
         )
+        # Differences have no bias of an adjoint, but take renders for each coordinate.
         self._by_differences = part.size <= MAX_DIFFERENCE_COORDINATES
         if self._by_differences:
             self._reference_estimator = "differences"
@@ -492,6 +516,7 @@ class GradientBench:
         self.reference: ReferenceValue | None = None
         self.settings = list[SampleSetting]()
         for name in part.estimators:
+            # in renders: the image itself, and those of its gradient
             cost = 1.0 + ADJOINT_COST.get(name, part.count_renders(name))
             for count in SAMPLE_COUNTS["independent"]:
                 self.settings.append(
@@ -509,7 +534,8 @@ class GradientBench:
     ) -> list[PrecisionReference]:
         """Compute the reference within a budget.
 
-        The bias of differences is a quarter of the mean disagreement of two steps.
+        By differences, its bias is taken as a quarter of the mean disagreement between
+        the derivatives at two steps.
         """
         if self._by_differences:
             compute = partial(self._compute_derivatives, self._list_probes())
@@ -561,10 +587,10 @@ class GradientBench:
     def _compute_derivatives(
         self, probes: Sequence[gradients.Probe], noise: int, spp: int
     ) -> Float64Array:
-        """Compute derivatives and step errors, (2, n), along each probe.
+        """Compute the derivatives along probes, and how far two steps disagree: (2, n).
 
-        A derivative is extrapolated to a step of zero; its step error is the difference
-        between two steps.
+        A derivative is extrapolated to a step of zero. The second row has the
+        difference between its values at two steps.
 
         Args:
             probes: n directions.
@@ -604,7 +630,11 @@ class GradientBench:
     def check_bias(self, seed: int) -> str | None:
         """Check the reference by an adjoint against differences along one direction.
 
-        Return a sentence if it is biased, else None.
+        The derivative along the direction is the product of the reference with it.
+
+        Returns:
+            A sentence if the reference is biased; None if not, or if the reference is
+            itself by differences.
         """
         if self._reference_estimator == "differences" or self.reference is None:
             return None

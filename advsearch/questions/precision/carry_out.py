@@ -173,6 +173,7 @@ class QuantityMeasurer:
         self._renderer = problem.renderer
         self._loss = cast(gradients.Loss, problem.compute_loss)
         if self._is_linear:
+            # A smooth loss of the raw image: differences may be taken per pixel.
             self._renderer = problem.renderer.copy_with(
                 denoiser="none", transfer="linear"
             )
@@ -181,6 +182,7 @@ class QuantityMeasurer:
                 self._renderer.formation.resolution, config.seed
             )
 
+        # name, fraction of the time, and the function that measures it
         self.sittings: list[tuple[str, float, Callable[[TimeBudget], Sitting]]] = []
         if "image" in config.measured_quantities:
             self.sittings.append(
@@ -217,9 +219,9 @@ class QuantityMeasurer:
     def may_be_steeper(self, point: PrecisionPoint) -> bool | None:
         """Return whether the error may fall faster than that of independent samples.
 
-        None if theory says nothing: differences have the bias of their step, the
-        material form its limits, and the denoiser its own. Stratification never makes
-        the slope shallower, and often steeper (Owen 1997).
+        It may with a stratified sampler (Owen 1997). None if theory says nothing, as
+        where the estimator has a bias: of a step (differences), of an approximation
+        (`material`), or of the denoiser.
         """
         sampler: str = self._config.pixel_sampler
         if point.quantity == "gradient":
@@ -286,6 +288,7 @@ class QuantityMeasurer:
         """
         if recommended.estimator is None or recommended.spp is None:
             return []
+        # a measured setting, with another sample count
         similar = next(
             setting
             for setting in bench.settings
@@ -395,8 +398,9 @@ def _describe_skipped(title: str, measured: Any) -> list[str]:
 def group_by_line(
     points: Sequence[PrecisionPoint],
 ) -> dict[tuple[str, ...], list[PrecisionPoint]]:
-    """Group points by quantity, control, family and estimator, in ascending order of
-    samples.
+    """Group points by quantity, control, family and estimator.
+
+    The points of a group are in ascending order of samples.
     """
     lines: dict[tuple[str, ...], list[PrecisionPoint]] = {}
     for point in points:
@@ -415,10 +419,10 @@ def recommend_settings(
     round_up: RoundUp,
     or_steeper: Callable[[PrecisionPoint], bool | None] = lambda point: None,
 ) -> list[Recommended]:
-    """Return the fastest setting that reaches a goal for each quantity, if any does.
+    """Return the fastest setting for a goal, of each quantity, control and family.
 
-    A recommendation without an estimator says that none does. A setting that was
-    measured again is recommended by these measurements.
+    A recommendation without an estimator says that none does. One of a gradient that
+    was measured again rests on the new measurements.
 
     Args:
         points: measured settings.

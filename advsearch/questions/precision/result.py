@@ -574,7 +574,11 @@ def _make_label(name: str, slope: PrecisionSlope | None) -> str:
 
 
 def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
-    """Draw a dashed line of slope -1/2 under the points, if they span enough time."""
+    """Draw a dashed line of slope -1/2 under the points, if they span enough time.
+
+    By theory, the error of independent samples falls with the root of their number, and
+    so of the time: error = scale / sqrt(seconds).
+    """
     start = min(point.seconds for point in points)
     end = max(point.seconds for point in points)
     if not end >= 1.5 * start:
@@ -602,7 +606,16 @@ def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
 def _draw_line(
     axes: Any, line: Sequence[PrecisionPoint], number: int, label: str
 ) -> None:
-    """Draw the points of an estimator with their intervals."""
+    """Draw relative errors of an estimator over seconds, with their intervals.
+
+    A known error is a filled marker. An open one with an arrow down is an upper limit.
+
+    Args:
+        axes: of matplotlib, logarithmic.
+        line: the points, by ascending samples.
+        number: of the estimator, which chooses color and marker.
+        label: in the legend.
+    """
     color = COLORS[number % len(COLORS)]
     marker = MARKERS[number % len(MARKERS)]
     axes.plot(
@@ -638,7 +651,14 @@ def _draw_line(
             }
             axes.annotate("", (x, y * 0.72), (x, y), arrowprops=arrow)
     axes.plot(
-        [], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label
+        # an empty line, whose entry in the legend has marker and line
+        [],
+        [],
+        marker=marker,
+        markersize=5,
+        color=color,
+        linewidth=1.0,
+        label=label,
     )
 
 

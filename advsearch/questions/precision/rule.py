@@ -128,11 +128,16 @@ def estimate_reference(
 ) -> ReferenceValue:
     """Return a function of the mean of independent parts, with its jackknife error.
 
-    The jackknife (Efron 1982, chapter 3) of the mean itself is its standard error. A
-    function, (n,) to (m,), is for what is no mean, such as a picture after its tone
-    curve or a model's margin on it. The error combines, as squares, the jackknife's
-    estimates of scatter and of bias (noise through a nonlinear function), and a known
-    `bias`.
+    The jackknife (Efron 1982, chapter 3) computes the function again without each part
+    in turn. How much these values scatter tells the standard error; by how much their
+    mean differs from the value, the bias that noise has through a nonlinear function.
+    The error combines both and the known `bias` as a root of the sum of squares.
+
+    Args:
+        parts: independent values (n,) of the same thing.
+        function: (n,) to (m,), of what is no mean itself, such as a picture after its
+            tone curve or a model's margin on it.
+        bias: a known bias of the value.
 
     Raises:
         ValueError: if there are fewer than two parts.
@@ -144,7 +149,7 @@ def estimate_reference(
         )
     total = np.sum(parts, axis=0)
     value = function(total / count)
-    # the function of the mean of all parts but one, of each part
+    # for each part, the function of the mean of all others
     jackknife_values = [function((total - part) / (count - 1)) for part in parts]
     center = np.mean(jackknife_values, axis=0)
     sum_of_squares = sum(
@@ -155,7 +160,8 @@ def estimate_reference(
     bias_estimate = 0.0
     if count > 2:
         bias_estimate = (count - 1) * float(np.linalg.norm(center - value))
-    # the estimate of the bias scatters as much as the value does
+    # The estimate of the bias scatters as much as the value does: what is less may be
+    # chance, and the scatter counts already.
     bias_estimate = max(0.0, bias_estimate - scatter)
     norm = float(np.linalg.norm(value))
     error = math.hypot(scatter, bias_estimate, bias)
@@ -167,13 +173,20 @@ def estimate_reference(
 def summarize_samples(
     setting: SampleSetting, samples: Sequence[Numbers], reference_error: float = 0.0
 ) -> PrecisionPoint:
-    """Estimate the error of a setting from its measurements.
+    """Estimate the error of a setting from repeated measurements.
 
-    The noise of the samples and that of the reference (`reference_error`) are
-    independent, so that their squares add: error^2 = mean of squares - floor^2. A root
-    mean square below `MIN_ERROR_RATIO` times the floor is not known; the result is then
-    a limit. The interval comes from the scatter of the squares on a logarithmic scale;
-    a single measurement and heavy tails have none.
+    The noise of the measurements and that of the reference are independent, so that
+    their squares add: error^2 = mean square - reference_error^2. A root mean square
+    below `MIN_ERROR_RATIO` times the error of the reference may be all of that: then
+    the error is not known, and the root mean square itself is its upper limit. The
+    interval comes from the scatter of the squares, on a logarithmic scale; a single
+    measurement and heavy tails have none.
+
+    Args:
+        setting: which was measured.
+        samples: the measurements, each with its relative "error", and with "cosine" and
+            times if they are known.
+        reference_error: relative error of what they were compared with.
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
     mean_square = statistics.fmean(squares)
@@ -185,8 +198,9 @@ def summarize_samples(
         error = math.sqrt(mean_square - reference_error**2)
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
-        deviation = statistics.stdev(squares) / math.sqrt(len(squares))
-        factor = _interval_factor(deviation, mean_square, len(squares))
+        # standard error of the mean square
+        standard_error = statistics.stdev(squares) / math.sqrt(len(squares))
+        factor = _interval_factor(standard_error, mean_square, len(squares))
         interval = (error / factor, error * factor)
     cosines = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
     cosine = None
@@ -208,9 +222,15 @@ def summarize_samples(
 
 
 def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
-    """Return the factor of a root mean square's interval, on a logarithmic scale.
+    """Return the factor between a root mean square and either bound of its interval.
 
-    The deviation is the standard error of the mean square of `count` values.
+    The interval is symmetric on a logarithmic scale: the root mean square is divided by
+    the factor for the lower bound, and multiplied for the upper one.
+
+    Args:
+        deviation: standard error of the mean square.
+        mean_square: of the errors.
+        count: of errors.
     """
     quantile = float(stdtrit(count - 1, (1.0 + CONFIDENCE) / 2.0))
     # 0.5: the logarithm of a root is half as wide; 50: so that exp does not overflow.
@@ -218,16 +238,19 @@ def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
 
 
 def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
-    """Return whether fewer than `MIN_ERROR_PIXELS` pixels hold the error of some
-    pictures.
+    """Return whether a few pixels hold most of the error of the pictures.
 
-    (sum of squares)^2 / (sum of fourth powers) is their number if all of them were
-    equal. False if the pictures are too small to tell. What happens in none of the
-    pictures, such as a firefly in every hundredth one, cannot be seen.
+    If n pixels had equal errors and all others none, (sum of squares)^2 / (sum of
+    fourth powers) would be n: so this is the effective number of pixels. Few are less
+    than `MIN_ERROR_PIXELS`. False if the pictures are too small to tell. What happens
+    in none of the pictures, such as a firefly in every hundredth one, cannot be seen.
     """
-    squares = sum(numbers["error"] ** 2 for numbers in samples)
-    fourth = sum(numbers.get("fourth", math.nan) for numbers in samples)
-    return fourth > 0.0 and squares**2 < MIN_ERROR_PIXELS * fourth
+    sum_of_squares = sum(numbers["error"] ** 2 for numbers in samples)
+    # NaN without fourth powers, which makes the result false
+    sum_of_fourths = sum(numbers.get("fourth", math.nan) for numbers in samples)
+    return (
+        sum_of_fourths > 0.0 and sum_of_squares**2 < MIN_ERROR_PIXELS * sum_of_fourths
+    )
 
 
 def median_time(seconds: Sequence[float]) -> float:
@@ -247,13 +270,17 @@ def fit_line(
 ) -> PrecisionSlope | None:
     """Fit the line of log error against log samples by least squares.
 
-    Only points with a known error count: one below the reference's own error says
-    nothing. None if fewer than `MIN_FIT_POINTS` sample counts are left.
+    Only points with a known error count: of others there is a limit only. None if they
+    have fewer than `MIN_FIT_POINTS` sample counts.
 
-    Theory says `MONTE_CARLO_SLOPE`; with `or_steeper` that or steeper; with None
-    nothing, and then it is not known whether the slope agrees. A slope agrees if it
-    differs by `SLOPE_TOLERANCE` at most. It disagrees if it differs by more, *and* its
-    interval excludes theory; otherwise nothing is known.
+    The slope agrees with theory if it differs from `MONTE_CARLO_SLOPE` by
+    `SLOPE_TOLERANCE` at most. It disagrees if it differs by more, and its interval
+    excludes theory as well. Otherwise `agrees` is None: not known.
+
+    Args:
+        points: of one estimator.
+        or_steeper: whether a steeper slope agrees, too. None if theory says nothing;
+            then `agrees` is None.
     """
     known = [point for point in points if point.is_known]
     if len({point.spp for point in known}) < MIN_FIT_POINTS:
@@ -263,6 +290,7 @@ def fit_line(
         np.log([point.rms for point in known]),
     )
     slope = float(line.slope)
+    # two degrees of freedom are used up by slope and offset
     quantile = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0))
     half_width = quantile * float(line.stderr)
     difference = slope - MONTE_CARLO_SLOPE
@@ -294,8 +322,9 @@ def fit_line(
 def describe_disagreement(
     slope: PrecisionSlope, points: Sequence[PrecisionPoint]
 ) -> str | None:
-    """Describe how a slope disagrees with theory and the likeliest reason; None if it
-    agrees.
+    """Describe how a slope disagrees with theory, and the likeliest reason.
+
+    None if it agrees.
     """
     if slope.agrees is not False or slope.theory is None:
         return None
@@ -342,14 +371,24 @@ def recommend_count(
     round_up: RoundUp = round_up_exactly,
     or_steeper: bool | None = None,
 ) -> Recommended | None:
-    """Return the smallest sample count at which one line reaches a relative error.
+    """Return the smallest sample count at which one estimator reaches a relative error.
 
-    If the fitted line passes through the interval of every known point, of at least
-    four, it stands for them. Otherwise the error is interpolated between points on
-    logarithmic axes. Beyond the last one it follows the fitted slope, or that of theory
-    (see `fit_line`) if points are too few for a fit, at most `MAX_EXTRAPOLATION` times
-    as far, and not at all if the line levels off. A limit counts as an error of that
-    size. Time is interpolated, and beyond the last point grows with the samples.
+    If a fitted line passes through the interval of every known point, of at least four,
+    the count comes from the line. Else the error is interpolated between the points on
+    logarithmic axes. Beyond the last point it follows the slope of the fit, or that of
+    theory if points are too few for a fit: at most up to `MAX_EXTRAPOLATION` times the
+    samples, and not at all if the error has leveled off. A point of which only a limit
+    is known counts as an error of that size. Time is interpolated as well, and is
+    proportional to the samples beyond the last point.
+
+    Args:
+        points: of one estimator.
+        goal: the relative error.
+        round_up: returns a sample count that the estimator accepts.
+        or_steeper: see `fit_line`.
+
+    Returns:
+        The recommendation; None if no count is known to reach the goal.
     """
     if not points or not goal > 0.0:
         return None
@@ -412,10 +451,10 @@ def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) ->
 def _solve_line(
     line: PrecisionSlope, ordered: Sequence[PrecisionPoint], goal: float
 ) -> tuple[float | None, str]:
-    """Return the samples at which a line reaches a goal, and the basis.
+    """Return the samples at which a fitted line reaches a goal, and their basis.
 
-    At least the smallest measured number; None beyond `MAX_EXTRAPOLATION` times the
-    largest one.
+    The line is log error = offset + slope * log samples. The samples are at least the
+    smallest measured number, and None beyond `MAX_EXTRAPOLATION` times the largest.
     """
     samples = math.exp((math.log(goal) - line.offset) / line.slope)
     smallest = float(ordered[0].spp)
@@ -438,9 +477,14 @@ def confirm_recommendation(
 
     What looks cheapest among noisy points is mostly a lucky one, and its error looks
     smaller than it is. New measurements, with seeds of their own, don't have that bias.
-    If their error is above the goal, the sample count grows as independent samples need
-    it, by (error / goal)^2, at most `MAX_EXTRAPOLATION` times, and the error shrinks by
-    the root.
+    If their error is above the goal, the sample count grows by (error / goal)^2, as the
+    error of independent samples falls with the root of their number, but by at most
+    `MAX_EXTRAPOLATION`.
+
+    Args:
+        recommendation: with a goal and a sample count.
+        point: the new measurement of it.
+        round_up: returns a sample count that the estimator accepts.
     """
     assert recommendation.goal is not None and recommendation.spp is not None
     needed_factor = max(1.0, (point.rms / recommendation.goal) ** 2)
@@ -462,10 +506,19 @@ def _interpolate_count(
     line: PrecisionSlope | None,
     or_steeper: bool | None,
 ) -> tuple[float | None, str]:
-    """Return the samples from which on ordered points stay at or below a goal.
+    """Return the samples from which on the error stays at or below a goal.
+
+    That is between the last point above the goal and the next, on logarithmic axes.
+
+    Args:
+        ordered: points by ascending samples.
+        goal: the relative error.
+        line: fitted, for what lies beyond the last point; None without.
+        or_steeper: see `fit_line`.
 
     Returns:
-        The samples, None if nothing is known of so many; and the basis.
+        The samples, None if nothing is known of so many; and whether they are
+        "measured", "interpolated" or "extrapolated".
     """
     if ordered[-1].rms > goal:
         return _extrapolate_count(ordered, goal, line, or_steeper), "extrapolated"
@@ -477,6 +530,7 @@ def _interpolate_count(
     if n_until_goal == 0:
         return float(below.spp), "measured"
     above = ordered[n_until_goal - 1]
+    # part of the way from `above` to `below`, in logarithms
     fraction = math.log(above.rms / goal) / math.log(above.rms / below.rms)
     return above.spp * (below.spp / above.spp) ** fraction, "interpolated"
 
@@ -490,8 +544,14 @@ def _extrapolate_count(
     """Return the samples beyond the last point at which a goal is reached.
 
     The error follows the slope of the line, or that of theory without a line. None if
-    neither is known, the slope is too flat, the last error is a limit, or the points
-    have leveled off; or beyond `MAX_EXTRAPOLATION` times the samples.
+    neither is known, if the slope is too flat, if the last error is only a limit, if
+    the points have leveled off, or beyond `MAX_EXTRAPOLATION` times the samples.
+
+    Args:
+        ordered: points by ascending samples.
+        goal: the relative error.
+        line: fitted; None without.
+        or_steeper: None if theory has no slope.
     """
     last = ordered[-1]
     slope = None
@@ -503,6 +563,7 @@ def _extrapolate_count(
         return None
     if not last.is_known or has_leveled_off(ordered):
         return None
+    # error ~ samples^slope; a slope steeper than the limit is not relied on
     factor = (goal / last.rms) ** (1.0 / max(slope, MIN_EXTRAPOLATED_SLOPE))
     return last.spp * factor if factor <= MAX_EXTRAPOLATION else None
 

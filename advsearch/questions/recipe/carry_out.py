@@ -226,13 +226,16 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
 def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
     """Load everything that the runs name, and return the parameters of each part.
 
-    A wrong name would otherwise end hours of rendering.
+    A wrong name would otherwise end hours of rendering. Runs whose settings differ in
+    seed and workers alone are loaded once.
+
+    Returns:
+        For each part the names of its parameters, which are columns of its rows.
     """
     parameters_of_settings = dict[str, set[str]]()
-    columns = defaultdict[str, set[str]](set)
+    parameters_of_part = defaultdict[str, set[str]](set)
     config_of_run = {run.name: run.config for run in runs}
     for run in runs:
-        # runs that differ in these alone are loaded once
         distinct_settings = {
             name: value
             for name, value in run.config.to_json().items()
@@ -240,12 +243,13 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
         }
         key = f"{distinct_settings} {run.around}"
         if key not in parameters_of_settings:
+            # the search around whose distribution this run samples
             search = config_of_run[run.around] if run.around else None
             parameters_of_settings[key] = _check_run(run.config, search)
-        columns[run.part] |= parameters_of_settings[key]
+        parameters_of_part[run.part] |= parameters_of_settings[key]
         if getattr(run.config, WORKERS_COLUMN, None) is not None:
-            columns[run.part].add(WORKERS_COLUMN)
-    return columns
+            parameters_of_part[run.part].add(WORKERS_COLUMN)
+    return parameters_of_part
 
 
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
@@ -402,7 +406,8 @@ def _run_parts(
 ) -> tuple[list[DoneRun], list[str]]:
     """Run what is not finished, until a run is interrupted.
 
-    A run around a search whose result has no distribution is left out.
+    A run around a search samples from what the search found. If that has no
+    distribution, the run is left out.
 
     Returns:
         The runs with their results, and a sentence for each run that was left out.
@@ -471,7 +476,10 @@ def sample_around(
 def _range_around(
     mean: float, deviation: float, search_range: tuple[float, float], parameter: Any
 ) -> list[float]:
-    """Return the range of a uniform distribution, inside the range of the search.
+    """Return the range of the uniform distribution with some mean and deviation.
+
+    It is cut to the range of the search, except for an angle over a full turn, which is
+    cut to one turn. On a logarithmic parameter, the logarithm is uniform.
 
     Args:
         mean: mean of the distribution.
@@ -554,8 +562,9 @@ def _read_frame(
 ) -> Rows:
     """Read the rows of all runs into one frame.
 
-    A sweep has rows of its part, and those of its photographs under `PHOTOGRAPHS`. Rows
-    of a sweep that sets `workers` have a column of that.
+    The rows of a run have the name of its part. Photographs that a sweep was compared
+    with have rows, too, of the part `PHOTOGRAPHS`. The rows of a sweep that sets
+    `workers` have a column of that.
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()

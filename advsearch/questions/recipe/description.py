@@ -369,8 +369,7 @@ def _safe_name(text: str) -> str:
 
 
 def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
-    """Reject a part that would do more than its run, unless the recipe is a bundled
-    one.
+    """Reject a part that would do more than its run, unless the recipe is bundled.
 
     That is to connect to other machines, or to start more processes than there are
     cores.

@@ -82,7 +82,15 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
 def _describe_predictions(
     groups: Mapping[str, Sequence[PredictionCount]], things: str
 ) -> list[str]:
-    """Describe for how many groups the most frequent prediction is mostly correct."""
+    """Describe for how many groups the most frequent prediction is mostly right.
+
+    Those for which it is not are described each.
+
+    Args:
+        groups: for each group the predictions, the most frequent first, each with its
+            tally and how often it is right.
+        things: plural of what the groups are.
+    """
     sentences = list[str]()
     for value, counts in groups.items():
         tally, n_right = counts[0]
@@ -103,7 +111,15 @@ def _describe_predictions(
 def _draw_stacked_bar(
     axes: Any, position: int, counts: Sequence[PredictionCount]
 ) -> None:
-    """Draw the most frequent predictions side by side, and all others in gray."""
+    """Draw the most frequent predictions of a group in a row, all others in gray.
+
+    A prediction is blue if it is right in at least half of its cases, else red.
+
+    Args:
+        axes: of matplotlib.
+        position: of the bar on the vertical axis.
+        counts: of each prediction its tally, and how often it is right.
+    """
     left = 0.0
     for tally, n_right in counts:
         share = tally.fraction or 0.0
@@ -224,7 +240,10 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
 
 
 def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
-    """Return which predictions (n,) are one of the classes, in full or in a list."""
+    """Return which predictions (n,) name one of the classes.
+
+    A label may be a list of synonyms, as in "cup, mug": it matches in full, or by one.
+    """
     names = predictions.map(
         lambda label: {label.strip(), *map(str.strip, label.split(","))}
     )
@@ -269,10 +288,15 @@ def _draw_cues(
 def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     """Count how many predictions the shape and the texture predict, by pair of both.
 
-    A cue predicts the most frequent of the predictions about the same object with
-    other textures, or about the same texture on other objects. Both are sampled to the
-    size of the smaller set. A predicted prediction is in neither set, so that a model
-    that goes by neither cue is predicted equally well by both.
+    To predict what a model says about a pair, a cue takes its most frequent prediction
+    about the same object with other textures, or about the same texture on other
+    objects. Both sets are sampled to the size of the smaller, and neither has the
+    pair's own predictions, so that a model that goes by neither cue is predicted
+    equally well by both.
+
+    Args:
+        rows: predictions with object and texture.
+        options: of the figure, which name the columns of both.
 
     Returns:
         For each pair of object and texture: the number of predictions, those that the
@@ -305,7 +329,15 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
 def _collect_labels(
     labels_of_pair: Mapping[Any, Sequence[str]], shape: str, texture: str
 ) -> tuple[list[str], list[str]]:
-    """Return the predictions about the same shape, and those about the same texture."""
+    """Return the predictions about the same shape, and those about the same texture.
+
+    The pair of both itself is left out of either.
+
+    Args:
+        labels_of_pair: predictions by (shape, texture).
+        shape: which the first have, with other textures.
+        texture: which the second have, with other shapes.
+    """
     same_shape = list[str]()
     same_texture = list[str]()
     for (other_shape, other_texture), other_labels in labels_of_pair.items():
@@ -340,6 +372,7 @@ def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
         _shape_advantage(generator.choices(pairs, k=len(pairs)))
         for _ in range(RESAMPLES)
     )
+    # 2.5 % at either end are outside of the interval
     n_outside = round(RESAMPLES * 0.025)
     lower = resampled[n_outside]
     upper = resampled[-1 - n_outside]
@@ -435,9 +468,7 @@ def _split_by_triangle(
     mixtures: npt.NDArray[np.float64],
     corners: Mapping[Any, Any],
 ) -> list[npt.NDArray[np.bool_]]:
-    """Return which mixtures lie in each triangle of the diagram: a mask (n,) for
-    each.
-    """
+    """Return for each triangle of the diagram which mixtures (n,) lie in it."""
     triangles = pd.Series(
         [find_triangle(mixture, options.side) for mixture in mixtures]
     )
@@ -450,7 +481,17 @@ def _make_panels(
     by_margin: bool,
     in_triangle: Sequence[npt.NDArray[np.bool_]],
 ) -> dict[str, list[float | None]]:
-    """Return a mean by triangle for each prediction, or that of the margin."""
+    """Return what the diagram of each prediction shows: a value for each triangle.
+
+    That is the fraction of the mixtures inside for which the prediction is given, or
+    with `by_margin` the mean margin; None where no mixture lies.
+
+    Args:
+        rows: of one mixture each.
+        ranking: the predictions with their counts.
+        by_margin: whether margins are shown; then there is a single prediction.
+        in_triangle: for each triangle, which rows (n,) lie in it.
+    """
     panels = dict[str, list[float | None]]()
     for label, _ in ranking:
         values = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
@@ -463,7 +504,12 @@ def _make_panels(
 def _describe_empty(
     in_triangle: Sequence[npt.NDArray[np.bool_]], corners: Mapping[Any, Any]
 ) -> list[str]:
-    """Describe how many triangles of the diagram have no picture."""
+    """Describe how many triangles have no mixture; empty if all have one.
+
+    Args:
+        in_triangle: for each triangle, which mixtures (n,) lie in it.
+        corners: one entry for each triangle.
+    """
     text = list[str]()
     n_empty = sum(not is_inside.any() for is_inside in in_triangle)
     if n_empty:
@@ -510,7 +556,15 @@ def _mean_by_triangle(
 def _describe_margins(
     label: str, margins: Mapping[str, Float64Array]
 ) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
-    """Describe the margins by main ingredient: sentences, heads and rows of a table."""
+    """Describe the margins of a single prediction by the main ingredient.
+
+    Args:
+        label: the only prediction that is given.
+        margins: of the mixtures in which each ingredient is the largest, by its name.
+
+    Returns:
+        Sentences, and the heads and rows of a table.
+    """
     text = [SINGLE_PREDICTION.format(label), _compare_margins(margins)]
     heads = [
         "where most is",
@@ -531,7 +585,17 @@ def _describe_ingredients(
     names: Sequence[str],
     main_ingredient: npt.NDArray[np.intp],
 ) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
-    """Describe predictions by main ingredient: sentences, heads and rows of a table."""
+    """Describe how often each prediction is given, by the main ingredient.
+
+    Args:
+        rows: of one mixture each.
+        ranking: the predictions with their counts, the most frequent first.
+        names: of the ingredients.
+        main_ingredient: (n,) index of the largest ingredient in each row.
+
+    Returns:
+        Sentences, and the heads and rows of a table.
+    """
     text = list[str]()
     table = list[list[rates.Cell]]()
     heads = ["prediction", "where most is", "given in", *rates.FRACTION_HEADS]
@@ -608,12 +672,15 @@ def _draw_panels(
 def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
     """Return the triangle of a ternary diagram that three fractions (3,) lie in.
 
-    Rounded down, the fractions add up to 1 less than `side` in a triangle that points
-    up, and to 2 less in one that points down. `side` is the number of triangles along a
-    side.
+    A triangle is (a, b, points_down): the first two fractions times `side`, rounded
+    down, and whether it points down. With the third one, rounded likewise, they add up
+    to side - 1 in a triangle that points up, and to side - 2 in one that points down.
+    `side` is the number of triangles along a side of the diagram.
     """
     a, b, c = (int(fraction * side) for fraction in mixture)
-    while a + b + c >= side:  # a corner of triangles: move towards the largest
+    # The sum is `side` at a corner, which several triangles share. It counts for one of
+    # those that have no larger value of its largest fraction.
+    while a + b + c >= side:
         if a >= max(b, c):
             a -= 1
         elif b >= c:
@@ -624,7 +691,14 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
 
 
 def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]]:
-    """Return the triangles of a ternary diagram with the fractions at their corners."""
+    """Return the triangles of a ternary diagram with the mixtures at their corners.
+
+    The key of a triangle is (a, b, points_down): the first two fractions inside it,
+    times `side` and rounded down, and whether it points down.
+
+    Args:
+        side: number of triangles along a side of the diagram.
+    """
 
     def mixture_at(x: int, y: int) -> Mixture:
         """Return the fractions at the corner x and y steps along the first two."""
@@ -645,9 +719,17 @@ def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]
 
 
 def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
-    """Compare the smallest and the largest mean margin by normal intervals.
+    """Describe for which ingredient the mean margin is smallest, and for which largest.
 
-    For the comparison they are widened for a choice among all (Bonferroni).
+    The margin is by how much the right label leads the next. Whether the two differ is
+    decided by intervals that are widened, since they were chosen for being extreme
+    among all ingredients (Bonferroni).
+
+    Args:
+        margins: of the mixtures in which each ingredient is the largest, by its name.
+
+    Returns:
+        A text with both means, their 95 % intervals and the verdict.
     """
     smallest = min(margins, key=lambda name: margins[name].mean())
     largest = max(margins, key=lambda name: margins[name].mean())
@@ -671,7 +753,10 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
 
 
 def _mean_interval(values: Float64Array, n_compared: int = 1) -> tuple[float, float]:
-    """Return the normal interval of a mean, widened for a choice among `n_compared`."""
+    """Return the normal 95 % interval of the mean of values (n,).
+
+    It is widened for a choice among `n_compared` means (Bonferroni).
+    """
     alpha = (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * n_compared)
     half_width = NormalDist().inv_cdf(1.0 - alpha) * _standard_error(values)
     mean = values.mean()

@@ -211,8 +211,12 @@ class ClusteredFraction:
 
     @classmethod
     def from_rows(cls, name: str, rows: Rows, flags: Any = None) -> ClusteredFraction:
-        """Count rows by unit: those that are flagged (n,), by default the correct
-        ones.
+        """Count rows by unit.
+
+        Args:
+            name: of the tally.
+            rows: with a column "unit".
+            flags: (n,) whether each is counted; by default those that are correct.
         """
         if flags is None:
             flags = rows["correct"]
@@ -263,8 +267,9 @@ class ClusteredFraction:
         return f"{verb} in {self.n_counted} of {self.total} ({share})"
 
     def is_below(self, other: ClusteredFraction, n_compared: int = 1) -> bool:
-        """Return whether this interval lies below that of another tally, both
-        widened.
+        """Return whether the interval of this tally lies below that of another one.
+
+        Both are widened for a choice among `n_compared`.
         """
         lower = self.interval(n_compared)
         upper = other.interval(n_compared)
@@ -475,9 +480,13 @@ def _name_columns(options: RatesOptions) -> str:
 def _count_cells(
     rows: Rows, series_values: Sequence[str], options: RatesOptions
 ) -> tuple[dict[str, list[ClusteredFraction]], list[float] | None]:
-    """Count the rows of each group and series; also return the centers of bins.
+    """Count the rows of each group and series.
 
     Bars of names are sorted by the fraction of the first series, the highest first.
+
+    Returns:
+        For each group by its name a tally for each series; and the centers of bins,
+        None if the groups are single values.
     """
     groups, bin_centers = _group_rows(rows, options)
     cells = dict[str, list[ClusteredFraction]]()
@@ -495,7 +504,11 @@ def _count_cells(
 def _count_series(
     name: str, rows: Rows, series_values: Sequence[str], options: RatesOptions
 ) -> list[ClusteredFraction]:
-    """Count right or wrong predictions in each series, in the order of the series."""
+    """Count the right predictions in each series; with `options.wrong` the wrong ones.
+
+    The tallies are in the order of `series_values`; a series without rows has an empty
+    one.
+    """
     rows_of_series = {"": rows}
     if options.series and len(rows):
         rows_of_series = split_rows(rows, options.series)
@@ -520,10 +533,10 @@ def _name_series(series: Sequence[str], options: RatesOptions) -> list[str]:
 def _describe_cells(
     cells: Cells, series: Sequence[str], is_binned: bool, options: RatesOptions
 ) -> list[str]:
-    """Describe the lowest and the highest cell: over a map, or of each series.
+    """Describe the lowest and the highest cell: over a map, or else of each series.
 
     Args:
-        cells: the counts of each series, by row.
+        cells: for each row by its name, a tally for each series.
         series: names of the series.
         is_binned: whether the rows are bins of a number.
         options: of the figure.
@@ -567,10 +580,17 @@ def _describe_series(
     series: Sequence[str],
     options: RatesOptions,
 ) -> list[str]:
-    """Compare the series over all rows, and models by their mean relative error.
+    """Compare the series over all rows.
 
-    That is the mCE of Hendrycks and Dietterich (2019), with the first model as the
-    reference.
+    Where they are models and errors are counted, each but the first also has the mean
+    over rows of its error relative to that of the first model: the mCE of Hendrycks and
+    Dietterich (2019).
+
+    Args:
+        cells: for each row a tally for each series.
+        totals: of each series over all rows.
+        series: their names.
+        options: of the figure.
     """
     if not options.series or len(series) < 2:
         return []
@@ -612,7 +632,17 @@ def _compare_with_baseline(
     series: Sequence[str],
     verb: str,
 ) -> list[str]:
-    """Compare the part `name` with all other rows, a sentence for each series."""
+    """Compare one part with all other rows, a sentence for each series.
+
+    A difference is shown if the intervals do not overlap.
+
+    Args:
+        name: of the part.
+        tallies: of the part, for each series.
+        totals: of the others, for each series.
+        series: their names.
+        verb: what is counted.
+    """
     text = []
     for series_name, tally, total in zip(series, tallies, totals, strict=True):
         differs = tally.is_below(total) or total.is_below(tally)
@@ -702,10 +732,14 @@ def _draw_rate_lines(
 def _group_rows(
     rows: Rows, options: RatesOptions
 ) -> tuple[Mapping[str, Rows], list[float] | None]:
-    """Split rows by a column's values, or by bins; also return the centers of bins.
+    """Split rows by a column's values, or by bins of them.
 
-    Without `bins` and lines, each value is a group, and there are no centers. Rows
-    outside the `range` are in no bin.
+    Without `bins`, and unless lines are drawn, each value is a group. Rows outside of
+    the `range` are in no bin.
+
+    Returns:
+        The rows by the name of the value or bin; and the centers of the bins, None
+        without bins.
     """
     if options.bins is None and options.form != "lines":
         return split_rows(rows, options.by), None
@@ -752,7 +786,14 @@ def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
 
 
 def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> None:
-    """Draw the fractions as a matrix of colors with percentages in it."""
+    """Draw the fractions as a matrix of colors with percentages in it.
+
+    Args:
+        axes: of matplotlib.
+        cells: for each row of the matrix a tally for each series.
+        series: names of the columns.
+        label: of the color bar.
+    """
     shares = [
         [math.nan if tally.fraction is None else tally.fraction for tally in tallies]
         for tallies in cells.values()
@@ -767,6 +808,7 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
             f"{100 * share:.0f}",
             ha="center",
             va="center",
+            # readable on a dark color, at either end of the scale
             color="white" if abs(share - 0.5) > 0.3 else "black",
             fontsize=7.5,
         )
@@ -786,7 +828,14 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
 def _draw_lines(
     axes: Any, cells: Cells, series: Sequence[str], bin_positions: Sequence[float]
 ) -> None:
-    """Draw the fractions of each series, with their 95 % intervals as bands."""
+    """Draw the fractions of each series as a line, with their 95 % intervals as bands.
+
+    Args:
+        axes: of matplotlib.
+        cells: for each bin a tally for each series.
+        series: names for the legend.
+        bin_positions: of the bins along the horizontal axis.
+    """
     for index, name in enumerate(series):
         positions = list[float]()
         shares = list[float | None]()
@@ -796,6 +845,7 @@ def _draw_lines(
             tally = tallies[index]
             if not tally.total:
                 continue
+            # Without an interval nothing is known: the band is full.
             interval = tally.interval() or (0.0, 1.0)
             positions.append(position)
             shares.append(tally.fraction)
@@ -911,8 +961,13 @@ def _add_agreement(
     table: list[list[Cell]],
     series_name: str,
 ) -> None:
-    """Add the agreement of pairs to the bars and the table, for all objects and
-    each.
+    """Add the agreement of pairs to the bars and the table, of all objects and of each.
+
+    Args:
+        bars: tallies by object, or `ALL_OBJECTS`; each gets one more.
+        pairs: of renderings and other images.
+        table: which gets a row for each object.
+        series_name: what the other images are.
     """
     for name, tallies in bars.items():
         object_pairs = pairs
@@ -939,8 +994,9 @@ def _draw_agreement(figure: Any, bars: Cells, series: Sequence[str]) -> None:
 def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
     """Join rows with the renderings of the same configuration.
 
-    A row may have more parameters than its rendering. Columns of the rendering that
-    the row has too end in `` rendered``.
+    A configuration is all columns of the renderings but those that say something of a
+    single row. Rows may have more parameters. Columns of a single row come twice: those
+    of the rendering end in `` rendered``.
     """
     per_row = {PREDICTION_COLUMN, PART_COLUMN, "correct", "margin", "time", "unit"}
     configuration = [name for name in renderings if name not in per_row]
@@ -948,7 +1004,16 @@ def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
 
 
 def _count_agreement(name: str, pairs: Rows) -> tuple[ClusteredFraction, list[Cell]]:
-    """Count the pairs that agree; also return the cells of the table's row."""
+    """Count the pairs in which both predictions are right, or both are wrong.
+
+    Args:
+        name: of the tally.
+        pairs: with "correct rendered" for the rendering, "correct" for the other image.
+
+    Returns:
+        The tally of these pairs; and the cells of the table's row: pairs by whether the
+        rendering and the other image are right, equal predictions, and the tally.
+    """
     of_rendering = pairs["correct rendered"]
     of_other = pairs["correct"]
     confusion = list[Cell]()
@@ -995,8 +1060,13 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 
 
 def _describe_where(right: bool, pairs: Rows) -> str:
-    """Describe the other image of pairs whose rendering was predicted right or
-    wrong.
+    """Describe how often both predictions are right, or wrong, if the first one is.
+
+    The first is about the rendering, the second about the other image of a pair.
+
+    Args:
+        right: whether the first is right.
+        pairs: of both.
     """
     verb = "right" if right else "wrong"
     is_selected = pairs["correct rendered"] == right
@@ -1064,7 +1134,11 @@ def _compute_gains(run_rates: Any, rates_by_count: Mapping[int, Any]) -> Any:
 
 
 def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
-    """Describe the throughput of each worker count, relative to the fewest workers."""
+    """Describe the throughput of each worker count, relative to the fewest workers.
+
+    Args:
+        rates_by_count: throughput of several runs, by ascending worker count.
+    """
     fewest = next(iter(rates_by_count))
     text = list[str]()
     for workers, run_rates in rates_by_count.items():
@@ -1084,6 +1158,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     if min_runs > 1:
         # The median of the population lies outside the range of n runs only if all n
         # are on one side of it.
+        # The chance of that is 0.5^n for either side.
         confidence = 100 * (1 - 0.5 ** (min_runs - 1))
         text.append(
             f"Medians of {min_runs} runs, one of each object, with the lowest and the "
@@ -1096,9 +1171,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
 def _draw_scaling(
     figure: Any, rates_by_count: Mapping[int, Any], max_rate: float
 ) -> None:
-    """Draw median and range of the throughput over worker counts, and linear
-    scaling.
-    """
+    """Draw median and range of the throughput by worker count, and linear scaling."""
     axes = figure.subplots()
     counts = list(rates_by_count)
     fewest, slowest = next(iter(rates_by_count.items()))

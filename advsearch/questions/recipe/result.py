@@ -284,9 +284,10 @@ def _format_cell(column: str, value: Cell) -> str:
 
 
 def omit_repeated_sentences(figures: Sequence[RecipeFigure]) -> list[list[str]]:
-    """Return the sentences of each figure without counts that an earlier one reports.
+    """Return the sentences of each figure, less those that an earlier figure has.
 
-    If nothing is left, a sentence says so.
+    Only sentences with a count, as in "3 of 5", are left out. If nothing is left, or
+    the text is that of the figure before, a sentence says so.
     """
     reported = set[str]()
     remaining = list[list[str]]()

@@ -75,13 +75,14 @@ def grow_box(
 ) -> GrownBox:
     """Grow a box around a point, then check it with samples that nothing was fitted to.
 
-    Each face in turn tries to move out by a fraction of what is left to the bound (1/2
-    at first, halved at every level at which no face can move any more). The slab that it
-    would win is probed at random points; if all have the centre's prediction, it moves.
-    Growing ends after `MAX_PROBED` images for each parameter at the latest. Then the
-    box is sampled; on an exception, the face that cuts off the least of the box moves
-    in to it and the box is sampled anew, with other seeds, `ATTEMPTS` times at most;
-    the last check counts whatever it shows.
+    Each face in turn tries to move out by a fraction of its distance to the bound. The
+    slab that it would win is probed at random points; if all have the centre's
+    prediction, it moves. The fraction is 1/2 at first, and halved when no face can move
+    any more. Growing ends after `MAX_PROBED` images for each parameter at the latest.
+
+    Then the box is sampled. For each exception, the face that cuts off the least of the
+    box moves in to it, and the box is sampled anew, with other seeds, `ATTEMPTS` times
+    at most; the last check counts whatever it shows.
 
     Args:
         is_same: whether a point has the prediction of the centre.
@@ -140,7 +141,7 @@ class GrowingBox:
     def grow(self) -> None:
         """Move faces out while the slabs that they win have the centre's prediction."""
         n_faces = 2 * len(self._center)
-        # so many that a round of all faces still fits
+        # A round of all faces begins only if it fits into the limit of images.
         last_round = MAX_PROBED * len(self._center) - n_faces * PROBES
         fraction = 0.5
         for _ in range(LEVELS):
@@ -156,9 +157,13 @@ class GrowingBox:
         return points[[not self._evaluate(point) for point in points]]
 
     def exclude(self, point: Tensor) -> None:
-        """Move a face in, so that a point lies outside.
+        """Move a face in, so that a point lies outside and the centre stays inside.
 
-        It is the face that cuts off the least of the box.
+        It is the face that cuts off the least of the box. Points outside change
+        nothing.
+
+        Args:
+            point: (d,) with another prediction than the centre.
         """
         if not bool(((point >= self.low) & (point <= self.high)).all()):
             return
@@ -180,13 +185,14 @@ class GrowingBox:
     def _push(self, face: int, fraction: float) -> bool:
         """Move a face out if the slab that it wins has the centre's prediction.
 
-        A face close to the bound tries to move all of the distance. The slab is probed
-        at random points, one of which is moved to the outer face. A face does not move
-        by less than `MIN_STEP`.
+        It tries a fraction of the distance to the bound, or all of it if little is
+        left. The slab is probed at random points, one of which is moved to the outer
+        face. If one has another prediction, or the step is less than `MIN_STEP`, the
+        face stays.
 
         Args:
             face: its index: 2 * axis, and 1 more for the upper face.
-            fraction: of the distance to the bound.
+            fraction: of the distance to the bound, 0 or 1.
 
         Returns:
             Whether it moved.
@@ -195,6 +201,8 @@ class GrowingBox:
         distance = float(1.0 - self.high[axis]) if is_upper else float(self.low[axis])
         if distance <= 0.0:
             return False
+        # A fraction of so little would soon be less than a step, and the bound never
+        # reached.
         is_close = distance < 4.0 * MIN_STEP
         step = distance if is_close else fraction * distance
         if step < MIN_STEP and not is_close:

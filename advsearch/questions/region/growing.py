@@ -258,9 +258,13 @@ class RegionSearch:
     def _is_same(self, values: Tensor, number: int) -> bool:
         """Return whether the verdict at coordinates (k,) is that of the centre.
 
-        An image without the object, or with a prediction that is not a number, is
-        neither right nor wrong, and so another one. Images of the check are rendered,
-        never predicted.
+        An image without the object, or with a prediction that is not a number, has no
+        verdict, and so not that of the centre. Images of the check are rendered, never
+        predicted.
+
+        Args:
+            values: of the parameters that vary.
+            number: of the point, which seeds its noise.
         """
         predictor = None if self._is_checking else self._verifier.state.predictor
         u = self._varied.with_values(values)
@@ -312,10 +316,10 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
 def describe_box(
     problem: Problem, grown: boxes.GrownBox, varied: VariedParameters
 ) -> list[BoxSide]:
-    """Return the range of each parameter in its unit.
+    """Return the range of each varied parameter inside the box, in its unit.
 
-    Of a number that no control describes, as fractions of the range. A component of a
-    vector is described as ``NAME.INDEX``.
+    If no control describes a number, it is a fraction of the parameter's range. A
+    component of a vector is named ``NAME.INDEX``.
 
     Args:
         problem: of the scene.
@@ -389,6 +393,7 @@ def draw_map(
     trials = verifier.try_in_batches(
         "map", size * size, find_configuration, has_success=False, predictor=predictor
     )
+    # The score is how wrong a prediction is.
     margins = [-trial.score for trial in trials]
     rows = [margins[begin : begin + size] for begin in range(0, len(margins), size)]
     x_range, y_range = find_ranges(verifier.problem, varied, box)

@@ -287,9 +287,10 @@ def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
 def model_condition(
     problem: Problem, other_problem: Problem, name: str, spp: int
 ) -> ReplayCondition:
-    """Return the condition that asks another model.
+    """Return the condition under which another model predicts the scene.
 
-    A model that takes the same images as the run's own shares the run's renders.
+    If that takes the same images as the run's own model, it gets the run's renders,
+    which are shared by their key (`RUN_LIGHT`); else it has renders of its own.
 
     Args:
         problem: of the run.
@@ -297,17 +298,17 @@ def model_condition(
         name: of the other model.
         spp: samples per pixel.
     """
-    light = name
+    shared_key = name
     if other_problem.renderer.formation == problem.renderer.formation:
-        light = RUN_LIGHT
+        shared_key = RUN_LIGHT
         other_problem = replace(other_problem, renderer=problem.renderer)
     return ReplayCondition(
         "model",
         name,
         make_problem=partial(replace, other_problem),  # a copy
         spp=spp,
-        light=light,
-        source=light,
+        light=shared_key,
+        source=shared_key,
     )
 
 
@@ -526,7 +527,10 @@ class _Table:
             )
 
     def _render(self, conditions: Sequence[ReplayCondition]) -> None:
-        """Render the trials of conditions, and count the renders even if it stops."""
+        """Render the trials of conditions, and count the renders even if it stops.
+
+        There are as many trials of the clean scene as of the adversarial one.
+        """
         names = ", ".join(dict.fromkeys(condition.name for condition in conditions))
         if len(conditions) == 1:
             names = f"{names}: {conditions[0].description}"

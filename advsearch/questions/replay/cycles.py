@@ -367,8 +367,9 @@ def _describe_lamps(
 
 
 def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
-    """Rotate a mesh so that Blender, which imports glTF with -y in front, has our
-    axes.
+    """Rotate a mesh so that it has our axes in Blender.
+
+    Blender imports glTF with -y in front.
     """
     rotation = np.array(
         [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32
@@ -383,7 +384,9 @@ def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
 def _make_ground(
     scene: SceneDescription, reflectance: Tensor | None
 ) -> list[assets.Shape]:
-    """Return the ground of a scene as a mesh; empty if it has none, or one already.
+    """Return the ground of a scene as a mesh, a square around the origin at height 0.
+
+    Empty if the scene has no ground, or its parts have one already.
 
     Args:
         scene: the scene.
@@ -440,6 +443,7 @@ class _Process:
             with OpenEXR.File({}, {"RGB": np.ascontiguousarray(radiance)}) as image:
                 image.write(str(self._directory / "environment.exr"))
         # Blender takes the arguments after "--" as the script's; Python needs none.
+        # "-I" marks a Python with the module bpy in place of the program Blender.
         separator = [] if "-I" in program else ["--"]
         self._log = self._directory / "log.txt"
         with self._log.open("wb") as log:
@@ -456,6 +460,7 @@ class _Process:
                 raise BlenderError(
                     f"Blender can't be started ({error.strerror}); check {program[0]}"
                 ) from error
+        # Blender runs until this object is collected or Python exits.
         weakref.finalize(self, _stop, self._process, self._temporary)
 
     def render(self, seed: int, spp: int) -> Tensor:

@@ -129,7 +129,16 @@ def count_conditions(
 def _count_agreeing(
     photographs: Sequence[Any], axis: str, value: workbench.AxisValue
 ) -> tuple[int, int]:
-    """Count photographs under a condition: those that agree, and all."""
+    """Count photographs under a condition: those that agree, and all.
+
+    A photograph agrees if the model is right about it and about its rendering, or wrong
+    about both.
+
+    Args:
+        photographs: their rows.
+        axis: a parameter of the rendering.
+        value: which it has to have.
+    """
     agrees = []
     for photo in photographs:
         if axis in photo.values and _has_value(photo.values[axis]["value"], value):
@@ -155,8 +164,9 @@ def list_triggering_conditions(result: results.Result) -> list[str]:
 
 
 def evaluate_criterion(criterion: float, interval: results.Interval) -> str:
-    """Return whether an interval is above a criterion (met), below (not met) or
-    open.
+    """Return whether an interval is above a criterion, below it, or neither.
+
+    The words are "met", "not met" and "open".
     """
     lower, upper = interval
     if lower >= criterion:
@@ -326,9 +336,17 @@ def describe_exposure(
 def _weighted_mean(
     rows: Mapping[str, ConditionShare], weights: Mapping[str, float]
 ) -> tuple[float, float, float]:
-    """Return the weighted mean of fractions, and its lower and upper bound.
+    """Return the weighted mean of the rates of right predictions, with its bounds.
 
-    The bounds are those of intervals that hold jointly for all values (Bonferroni).
+    Each of the k rates has an interval of confidence 1 - 0.05 / k, so that all hold
+    together with 95 % (Bonferroni). The bounds of the mean are the means of theirs.
+
+    Args:
+        rows: counts of right predictions by the value of an axis.
+        weights: by value; they need not add up to 1.
+
+    Returns:
+        Mean, lower and upper bound.
     """
     total = sum(weights.values())
     confidence = 1.0 - 0.05 / len(weights)
@@ -414,7 +432,12 @@ def describe_domain(
 def _fixed_domain(
     result: results.Result, recorded: Sequence[RecordedSettings]
 ) -> dict[str, list[str]]:
-    """Return the fixed values of each part of an operational design domain."""
+    """Return what does not vary in a run, by the part of an operational design domain.
+
+    Args:
+        result: of the run.
+        recorded: the settings that it recorded, its own first.
+    """
     fixed = defaultdict[str, list[str]](list)
     environment = getattr(result, "environment", "") or join_values(
         recorded, "environment"
@@ -496,8 +519,9 @@ def collect_claims(result: results.Result) -> list[views.Claim]:
 
 
 def list_photograph_claims(photos: Any) -> list[views.Claim]:
-    """Return the claim of a table of agreement (`advsearch.photo_agreement`), if not
-    empty.
+    """Return the claim of a table of agreement; none if the table is empty.
+
+    The table is from `advsearch.photo_agreement`.
     """
     if not photos.photos or photos.interval is None:
         return []
@@ -611,6 +635,10 @@ def _describe_subject(
 
     An environment that a control varied is marked as such. What is not known is left
     out.
+
+    Args:
+        result: of the run.
+        recorded: the settings that it recorded, its own first.
     """
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())
@@ -873,7 +901,11 @@ def _format_start(folder: Path) -> str:
 
 
 def _compare_models(runs: Sequence[EvidenceRun]) -> list[str]:
-    """Warn if runs are of different models, by their names and their files' digests."""
+    """Warn if runs are of different models.
+
+    They are if the models' names differ, or the digests of their files, which runs note
+    by the name of the model or by what follows its "@".
+    """
     models = list[str]()
     digests = list[str]()
     for run in runs:
@@ -1065,9 +1097,7 @@ def _list_searched(
     result: results.Result,
     sweeps: Sequence[tuple[results.Result, Mapping[str, Any]]],
 ) -> list[str]:
-    """Describe what varied in the claims of a suite, or in the sweeps that were
-    read.
-    """
+    """Describe what varied in the claims of a suite, or in the sweeps that it read."""
     noted = read_noted_settings(folder, result)
     if noted is not None:
         return _searched_by_claims(noted.get(CLAIM_KIND))
@@ -1106,9 +1136,10 @@ def _describe_limits(
 
 
 def _searched_by_claims(claims: Mapping[str, Mapping[str, Any]] | None) -> list[str]:
-    """Describe what varied in the claims of a suite.
+    """Describe what varied in the claims of a suite: a line for each control and range.
 
-    `claims` are the settings of each, None if they cannot be read.
+    Args:
+        claims: the settings of each claim by its name; None if they cannot be read.
     """
     if claims is None:
         return ["as the claims of its suite say, which cannot be read any more"]

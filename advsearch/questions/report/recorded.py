@@ -192,8 +192,9 @@ def read_run_settings(folder: Path) -> Mapping[str, Any]:
 
 
 def find_read_sweeps(result: results.Result) -> list[Path]:
-    """Return the directories of the sweeps whose rows a result was made from, if they
-    exist.
+    """Return the directories of the sweeps that a result read its rows from.
+
+    Those that do not exist any more are left out.
     """
     return _find_runs(
         [

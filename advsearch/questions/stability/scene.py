@@ -62,8 +62,15 @@ def make_renderer(
 ) -> gradients.Renderer:
     """Return `render(u, seed, spp)` of a small image, as `Scene.renderer` does.
 
-    `plugins` are further shapes as Mitsuba's dictionaries. Differences are taken per
-    pixel, since the losses of the cases are smooth.
+    Differences are taken per pixel, since the losses of the cases are smooth.
+
+    Args:
+        controls: what varies.
+        thing: the object, its name, or what makes it.
+        environment: a plain one by default.
+        settings: of the scene.
+        plugins: further shapes, as Mitsuba's dictionaries by name.
+        denoise: the denoiser.
     """
     shape = thing() if callable(thing) else thing
     scene = workbench.load_scene(
@@ -84,9 +91,7 @@ def describe_mug() -> SceneDescription:
 
 
 def make_plain_environment() -> assets.EnvironmentAsset:
-    """Return a sky (16, 32, 3) brighter on one side and above, so that rotation
-    shows.
-    """
+    """Return a sky (16, 32, 3), brighter above and, to show rotations, on one side."""
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
     azimuthal = 0.6 * np.sin(columns * (2.0 * np.pi / 32.0))
     vertical = 0.8 * np.cos(rows * (np.pi / 16.0))
@@ -108,7 +113,12 @@ def make_gray_environment(
 def make_mesh(
     vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]
 ) -> assets.Mesh:
-    """Return a mesh with UVs from x and z, whose normals face +x."""
+    """Return a mesh with UVs from y and z, whose normals face +x.
+
+    Args:
+        vertices: points (x, y, z), about a plane of constant x.
+        faces: three indices of vertices each.
+    """
     points = np.asarray(vertices, np.float32)
     facing = np.tile([1.0, 0.0, 0.0], (len(points), 1))
     low = points.min(axis=0)
@@ -123,7 +133,7 @@ def make_mesh(
 
 
 def make_checkered_object(mesh: assets.Mesh) -> assets.ObjectAsset:
-    """Return an object with a checkered texture around a display-referred gray."""
+    """Return an object with a checkered texture (4, 4): 0.35 and 0.65, in sRGB."""
     checks = np.indices((4, 4)).sum(axis=0) % 2
     base = np.float32(0.5) + np.float32(0.3) * (checks - np.float32(0.5))
     texels = np.repeat(base[:, :, None], 3, axis=2).clip(0.0, 1.0).astype(np.float32)
@@ -140,8 +150,9 @@ def make_checkered_mug() -> assets.ObjectAsset:
 
 
 def make_dark_mug() -> assets.ObjectAsset:
-    """Return the mug in black: only its outline changes in the picture, with little
-    noise.
+    """Return the mug in black.
+
+    Only its outline changes in the picture, with little noise.
     """
     return paint_mug(np.full((4, 4), 0.02))
 
@@ -279,9 +290,16 @@ def _compare_images(
 def _check_gradient(
     rows: Sequence[results.Measured],
 ) -> tuple[list[Check], float | None]:
-    """Check the largest noise and the largest error; return the latter's bias too.
+    """Check the comparison of derivatives with differences: its noise and the errors.
 
-    Without derivatives there are no checks, and no bias.
+    There is a check of the derivative with the largest noise and one of that with the
+    largest error; without derivatives there is none.
+
+    Args:
+        rows: the compared derivatives.
+
+    Returns:
+        The checks, and the bias of the derivative with the largest error.
     """
     if not rows:
         return [], None
@@ -305,8 +323,16 @@ def search_scene(
 ) -> workbench.SearchResult:
     """Search from a configuration with the margin of a linear model of two classes.
 
-    Its logits are 0, and `LOGIT_SCALE` times the increase of the loss over the start,
-    minus 1.
+    One logit is 0, the other `LOGIT_SCALE` times the increase of the loss over the
+    start, minus 1. So the margin is -1 at the start, and above 0 once the loss has
+    increased by 1 / `LOGIT_SCALE`.
+
+    Args:
+        renderer: of the scene.
+        loss: of an image.
+        start: (d,) configuration.
+        spp: samples per pixel.
+        evaluations: with gradients, that the search makes.
     """
     loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
     gradient_cost = make_domain(renderer, start).gradient_cost
@@ -314,6 +340,7 @@ def search_scene(
     def margin(image: Tensor) -> Tensor:
         return LOGIT_SCALE * (loss(image) - loss_at_start) - 1.0
 
+    # counted in renders, of which a gradient takes several
     steps = evaluations * (1 + gradient_cost) + 1
     return run_search(
         renderer, margin, steps, spp=spp, start=start, candidates=1, repeats=1
@@ -339,8 +366,16 @@ def compare_gradient(
     seeds: tuple[int, int] = (3, 12),
     repeats: int = 24,
 ) -> list[results.Measured]:
-    """Compare the plan's gradient of a linear loss with common-random-number
-    differences.
+    """Compare the plan's gradient of a smooth linear loss with differences.
+
+    Differences are between renders with the same random numbers.
+
+    Args:
+        renderer: whose formation is linear meanwhile.
+        u: the configuration (d,).
+        spp: samples per pixel.
+        seeds: minimum and maximum number of seeds of the differences.
+        repeats: gradients that are compared.
     """
     formation = renderer.formation
     bench = gradients.Bench(
@@ -369,8 +404,8 @@ def measure_inward_slope(
 ) -> tuple[float, float]:
     """Return the derivative of the smooth linear loss along a direction inwards.
 
-    The direction moves values from the start into the range that increase the loss, if
-    `factor` is 1. Other values stay.
+    Values at the ends of their range can only move inwards. The direction moves those
+    that increase the loss this way by `factor` into the range, and leaves all others.
 
     Args:
         renderer: of the scene.
@@ -388,6 +423,7 @@ def measure_inward_slope(
     step = 0.04
     loss = gradients.make_smooth_loss(linear.formation.resolution)
     inwards = torch.where(u > 0.5, -1.0, 1.0)
+    # 0.5 - u points inwards.
     increases_loss = gradient * (0.5 - u) > 0.0
     direction = inwards * increases_loss * factor
     slopes = []
@@ -396,6 +432,7 @@ def measure_inward_slope(
             float(loss(render_image(linear, u + count * step * direction, seed, spp)))
             for count in range(3)
         )
+        # one-sided difference of second order, from values at 0, 1 and 2 steps
         slopes.append((4.0 * at_1 - 3.0 * at_0 - at_2) / (2.0 * step))
     return float(gradient @ direction), math.fsum(slopes) / seeds
 
@@ -466,8 +503,9 @@ def run_search(
 def make_domain(
     renderer: gradients.Renderer, start: Tensor | None = None
 ) -> policies.Domain:
-    """Return the domain of a search from a configuration, by default the renderer's
-    start.
+    """Return the domain of a search.
+
+    It starts from a configuration, by default that of the renderer.
     """
     space: Any = renderer.space  # of controls, since `make_renderer` made it
     start = renderer.start if start is None else start

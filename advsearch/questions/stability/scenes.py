@@ -247,7 +247,7 @@ register_cases(
 
 
 def make_glass_ball() -> dict[str, dict[str, object]]:
-    """Return a ball of clear glass before the mug, as Mitsuba's dictionary by name."""
+    """Return a glass ball between camera and mug, as Mitsuba's dictionary by name."""
     camera = geometry.camera_to_world(describe_mug())[:3, 3]
     center = [float(value) for value in camera * 0.6 + np.array([0.0, 0.0, 0.2])]
     material = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
@@ -506,7 +506,11 @@ def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
 
 
 def _format_box(points: np.ndarray) -> list[str]:
-    """Return the lines of an OBJ file with a box of these corners (8, 3)."""
+    """Return the lines of an OBJ file with a box.
+
+    Args:
+        points: (8, 3) its corners, z fastest, then y.
+    """
     quads = [
         [0, 4, 6, 2],
         [1, 3, 7, 5],
@@ -517,6 +521,7 @@ def _format_box(points: np.ndarray) -> list[str]:
     ]
     lines = [f"v {x:.12g} {y:.12g} {z:.12g}" for x, y, z in points]
     for a, b, c, d in quads:
+        # two triangles of each quad; OBJ counts corners from 1
         for face in ((a, b, c), (a, c, d)):
             lines.append("f " + " ".join(str(1 + corner) for corner in face))
     return lines
@@ -765,8 +770,7 @@ for control, name in (
 
 
 def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
-    """Run cases of the suite in order, until all are done, the time is over, or an
-    interrupt.
+    """Run cases of the suite in order, until the end, the time is over, or Ctrl-C.
 
     The result of a case is stored at once: a resumed run continues with the next.
     """
@@ -837,13 +841,16 @@ def estimate_hessian(
     directions: Tensor,
     steps: Sequence[float],
 ) -> Tensor:
-    """Estimate second derivatives (k, k), float64, of an objective by differences.
+    """Estimate second derivatives (k, k), float64, of an objective f by differences.
+
+    They are central, of steps h: (f(+) - 2 f + f(-)) / h^2 on the diagonal, and (f(++)
+    - f(+-) - f(-+) + f(--)) / (4 h_i h_j) elsewhere.
 
     Args:
-        value: the objective.
-        u: the configuration (d,).
-        directions: directions (k, d).
-        steps: half-width of the differences along each direction.
+        value: the objective f.
+        u: the configuration (d,) at which they are taken.
+        directions: directions (k, d) along which they are taken.
+        steps: (k,) how far u moves along each direction, to either side.
     """
     moves = [
         step * direction for step, direction in zip(steps, directions, strict=True)
@@ -885,6 +892,7 @@ def wide_range() -> Outcome:
             float(renderer.gradient(loss, renderer.start, seed, 32)[1][0])
             for seed in range(6)
         ]
+        # from u, which is 1 over the whole range, to object sizes
         slopes.append(statistics.fmean(derivatives) / width)
     error = abs(slopes[0] / slopes[1] - 1.0)
     error_check = check_range(
@@ -907,11 +915,12 @@ def light_rotation_texel() -> Outcome:
     }
     renderer = make_renderer(controls)
     u = renderer.start.clone()
+    # power and rotation
     u[0] = 0.5
     u[1] = 0.1
-    second = _estimate_three_curvatures(renderer, u)
+    hessian = _estimate_three_curvatures(renderer, u)
     # from the unit box to watts, degrees and sRGB
-    units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
+    from_unit_box = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
     path, _ = _record_path(renderer, u, 1.0)
     scaled_path, ending = _record_path(renderer, u, RATIO)
     distances = (path - path[0]).abs().amax(dim=0)
@@ -925,16 +934,19 @@ def light_rotation_texel() -> Outcome:
         ),
         ending=ending,
         measured={
-            "condition number in u": condition_number(second),
+            "condition number in u": condition_number(hessian),
             "condition number in watts, degrees and sRGB": condition_number(
-                units @ second @ units
+                from_unit_box @ hessian @ from_unit_box
             ),
         },
     )
 
 
 def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tensor:
-    """Return second derivatives (3, 3) by power, rotation, and all texels at once."""
+    """Return second derivatives (3, 3) by power, rotation, and all texels at once.
+
+    The configuration is power, rotation, and texels, in this order.
+    """
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     directions = torch.zeros(3, len(u))
     directions[0, 0] = 1.0

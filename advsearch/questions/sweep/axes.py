@@ -126,7 +126,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     """Parse one axis; see `parse_axes`.
 
     Args:
-        name: of the parameter.
+        name: of the parameter, as the user wrote it.
         values: of it.
         instances: the sampled controls by name.
     """
@@ -369,6 +369,7 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
             "repeat; write "
             f"{first:g}:{first + FULL_TURN:g}:{count}"
         )
+    # After a full turn the last value would be the first one again: it is left out.
     is_full_turn = is_angle and last - first == FULL_TURN
     values = np.linspace(first, last, count, endpoint=not is_full_turn)
     return [float(value) for value in values]
@@ -478,8 +479,9 @@ class SampledNumber:
 def choose_n_parts(n_images: int) -> int:
     """Return into how many parts tables and figures cut the range of a parameter.
 
-    As many as leave the map over two parameters `MIN_CELL_DRAWS` draws a cell, but
-    between `MIN_RANGE_PARTS` and `MAX_RANGE_PARTS`.
+    It is the largest number for which a map over two parameters, with that many parts
+    each, has `MIN_CELL_DRAWS` draws in a cell on average; but between `MIN_RANGE_PARTS`
+    and `MAX_RANGE_PARTS`.
 
     Args:
         n_images: images of the full sweep.
@@ -561,11 +563,15 @@ class Points:
         self._lower = domain.lower.numpy()
         self._upper = domain.upper.numpy()
         self._axes = {axis.name: (index, axis) for index, axis in enumerate(axes)}
+        # `_assign_blocks` fills these lists. Blocks of few numbers share the sequence
+        # of the sampler; large ones have random draws, since Sobol numbers are for few.
         self._grid_coordinates: list[_GridCoordinate] = []
         self._small_blocks: list[_SampledBlock] = []
         self._large_blocks: list[_SampledBlock] = []
         self.sampled_numbers = tuple(self._assign_blocks(domain))
         self._columns = [number.column for number in self.sampled_numbers]
+        # Each number cuts [0, 1] into equal shares, one or several for each of its
+        # parts.
         n_shares = [
             len(number.part_of_share or number.parts) for number in self.sampled_numbers
         ]
@@ -578,7 +584,8 @@ class Points:
             large_dimensions, "random", seed, "large draws"
         )
         self.is_sampled = small_dimensions + large_dimensions > 0
-        # Samples are draws, or differ in noise alone if nothing is sampled.
+        # If nothing is sampled, the samples of a grid point are repeats of one draw,
+        # each with its own noise.
         n_draws = samples if self.is_sampled else 1
         time_axis = next(
             (index for index, axis in enumerate(axes) if axis.is_time), None
@@ -598,10 +605,15 @@ class Points:
         self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
 
     def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
-        """Assign each block to the grid, or to columns of the draws.
+        """Fill the lists of grid coordinates and sampled blocks from the blocks.
 
-        Yields the sampled numbers that tables show: those of short blocks, of controls
-        that know their ranges. Large blocks have a sequence of draws of their own.
+        A block is the coordinates of one parameter. If an axis of the grid has the
+        parameter, its values come from there, else from columns of the draws: a column
+        for each coordinate, and in a ball one more for the length.
+
+        Yields:
+            The sampled numbers that tables show: those of short blocks, of controls
+            that know their ranges.
         """
         controls = {control.name: control for control in self.space.controls}
         for group, (block, coordinates) in zip(
@@ -750,8 +762,8 @@ class Points:
         """Return coordinates inside the budget of a block from uniform numbers.
 
         They are uniform in the box, or in the ball around the start (Muller 1959): a
-        direction from k normal numbers, and a length. A choice has the center of the
-        part of [0, 1] that its option has.
+        direction from k normal numbers, and a length. An option of a choice stands for
+        an equal part of [0, 1]; its coordinate is the center of that part.
 
         Args:
             sampled: the block, of k coordinates.
@@ -769,8 +781,9 @@ class Points:
             lower = self._lower[sampled.coordinates].astype(np.float64)
             upper = self._upper[sampled.coordinates].astype(np.float64)
             return np.asarray(lower + (upper - lower) * uniform)
-        # 0 and 1 would be infinite.
+        # Normal numbers, by the inverse distribution; 0 and 1 would be infinite.
         direction = ndtri(np.clip(uniform[:, :-1], 1e-12, 1.0 - 1e-12))
+        # The volume within a length r grows as r^k: r is the root of a uniform number.
         length = block.epsilon * uniform[:, -1:] ** (1.0 / block.size)
         # not divided by 0, where all numbers are 0.5
         norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
@@ -864,7 +877,8 @@ class Points:
     ) -> Iterator[tuple[str, str, list[Any]]]:
         """Yield name, unit and values (n,) of each parameter of a control.
 
-        The same as `describe` of each configuration, sixty times as fast.
+        The values are those of `describe` of each configuration, sixty times as fast,
+        since all n configurations are converted at once.
 
         Args:
             control: which describes itself as `Control` does.

@@ -213,7 +213,11 @@ def _check_can_use_workers(
     loaded: Sequence[Any],
     set_options: Mapping[str, Any],
 ) -> None:
-    """Raise an error if workers are requested for objects that they cannot load."""
+    """Raise an error if workers are requested for objects that they cannot load.
+
+    Workers are other processes. They load everything by its name, and do not have the
+    objects of this session.
+    """
     are_named = all(isinstance(network, (str, Path)) for network in networks)
     has_objects = bool(loaded) or bool(loading.list_session_only_controls(controls))
     if has_objects or not are_named or isinstance(task, FunctionTask):
@@ -376,8 +380,8 @@ def _run_config(
 
     Args:
         config: the settings.
-        scenes: those that are loaded; none loads the ones that the settings name.
-        models: as the caller passed them, and so on.
+        scenes: those that are loaded; empty to load the ones that the settings name.
+        models: as the caller passed them; so are all others.
     """
     resumed = _find_resumable(config)
     if config.run is not None and resumed is None:
@@ -386,6 +390,7 @@ def _run_config(
     if config.run is not None and resumed is None:
         context = create_before_work(config)
     if config.twins is not None:
+        # a check before the work: raises an error if it cannot be read
         read_twins(config.twins)
     with context as directory:
         named_scenes = scenes or load_scenes(config)
@@ -435,6 +440,7 @@ def sweep_from_config(
     """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
+    # a check before the work: raises an error if the run of twins cannot be read
     if config.twins is not None:
         read_twins(config.twins)
     progress = progress or NullProgress()
@@ -667,8 +673,12 @@ def _find_scene_notes(
 def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
     """Load the scenes of a configuration: every object in every environment.
 
-    They come by object, then by environment. Without an `environment`, each object has
-    that of its own scene. A scene that a Python caller passed is returned as it is.
+    They are sorted by object, then by environment. Without an `environment`, each
+    object has that of its own scene. A scene that a Python caller passed is the only
+    one.
+
+    Args:
+        config: settings of the sweep.
     """
     passed: Scene | None = config.python_object(naming.SCENE, config.object)
     if passed is not None:
@@ -686,6 +696,7 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
             for name, scene in scenes.items()
         )
     first_scene = scenes[objects[0]].description
+    # Environments are loaded once, with the first object, and given to all others.
     maps = {first_environment: first_scene.environment}
     for name in environments[1:]:
         scene = load_scene(first_scene.object, name)

@@ -164,9 +164,7 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
 
 
 def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
-    """Draw the accuracy at each value of an axis, with intervals, on matplotlib
-    axes.
-    """
+    """Draw the accuracy at each value of an axis, with intervals."""
     values = [row.value for row in rows]
     # A single draw has no interval.
     intervals = [
@@ -740,6 +738,7 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     for name, value, unit, remark in rates:
         if value is None:
             continue
+        # fractions are shown in percent
         factor = 100.0 if unit == " %" else 1.0
         interval = "-"
         if value.interval:
@@ -858,6 +857,9 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
 def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     """Compute the distance at which an object is first detected.
 
+    A line that falls with the distance is fitted to the fraction of right images; the
+    estimate is where it crosses one half. Binomial tests give its bounds.
+
     Args:
         rows: counts by a distance, or by the bounds of a range of it.
 
@@ -877,7 +879,8 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     significance = 0.025 / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
-    # The line is fitted beyond the last dip that is not chance.
+    # The index of the nearest distance beyond the last dip that is not chance: nearer
+    # ones contradict a falling line.
     first = max(
         (distances.index(dip.distance) + 1 for dip in dips if dip.is_significant),
         default=0,
@@ -935,11 +938,11 @@ def _bound_distance(
 def _find_crossing(
     distance: NDArray[np.float64], falling: NDArray[np.float64]
 ) -> float | None:
-    """Return where a falling line crosses one half; None if it does not.
+    """Return the distance where a falling line crosses one half; None if it does not.
 
     Args:
         distance: (m,) ascending; the line is linear in its logarithm.
-        falling: (m,) the line.
+        falling: (m,) the line, the fraction of right images at each distance.
     """
     if not falling[0] >= HALF > falling[-1]:
         return None
@@ -1020,11 +1023,18 @@ def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
 
 
 def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
-    """Return where an object is detected less often than beyond.
+    """Return a sentence about dips: distances with fewer detections than beyond.
 
-    These are all dips that are not chance. Without any, it is the least likely of those
-    that contradict the estimate: fewer than half of the images are right at a distance
-    nearer than the estimate, or below the rise beyond it.
+    It has all of these dips that are not chance. If all may be chance, it has the least
+    likely one that contradicts the estimate, if any: a dip with fewer than half of the
+    images right, nearer than the estimated distance or before a rise to at least half.
+
+    Args:
+        estimate: of the detection distance.
+        unit: of distances.
+
+    Returns:
+        One sentence, or nothing.
     """
     significant = [dip for dip in estimate.dips if dip.is_significant]
     if significant:

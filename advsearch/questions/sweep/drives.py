@@ -57,10 +57,10 @@ def add_frames(
 ) -> tuple[tuple[Control, ...], dict[str, object]]:
     """Return the controls and the grid of a sweep over the frames of a path.
 
-    A control that travels along the path is added if there is none, and the times of
-    the frames become the last axis of the grid, unless it has them already: from 0 to
-    the end of the path, `fps` a second, at least two. Of several paths that nothing
-    chooses among, all are swept if nothing is sampled.
+    A control that travels along the path is added if there is none. The times of the
+    frames become the last axis of the grid, unless it has them already: from 0 to the
+    end of the path, `fps` a second, at least two. If there are several paths, nothing
+    chooses among them and nothing is sampled, then all are swept.
 
     Args:
         config: with a `path`.
@@ -171,7 +171,8 @@ class Drives:
     """
 
     _units = Units()
-    # from the plan: bounds that the sample has are none of what it is drawn from
+    # Bounds come from the plan. Those of the sampled distances would not bound the
+    # others that could have been drawn.
     _distance_bounds: tuple[float, float] | None = None
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
@@ -181,6 +182,7 @@ class Drives:
         axis = job.axes[axis_index]
         self._units = next(iter(job.load_points(0).values())).units
         self._distance_bounds = compute_distance_bounds(job, axis)
+        # The number of a row is its index in the flat array of this shape.
         shape = (
             len(job.scenes),
             *(len(axis.values) for axis in job.axes),
@@ -188,6 +190,7 @@ class Drives:
             len(job.models),
         )
         flags: Flags = np.full(shape, UNKNOWN, np.int8)
+        # The models of an image have the same distance.
         distance = np.full(shape[:-1], np.nan)
         self._path_of_step: dict[int, str] = {}
         self._frame_of_step: dict[int, DetectedFrame] = {}
@@ -199,7 +202,8 @@ class Drives:
         self.times = times[order]
         self.seconds = float(self.times[-1] - self.times[0])
         steps = np.arange(flags.size).reshape(shape)
-        # The frames become the last axis, in the order of their times.
+        # The frames become the last axis, in the order of their times. The arrays begin
+        # with the axis of the scenes, so that axes of the grid are one further back.
         self._flags = np.moveaxis(flags, axis_index + 1, -1)[..., order]
         self._steps = np.moveaxis(steps, axis_index + 1, -1)[..., order]
         self._distance = np.moveaxis(distance, axis_index + 1, -1)[..., order]
@@ -211,14 +215,17 @@ class Drives:
         flags: Flags,
         distance: npt.NDArray[np.float64],
     ) -> None:
-        """Read what the rows state of each frame.
+        """Fill the arrays of right predictions and of distances from rows.
+
+        Boxes, the name of the path and the unit of distances are kept, too.
 
         Args:
             rows: of the sweep.
             instance: name of the control that travels.
             flags: (scenes, ..., models), which is filled; a row's number is its index
                 in the flat array.
-            distance: (scenes, ...), which is filled; likewise with an image's number.
+            distance: (scenes, ...), which is filled; the number of an image, which is
+                that of its rows divided by the models, is its index in the flat array.
         """
         job = self._job
         right_names = self._find_right_names()
@@ -285,7 +292,14 @@ class Drives:
     def _compute_rates(
         self, drives: _CompleteDrives, model: int, answer: str
     ) -> DriveRates:
-        """Compute the rates of one model over drives; `answer` may be empty."""
+        """Compute the rates of one model over drives.
+
+        Args:
+            drives: those with all their frames.
+            model: its index.
+            answer: which scene they have, clean or adversarial, by its name; empty if
+                the sweep has no adversarial one.
+        """
         n_frames = len(self.times)
         first_distance = _first_right_distance(drives)
         drive_records = self._describe_drives(drives, first_distance)
@@ -296,6 +310,8 @@ class Drives:
         drive = np.asarray(self._units.find_draw(first_images))
         n_drives = len(np.unique(drive))
         n_right_drives = len(np.unique(drive[has_right]))
+        # bounds of the values, from the plan: every frame wrong, a change at every
+        # frame
         max_gap = n_frames * self._frame_interval
         max_flicker = (n_frames - 1) / self.seconds
         return DriveRates(
@@ -386,13 +402,14 @@ class Drives:
     ) -> TrackRates | None:
         """Compute what a tracker makes of the boxes of drives.
 
-        A frame that is lost has no track on the object; it is loose if a track would be
-        on it with less overlap.
+        A frame is lost if the object is visible and no track is on it. A lost frame is
+        loose if a track would be on it with less overlap.
 
         Args:
             model: its index.
             steps: (n, frames) numbers of the rows.
-            drive: (n,) the draw of each drive.
+            drive: (n,) the draw of each drive; drives of one draw differ in noise
+                alone.
 
         Returns:
             The rates; None unless the model detects and every frame has its boxes.
@@ -416,6 +433,7 @@ class Drives:
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
             lost=summarize_drives(lost, max, drive_of_value=drive),
+            # lost, but not if less overlap is enough
             loose=summarize_drives(lost - lost_loosely, max, drive_of_value=drive),
             switches=summarize_drives(switches, max, (0.0, n_frames - 1.0), drive),
             longest_gap=summarize_drives(
@@ -454,7 +472,10 @@ class Drives:
 def _compute_lost_loosely(
     task: Detection, tracker: Tracker, frames: Sequence[Sequence[DetectedFrame]]
 ) -> npt.NDArray[np.float64]:
-    """Compute the fraction (n,) of lost frames if tracks may overlap the object less.
+    """Compute for each drive the fraction (n,) of frames that are lost even loosely.
+
+    For that a track needs to overlap the object by `MIN_OVERLAP` only, if that is less
+    than the `iou` of the task.
 
     Args:
         task: of the model; a track is on the object from its `iou` on.
@@ -469,7 +490,8 @@ def _compute_lost_loosely(
 
 
 def find_longest_run(flags: npt.NDArray[np.bool_]) -> int:
-    """Return the length of the longest run of true flags (n,)."""
+    """Return the length of the longest run of true flags (n,); 0 if none is true."""
+    # 0 at both ends: a run may begin with the first flag or end with the last.
     changes = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     bounds = np.flatnonzero(changes)  # begin and end of each run, alternating
     return int((bounds[1::2] - bounds[::2]).max(initial=0))
@@ -505,11 +527,11 @@ def summarize_drives(
     There is no interval if the bounds are not known, or for a single drive.
 
     Args:
-        values: (n,).
+        values: (n,) one for each time that a drive was evaluated.
         worst: selects the worst of them: `min` or `max`.
         bounds: bounds of the values whatever a model predicts, from the plan.
-        drive_of_value: (n,) the drive of each value; values of one differ in noise
-            alone, so that their mean is the drive's. None: each has a drive of its own.
+        drive_of_value: (n,) the drive of each value. Values of one drive differ in
+            noise alone, and are averaged first. None: each has a drive of its own.
     """
     means = values
     if drive_of_value is not None:

@@ -166,6 +166,9 @@ class Job:
     def make_queries(self, numbers: range) -> list[WorkItem]:
         """Return the queries of all models about images of one scene.
 
+        The number of a query is that of its image, times the models, plus the index of
+        its model.
+
         Args:
             numbers: of the images in the sweep.
 
@@ -231,7 +234,9 @@ class Job:
         environment: str | None,
         values: Mapping[str, Value],
     ) -> dict[str, Value]:
-        """Return the stored values of a row.
+        """Return the stored values of a row: names of scene and model, and parameters.
+
+        Parameters of the controls that the scene itself fixes are left out.
 
         Args:
             scene: its index.
@@ -240,7 +245,7 @@ class Job:
             values: of the controls.
         """
         named_scene = self.scenes[scene]
-        held_names = {control.name for control in named_scene.fixed_controls}
+        fixed_names = {control.name for control in named_scene.fixed_controls}
         names = named_scene.names
         if environment is not None:
             names["environment"] = environment
@@ -250,7 +255,7 @@ class Job:
         }
         for name, value in values.items():
             control_name = name.partition(".")[0]
-            if control_name not in held_names:
+            if control_name not in fixed_names:
                 row_values[name] = value
         return row_values
 
@@ -336,11 +341,11 @@ def check_scenes(
     controls: Sequence[Control],
     axes: Sequence[Axis],
 ) -> None:
-    """Check that nothing that the scenes fix is varied too.
+    """Check that nothing varies that is fixed or chosen elsewhere.
 
     Raises:
         InputError: an axis varies what `set` fixes, or an axis or a control chooses the
-            environment beside several environments.
+            environment although several environments are named.
     """
     fixed_settings = {
         name
@@ -459,7 +464,7 @@ class SweptScene:
         self.number = number
         self.job = job
         self.points = job.load_points(number)
-        # render the scene without its object
+        # renderers of the scene without its object, by size, made on demand
         self._empty_renderers: dict[ImageSize, Renderer] = {}
         self.renderers = {size: self._make_renderer(size) for size in self.points}
         make_scene_facts = partial(
@@ -488,6 +493,7 @@ class SweptScene:
         light_seed = seeds.stream(config.seed, "sweep light", number)
         self.predictors = dict[ImageSize, SweepPredictor]()
         for size, points in self.points.items():
+            # Models of one size share their images, and so the predictor of these.
             first_model_of_size = job.image_sizes.index(size)
             self.predictors[size] = SweepPredictor(
                 problem=self.problems[first_model_of_size],
@@ -550,8 +556,8 @@ class SweptScene:
     ) -> list[Evaluation]:
         """Return the evaluation of each query.
 
-        That of the first model has the images that are stored. What an image costs
-        counts for the first model that gets it.
+        The first model's evaluation carries the images that are stored. Models of one
+        size share an image; its cost counts for the first of them.
 
         Args:
             queries: of this scene.
@@ -583,6 +589,9 @@ class SweptScene:
         images: Mapping[ImageSize, Mapping[int, SweptImage]],
     ) -> dict[int, Judgement]:
         """Return the judgements of all queries by their numbers.
+
+        The number of a query is that of its image, times the models, plus the index of
+        its model.
 
         Args:
             queries: of all models.
@@ -692,8 +701,8 @@ class SweptScene:
     def _render_empty(self, size: ImageSize, queries: Sequence[Query]) -> Tensor:
         """Render the scene without its object, with the noise of each query.
 
-        A renderer of its own does it: a scene in which something was far away has other
-        last bits.
+        It has a renderer of its own: after an object was hidden, a renderer gives
+        images that differ in their last bits from those before.
         """
         if size not in self._empty_renderers:
             self._empty_renderers[size] = self._make_renderer(size)
@@ -719,9 +728,14 @@ class SweptScene:
     def _make_images(
         self, size: ImageSize, queries: Sequence[Query]
     ) -> dict[int, SweptImage]:
-        """Return the images of one size, rounded to 8 bits, by their numbers."""
+        """Return the images of one size, rounded to 8 bits, by number in the sweep.
+
+        The number of a query is that of its image, times the models, plus the index of
+        its model.
+        """
         n_models = len(self.job.models)
         images_before = self.number * self.points[size].count
+        # The predictor numbers the images of this scene from 0.
         query_of_image = {
             query.number // n_models - images_before: query
             for query in queries
@@ -799,9 +813,9 @@ def verify_worst(
 ) -> WorstVerified | None:
     """Render the worst configuration again, and count wrong predictions.
 
-    The samples per pixel are chosen first; they have converged if the ladder has one
-    step, or if more samples leave the margin's sign. Renders that the run has stored
-    already are not made again.
+    The samples per pixel are chosen first, on a ladder: up to the count from which on
+    more samples leave the sign of the margin. Then they have converged, as they have if
+    the ladder has one step only. Renders that the run has stored are not made again.
 
     Args:
         problem: of its scene and model.

@@ -146,7 +146,7 @@ class Sweep:
             self._executor = executor
         self.journal = Journal(run, ParallelEvaluator(None, executor))
         self._n_rendered = 0  # images made now, by this process or its workers
-        # of the full sweep, as its rows state them: also those of a run before
+        # Counts of the full sweep, from its rows: also of those made before a resume.
         self._n_traced = 0  # images that were rendered, with those of predictors
         self._n_predicted = 0  # images that were predicted from rendered ones
         self._n_lost = 0  # rows whose worker died
@@ -221,7 +221,12 @@ class Sweep:
     def _evaluate_rows(
         self, missing: Sequence[range], predictions: Predictions
     ) -> None:
-        """Evaluate rows in batches; store and count what is predicted."""
+        """Evaluate rows in batches; store and count what is predicted.
+
+        Args:
+            missing: numbers of the rows that are not stored yet.
+            predictions: which gets the judgement of each.
+        """
         title = "rendering and classifying"
         self.stages.begin("sweep", title, self.n_rows, hint=self._sweep_hint())
         self.stages.progress.advance(self.n_rows - sum(map(len, missing)))
@@ -240,6 +245,7 @@ class Sweep:
             evaluated = list(zip(queries, evaluations, strict=True))
             self._save_images(evaluated)
             self._add_costs(self.journal.store(evaluated, id_is_number=True))
+            # Models of one size share an image, which counts for the first of them.
             self._n_rendered += sum(
                 self.job.is_first_of_size[query.number % self.n_models]
                 for query in queries
@@ -257,8 +263,8 @@ class Sweep:
     def _sweep_hint(self) -> str:
         """Return what the progress says of the work ahead.
 
-        That is the number of predictions, and about how large stored thumbnails are:
-        as a typical one, scaled by the pixels that they have.
+        That is the number of predictions, and how large the stored thumbnails are,
+        about: the size of a typical one, scaled by the pixels that they have.
         """
         hint = (
             f"{self.n_rows} predictions, pictures of "
@@ -305,11 +311,11 @@ class Sweep:
         """Yield the queries of missing rows in batches, none over two scenes.
 
         A batch begins at a multiple of its size in the scene, whatever is missing, so
-        that its evaluations don't depend on where a sweep was stopped. Of an image
-        that has some of its rows, only the missing ones are yielded.
+        that its evaluations don't depend on where a sweep was stopped. If only some
+        rows of an image are missing, only these are yielded.
 
         Args:
-            missing: ranges of row numbers.
+            missing: ranges of row numbers; a row is an image and a model.
         """
         batch_size = self.job.config.batch
         for rows in missing:
@@ -331,6 +337,7 @@ class Sweep:
                         for problem_name, u, query in items
                         if query.number in rows
                     ]
+                # the first image of the next scene
                 image = scene_begin + self.images_per_scene
 
     def _report(self, n_rows: int, predictions: Predictions) -> None:
@@ -387,6 +394,9 @@ class Sweep:
 
     def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[TableAxis]:
         """Return what tables are by: all axes with several values.
+
+        These are object, environment and adversarial scene, the model, the axes of the
+        grid, and the parts of sampled numbers.
 
         Args:
             rows: (n,) numbers of the rows, ascending, whose values are looked up.
@@ -465,7 +475,8 @@ class Sweep:
     ) -> WorstConfiguration | None:
         """Return the configuration with the smallest margin; None if there is none.
 
-        Its values, seed and right names are those of the query, which is made again.
+        Its row has the margin; values, seed and right labels come from the query, which
+        is made again.
 
         Args:
             predictions: of all rows.
@@ -549,13 +560,20 @@ class Sweep:
     def _summarize(
         self, predictions: Predictions, ending: str, worst: WorstConfiguration | None
     ) -> SweepSummary:
-        """Return what `summary.json` holds."""
+        """Return what `summary.json` holds.
+
+        Args:
+            predictions: of all rows so far.
+            ending: how the sweep ended.
+            worst: the configuration with the smallest margin; None without one.
+        """
         job = self.job
         config = job.config
         path = None if self.run is None else self.run.path
         seconds = self.stages.seconds
         verified = worst.verified if worst else None
         formation, gains = self._describe_formation()
+        # Rates are of these rows, and their intervals of the units that they belong to.
         rows = np.flatnonzero(predictions.is_counted)
         right = predictions.is_right[rows]
         units = self.units.find_unit(rows)
@@ -668,10 +686,11 @@ class Sweep:
         return self._n_rendered / sweep_seconds
 
     def _compute_change_rates(self) -> list[ChangeRates]:
-        """Return how often predictions of changed images are as claimed.
+        """Return how often the predictions about changed images are as claimed.
 
-        There are rates for each claim, change and model. Their `row` is the first in
-        which the prediction is not as claimed. Rows without the object do not count.
+        The rows have that as a metric, 1 where the prediction is as claimed. There is a
+        rate for each claim, change and model; its `row` is the first row in which the
+        prediction is not as claimed. Rows without the object do not count.
         """
         rates = list[ChangeRates]()
         for claim, change in self.job.config.claims:

@@ -98,6 +98,8 @@ class Groups:
         self.samples = samples
         # Samples are like one more axis, the fastest.
         self._all_axes = ProductIndex((*grid.sizes, samples))
+        # An image with other draws is of another group. Along an axis the draws change,
+        # except from one frame of a drive to the next.
         axis_is_within = [
             may_differ and (is_sampled or axis == frames)
             for axis, may_differ in enumerate(within)
@@ -111,15 +113,18 @@ class Groups:
         self.n_groups = self._between.count
         self.n_cached_groups = 1
         if True in self._is_within:
-            # Groups that differ in axes slower than all of those within come one after
-            # the other; those that differ in faster ones alternate.
+            # Images come in order, the last axis fastest. If an axis after the first
+            # one within lies between groups, groups along it alternate: all are cached.
             first_within = self._is_within.index(True)
             for axis in range(first_within, len(self._is_within)):
                 if not self._is_within[axis]:
                     self.n_cached_groups *= self._all_axes.sizes[axis]
 
     def _select(self, values: Sequence[int], *, is_within: bool) -> list[int]:
-        """Return the values of the axes within groups, or of those between."""
+        """Select the values that belong to axes within groups, or to those between.
+
+        `values` has one for each axis, that of the samples last.
+        """
         return [
             value
             for value, within in zip(values, self._is_within, strict=True)
@@ -132,11 +137,14 @@ class Groups:
         return self._between.index(self._select(digits, is_within=False))
 
     def find_member(self, number: int, index: int) -> int:
-        """Return the number of another image of the group of an image.
+        """Return the number of a member of the group that an image belongs to.
+
+        Both have the same index along every axis between groups; along the axes within,
+        the member has what its index in the group says.
 
         Args:
             number: of the image.
-            index: index of the other one in the group.
+            index: of the member in the group, in [0, group_size).
         """
         member_digits = list(self._all_axes.digits(number))
         within_axes = [
@@ -265,6 +273,7 @@ class LightOnSurfaces:
         self._seed = seeds.stream(seed, "surface light")
         self._arrangements: list[SurfaceRenderer] = []
         self._max_arrangements = 0
+        # which inputs of the scene change with each group of coordinates
         self._changed_inputs = {
             group.name: find_changed_inputs(renderer, [group.name])
             for group in renderer.space.groups
@@ -287,13 +296,17 @@ class LightOnSurfaces:
     def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
         """Return why images are rendered; None if they are predicted.
 
-        Also sets how many arrangements are cached.
+        They are predicted if enough images share their light, the scene has nothing
+        that light on surfaces cannot do, and arrangements and light fit into memory. As
+        a side effect this sets how many arrangements are cached.
 
         Args:
             make_groups: makes the groups.
             spp: samples per pixel of the images.
         """
         groups = make_groups(self.follows)
+        # An arrangement serves all images between which neither object nor surroundings
+        # move: those of several groups, each with light of its own.
         arrangement_groups = make_groups(
             self._find_groups_changing_only(FREE_INPUTS - {COLOR_INPUT})
         )
@@ -406,10 +419,10 @@ class SweepPredictor:
         self._groups = self._make_groups(self.method.follows)
 
     def _choose_method(self) -> tuple[BasisPictures | LightOnSurfaces, Refusal | None]:
-        """Return the cheapest method that pays here, without a refusal.
+        """Return the cheapest method that pays here, and None.
 
-        If none does, return the first that could follow something that varies, and why
-        it is not used.
+        If none does, return a method that is not used, and why: the first that could
+        follow something that varies, else the last.
         """
         refused: list[tuple[BasisPictures | LightOnSurfaces, Refusal]] = []
         for method_type in (BasisPictures, LightOnSurfaces):  # cheapest first
@@ -450,7 +463,8 @@ class SweepPredictor:
     def make_images(self, query_of_image: Mapping[int, Query]) -> dict[int, SweptImage]:
         """Render or predict images.
 
-        A predictor makes all images of its group at once.
+        Images of the same predictor are collected first, and then predicted all at
+        once.
 
         Args:
             query_of_image: the queries by the number of the image in the scene.
@@ -481,9 +495,9 @@ class SweepPredictor:
         return images
 
     def _count_traced(self, number: int) -> int:
-        """Return the images that were traced for the group of its first image.
+        """Return the images that were traced for the predictor of an image's group.
 
-        Of the other images of the group it is 0.
+        They count for the first image of the group; for all others this is 0.
         """
         if number != self._groups.find_member(number, 0):
             return 0
@@ -492,9 +506,10 @@ class SweepPredictor:
     def _load_predictor(self, group: int, number: int) -> Predictor | None:
         """Return the predictor of a group; None if its images are rendered.
 
-        It is made by the group alone, so that a sweep that was stopped goes on with the
-        same. A new one is compared with traced images first, and not used where it
-        deviates too much; for it the oldest that is cached is released.
+        A new one is compared with traced images first, and not used where it deviates
+        too much. It depends on the index of its group alone, not on the image that asks
+        for it, so that a sweep that was stopped continues with the same predictors. If
+        too many are cached, the oldest is released.
 
         Args:
             group: its index.
@@ -597,7 +612,7 @@ class SweepPredictor:
 def combine_transport(
     all_summaries: Sequence[LinearTransport | None],
 ) -> LinearTransport | None:
-    """Combine what predicted the images of several scenes.
+    """Combine the summaries of the predicted images of several scenes.
 
     Args:
         all_summaries: of each scene; None where nothing moves.

@@ -146,6 +146,7 @@ class Predictions:
         self.is_known: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.is_right: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.is_hidden: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        # apart from `is_right`: a prediction that is not a number is neither
         self._wrong: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.margin = np.full(n_rows, np.nan)
         self.outcome = np.full(n_rows, UNKNOWN_OUTCOME, np.uint8)
@@ -207,17 +208,20 @@ class Predictions:
     def compare_arms(self, models: Sequence[str], units: Units) -> list[PairedRates]:
         """Compare the predictions without and with an adversarial configuration.
 
-        The second half of the rows are those of the first with the adversarial
-        configuration. Only pairs of which both are known are counted.
+        The rows are two arms: the second half repeats the first with the adversarial
+        configuration. Pairs are counted only if both predictions are.
 
         Args:
             models: their names.
             units: how rows follow from draws.
+
+        Returns:
+            The comparison for each model that has pairs.
         """
-        by_arm = (2, -1, len(models))  # arms, images, models
-        right = self.is_right.reshape(by_arm)
-        outcome = self.outcome.reshape(by_arm)
-        both_counted = np.asarray(self.is_counted.reshape(by_arm).all(axis=0))
+        arm_shape = (2, -1, len(models))  # arms, images, models
+        right = self.is_right.reshape(arm_shape)
+        outcome = self.outcome.reshape(arm_shape)
+        both_counted = np.asarray(self.is_counted.reshape(arm_shape).all(axis=0))
         pairs = list[PairedRates]()
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])
@@ -316,15 +320,16 @@ def make_map(
 ) -> SweepMap | None:
     """Count predictions, and average margins, over every pair of values of two axes.
 
+    The two are the first axes of the grid; if it has fewer, the last ones outside of
+    the scene follow. Only if there are none of either kind, they are sampled ones.
+
     Args:
         axes: all of the tables.
         right: (n,) whether each prediction is right.
         margin: (n,) NaN where it is not a number.
 
     Returns:
-        The map over the first axes of the grid, or the last outside of the scene, or
-        sampled ones if there are none of these; None of fewer than two axes, or of
-        too many values.
+        The map; None of fewer than two axes, or of more than `MAX_CELLS` pairs.
     """
     axes = _order_for_map(axes)
     if len(axes) < 2:

@@ -80,14 +80,17 @@ class PartCounts:
         self.visible_counts = np.zeros(n_parts, np.int64)
         self.wrong_counts = np.zeros(n_parts, np.int64)
         self.permuted_counts = np.zeros((N_PERMUTATIONS, n_parts), np.uint32)
+        # for the sequential sampling in `add`
         self._images_left = n_images
         self._failures_left = np.full(N_PERMUTATIONS, n_failures)
         self._random = np.random.default_rng(seed)
 
     def add(self, parts: Int64Array, failed: bool) -> None:
-        """Count an image, and say in which permutations it is a failure.
+        """Count an image, and decide in which permutations it is a failure.
 
-        Images are added in the order of `permuted_failures`, `n_images` in all.
+        The permutations show what would be counted if predictions had nothing to do
+        with the parts. Images are added in the order of `permuted_failures`, `n_images`
+        in all.
 
         Args:
             parts: indices of the parts that it shows, each once.
@@ -154,7 +157,9 @@ def compare_parts(
 def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
     """Compute difference, lower and upper bound and p-value of parts, (m, 4).
 
-    Where images share a draw, the bounds are NaN.
+    The difference is the rate of wrong predictions where the part is visible, less that
+    elsewhere. Where images share a draw, they are not independent, and the bounds are
+    NaN.
 
     Args:
         counts: of all parts.
@@ -188,6 +193,7 @@ def _permutation_p_value(
     """
     images = counts.n_images
     failures = counts.n_failures
+    # the largest statistic of any part in each permutation, ascending
     max_statistics = np.sort(
         [
             _likelihood_ratio(
@@ -199,6 +205,7 @@ def _permutation_p_value(
     statistic = _likelihood_ratio(k, n, failures, images)
     n_permutations = len(max_statistics)
     # 1e-9: equal statistics may differ by rounding.
+    # permutations whose largest statistic is at least that of the part
     n_above = n_permutations - np.searchsorted(max_statistics, statistic - 1e-9)
     return np.asarray((1 + n_above) / (1 + n_permutations))
 
@@ -212,6 +219,8 @@ def _likelihood_ratio(
     failures in the other images, are with a rate each than with a common rate; at
     least 0. The shapes of `k` and `n` are broadcast.
     """
+    # Images by whether they show the part and whether they are failures, and the sums
+    # of this table by row and by column.
     cells = (k, n - k, n_failures - k, n_images - n - n_failures + k)
     margins = (n, n_images - n, np.array(n_failures), np.array(n_images - n_failures))
     log_ratio = (
@@ -283,11 +292,14 @@ class SurfaceCounts:
         self.part_counts = tuple(part_counts)
 
     def add(self, surfaces: Surfaces, wrong_by_model: Mapping[int, bool]) -> None:
-        """Count an image, by its surfaces and whether each model's prediction is wrong.
+        """Count an image for each model.
+
+        Parts are the cells of the map; on a mesh of few faces also the faces, whose
+        indices follow those of the cells.
 
         Args:
             surfaces: what the image shows.
-            wrong_by_model: by the index of the model.
+            wrong_by_model: whether the prediction is wrong, by the index of the model.
         """
         is_object = surfaces.visible_mask(OBJECT)
         face = surfaces.face[is_object].numpy()
@@ -361,7 +373,13 @@ class SurfaceCounts:
     def _describe_part(
         self, part: int, counts: PartCounts, compared: pd.DataFrame
     ) -> SurfacePart:
-        """Return the counts and the comparison of one part, as the summary has them."""
+        """Return the counts and the comparison of one part, as the summary has them.
+
+        Args:
+            part: its index.
+            counts: of a model.
+            compared: from `compare_parts`.
+        """
         n_visible = int(counts.visible_counts[part])
         n_visible_wrong = int(counts.wrong_counts[part])
         n_hidden = counts.n_images - n_visible
@@ -440,6 +458,7 @@ def _make_counts(
     for object_index, (name, asset) in enumerate(assets.items()):
         parts = SurfaceParts(asset.mesh)
         has_object = [named_scene.object == name for named_scene in job.scenes]
+        # each object and model has permutations of its own
         model_seeds = [
             seeds.stream(job.config.seed, "surface", object_index * n_models + model)
             for model in range(n_models)
@@ -528,11 +547,13 @@ def _select_known(
 def permute_draws(
     wrong: npt.NDArray[np.int8], draws: Int64Array, seed: int
 ) -> npt.NDArray[np.uint8] | None:
-    """Permute the predictions of full draws among the draws, N_PERMUTATIONS times.
+    """Permute the predictions of whole draws among the draws, N_PERMUTATIONS times.
+
+    Images of one draw are not independent, so that they stay together.
 
     Args:
-        wrong: (n,) whether each prediction is wrong, or UNKNOWN; every draw has as
-            many images.
+        wrong: (n,) whether each prediction is wrong, or UNKNOWN; every draw has as many
+            images.
         draws: (n,) the draw of each image.
         seed: of the permutations.
 
@@ -551,6 +572,7 @@ def permute_draws(
     generator = np.random.default_rng(seed)
     permuted = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
     for permutation in permuted:
+        # `permutation` is a row of `permuted`, which this fills.
         order = generator.permutation(n_draws)
         permutation[images_of_draw] = is_wrong[images_of_draw[order]]
     return np.packbits(permuted[:, is_known], axis=0)
@@ -841,7 +863,13 @@ def _find_scale_limit(panels: Sequence[Panel]) -> float:
 
 
 def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) -> None:
-    """Draw the views of an object side by side in the colors (cells, 3) of its map."""
+    """Draw the views of an object, in rows, in the colors of its map.
+
+    Args:
+        axes: of matplotlib.
+        views: each with the cell of the map, or -1, and the shade of every pixel.
+        cell_colors: (cells, 3) color of each cell.
+    """
     axes.axis("off")
     n_columns = ceil(len(views) / N_VIEW_ROWS)
     mosaic = np.ones((N_VIEW_ROWS * VIEW_SIZE, n_columns * VIEW_SIZE, 3))
@@ -850,7 +878,7 @@ def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) 
         top = row * VIEW_SIZE
         left = column * VIEW_SIZE
         is_object = view.cells[..., None] >= 0
-        # white where the object is not
+        # Where the object is not, -1 is looked up as cell 0, and then made white.
         shaded = cell_colors[np.maximum(view.cells, 0)] * view.shade[..., None]
         image = np.where(is_object, shaded, 1.0)
         mosaic[top : top + VIEW_SIZE, left : left + VIEW_SIZE] = image

@@ -100,13 +100,18 @@ class ConstantVelocity:
     def __call__(
         self, boxes: Float64Array, scores: Float64Array
     ) -> list[tuple[int, Float64Array]]:
-        """Return the tracks that have a box in this frame.
+        """Move all tracks on by one frame, and return those that have a box in it.
 
         Args:
-            boxes: (n, 4).
-            scores: (n,).
+            boxes: (n, 4) that were detected in the frame.
+            scores: (n,) of the boxes.
+
+        Returns:
+            Number and box of each track that was assigned a box, or began.
         """
         is_sure = scores >= self.sure
+        # Every track moves by its speed, and counts as missed until it is assigned a
+        # box.
         waiting = [
             replace(track, box=track.box + track.speed, missed=track.missed + 1)
             for track in self._tracks
@@ -124,7 +129,7 @@ class ConstantVelocity:
     def _assign(
         self, tracks: Sequence[_Track], boxes: Float64Array
     ) -> tuple[list[_Track], list[_Track], list[Float64Array]]:
-        """Assign boxes (n, 4) to tracks.
+        """Assign boxes (n, 4) to tracks, which have moved on to the frame of the boxes.
 
         Returns:
             The tracks with a box, those without, and the boxes without a track.
@@ -134,7 +139,8 @@ class ConstantVelocity:
         for track_index, box_index in box_of_track.items():
             track = tracks[track_index]
             box = boxes[box_index]
-            # the box that was detected last, `missed` frames ago
+            # The box that was detected last, `missed` frames ago: at least 1, since a
+            # track counts as missed in this frame until now.
             last_box = track.box - track.speed * track.missed
             speed = (box - last_box) / track.missed
             assigned.append(_Track(track.number, box, speed))
@@ -146,9 +152,14 @@ class ConstantVelocity:
         return assigned, free_tracks, free_boxes
 
     def _match(self, tracks: Sequence[_Track], boxes: Float64Array) -> dict[int, int]:
-        """Return the index of the box of each matched track, by the largest overlap."""
+        """Return the index of the box of each matched track, by the index of the track.
+
+        The sum of the overlaps is the largest possible (Kuhn 1955). A pair that
+        overlaps less than `overlap` is no match.
+        """
         overlap_rows = [compute_overlaps(boxes, track.box) for track in tracks]
         overlap_table = np.array(overlap_rows).reshape(len(tracks), len(boxes))
+        # negated, since the function minimizes the sum
         pairs = zip(*linear_sum_assignment(-overlap_table), strict=True)
         return {
             track: box
@@ -166,7 +177,8 @@ def read_frame(payload: Any, names: Collection[str]) -> DetectedFrame:
     """Return the boxes that a row of a detector stores.
 
     Args:
-        payload: of the row.
+        payload: of the row: "found" has the detected boxes with labels and scores,
+            "box" the true one, None if the object is not visible.
         names: of the classes whose boxes count.
     """
     found = [box for box in payload["found"] if box["label"] in names]
@@ -183,8 +195,10 @@ def track_drive(
 ) -> DriveTracking:
     """Track the boxes of a drive, and compare the tracks with the true boxes.
 
-    Of several tracks on the object, the one of the last frame counts if it is among
-    them, else the one that overlaps most: then the identity has switched.
+    A frame in which the object is visible is lost if no track is on it. The object is
+    followed by one track, at first the one that overlaps it most. In a frame in which
+    other tracks are on it, but not this one, the one of these that overlaps most
+    follows it from then on: its identity has switched.
 
     Args:
         frames: of the drive, in their order.
@@ -221,7 +235,13 @@ def track_drive(
 def _find_tracks_on(
     tracks: Sequence[tuple[int, Any]], true_box: Float64Array | None, iou: float
 ) -> list[tuple[float, int]]:
-    """Return overlap and number of the tracks that are on the true box."""
+    """Return overlap and number of the tracks that are on the true box.
+
+    Args:
+        tracks: number and box (4,) of each.
+        true_box: (4,); None if the object is not visible, then no track is on it.
+        iou: overlap from which on a track is on it.
+    """
     if true_box is None:
         return []
     boxes = np.array([box for _, box in tracks], dtype=float).reshape(-1, 4)

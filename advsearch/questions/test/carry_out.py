@@ -82,6 +82,7 @@ def try_suite(
     start = time.perf_counter()
     config = context.config
     context.progress.stage("reading the suite")
+    # a check before the work: raises an error if the run of twins cannot be read
     if config.twins is not None:
         workbench.read_twins(config.twins)
     loaded_suite = _read_noted_suite(context.resumed) or suite or _read_suite(config)
@@ -139,9 +140,7 @@ def _read_suite(config: SuiteConfig) -> Suite:
 def _note_settings(
     context: RunContext[SuiteConfig], suite: Suite, planned: Sequence[PlannedClaim]
 ) -> None:
-    """Note the settings that claims are tested with, so that a resumed run repeats
-    them.
-    """
+    """Note the settings of claims, so that a resumed run tests with the same."""
     run = context.run
     run.store.write_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
     judged_with = {
@@ -263,9 +262,7 @@ class _SuiteRun:
         )
 
     def _add_result(self, claim: PlannedClaim, tested: ClaimResult) -> None:
-        """Add the result of a claim, with what is expected and the command to repeat
-        it.
-        """
+        """Add the result of a claim, with what is expected and how to repeat it."""
         repeat = self._repeat_command(f"only={claim.name}") or ""
         expected = self.expected.get(claim.name, "held")
         self.results.append(

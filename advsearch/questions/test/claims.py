@@ -161,6 +161,7 @@ class ClaimTester:
         summary = self.context.run_part(pending.name, search)
         assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
+        # with the number of steps that was chosen, if none was set
         planned = search.model_copy(update={"steps": search.steps or summary.steps})
         verdict, reason, cause = words.evaluate_search(summary, planned)
         image_name = "clean" if summary.ending == "already wrong" else "adversarial"
@@ -248,7 +249,16 @@ class ClaimTester:
         claim: ShareClaim | NoWorseClaim,
         sequence: Any,
     ) -> _PictureSample:
-        """Add pictures to a confidence sequence until it decides the claim."""
+        """Evaluate pictures until their scores decide the claim, or there are no more.
+
+        Args:
+            evaluated: queries with their evaluations, and those of the other side.
+            claim: what is claimed.
+            sequence: a confidence sequence of the mean score, which gets each score.
+
+        Returns:
+            The scores, the verdict, and the worst picture against the claim.
+        """
         sample = _PictureSample()
         for query, evaluation, other in evaluated:
             score, badness, text = score_picture(claim, evaluation, other)
@@ -478,9 +488,18 @@ class ClaimTester:
         *,
         over: bool,
     ) -> ClaimResult:
-        """Test a counterexample by fresh renders; with `over`, under many conditions.
+        """Test a counterexample by trials with fresh seeds.
 
-        Its picture is that of the first wrong trial.
+        They end when further ones would change nothing, or the time is over. The
+        picture of the result is that of the first wrong trial.
+
+        Args:
+            pending: the result without a verdict.
+            example: the counterexample.
+            problem: of the model under test.
+            over: whether conditions vary; then each trial has one of the clean scene
+                under the same conditions, and does not count if the model is wrong
+                there.
         """
         u = problem.domain.project(example.make_configuration(problem.domain.start))
         # trials by which it is added are not repeated as trials of the suite
@@ -491,6 +510,8 @@ class ClaimTester:
         wrong_payloads = list[Any]()
         label = ""
         picture: str | None = None
+        # Over conditions, up to twice as many trials are made, as some may not count;
+        # each also renders the clean scene.
         max_trials = 4 * N_TRIALS[over] if over else N_TRIALS[over]
         self.progress.stage(example.name, max_trials, at_most=True)
         for query, trial, clean in self._run_trials(
@@ -522,9 +543,19 @@ class ClaimTester:
     def _run_trials(
         self, journal: workbench.Journal, kind: str, u: Tensor, spp: int, *, over: bool
     ) -> Iterator[tuple[workbench.Query, tasks.Judgement, tasks.Judgement | None]]:
-        """Yield trials of a configuration (d,), with `over` also of the clean scene.
+        """Yield the trials of a configuration, until the time is over.
 
-        The clean scene is evaluated under the same conditions.
+        Args:
+            journal: which evaluates and stores them.
+            kind: of their seeds and stored rows.
+            u: (d,) the configuration.
+            spp: samples per pixel.
+            over: whether the clean scene is evaluated as well, under the same
+                conditions.
+
+        Yields:
+            Query and judgement of the configuration, and the judgement of the clean
+            scene, None without `over`.
         """
         problem = journal.problem
         queries = list[workbench.Query]()
@@ -542,6 +573,7 @@ class ClaimTester:
             if not over:
                 yield query, trial.required_judgement, None
                 continue
+            # The next query is that of the clean scene; without it, the time is over.
             clean = next(evaluated, None)
             if clean is None:
                 return
@@ -625,6 +657,10 @@ def threshold_mean(claim: ShareClaim | NoWorseClaim) -> float:
 def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     """Check a claim's number of pictures; return a remark, or "" if it is enough.
 
+    A model that is always right has to be able to hold the claim with so many pictures,
+    and one that is always wrong to fail it. The remark is about a claim that compares
+    two models, if these are not enough for two that predict alike.
+
     Raises:
         InputError: if no predictions of so many pictures could decide it both ways.
     """
@@ -633,6 +669,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     threshold = threshold_mean(claim)
     needed = max(
         statistics.sequential.count_needed_samples(mean, confidence=confidence)
+        # what it takes to exceed the threshold, and to fall below it
         for mean in (threshold, 1.0 - threshold)
     )
     if claim.pictures < needed:

@@ -290,9 +290,7 @@ class Counterexample:
         )
 
     def find_changed_file(self, config: AttackConfig) -> str | None:
-        """Return the name of a file in its settings that has changed, None if none
-        has.
-        """
+        """Return the name of a file in its settings that has changed, if any."""
         return directory.summary.find_changed_file(
             self.files, select_deciding_settings(config)
         )
@@ -333,9 +331,7 @@ def compute_scene_digest(description: SceneDescription) -> str:
 
 
 def select_deciding_settings(config: AttackConfig) -> dict[str, Any]:
-    """Return the settings that decide a verdict, without the network, as JSON
-    values.
-    """
+    """Return the settings except the network that decide a verdict, for JSON."""
     left_out = NOT_DECIDING | {*MODEL_SETTINGS}
     return {
         name: value for name, value in config.to_json().items() if name not in left_out
@@ -495,6 +491,9 @@ def _write_smallest(
     over: bool,
 ) -> Counterexample:
     """Write the smallest form of a counterexample on which the model fails.
+
+    Forms store the offsets more or less finely. Each is written, read back and tried;
+    the last, finest one is kept whatever the model says.
 
     Args:
         base: path of the file without suffix.

@@ -21,8 +21,8 @@ def read_noted_settings(
 ) -> dict[str, dict[str, Mapping[str, Any]]]:
     """Return the settings of each claim and counterexample that was tested.
 
-    They are by "claim" or "counterexample", and by name. "claim" is missing if the
-    noted suite cannot be read.
+    They are by the kind, "claim" or "counterexample", and then by name. If the noted
+    suite cannot be read, "claim" is missing.
     """
     with Store.open_to_read(run) as store:
         suite = store.read_json_note(SUITE_NOTE)
@@ -46,7 +46,9 @@ def read_noted_settings(
 
 
 def _settings_of_claims(suite: Any) -> dict[str, Mapping[str, Any]]:
-    """Return the settings that each claim of a suite is tested with.
+    """Return the settings that each claim of a suite is tested with, by its name.
+
+    Settings of the claim override those of the suite.
 
     Raises:
         KeyError, TypeError, AttributeError, ValueError: if the suite is corrupt.
