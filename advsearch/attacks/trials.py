@@ -315,13 +315,16 @@ def _is_settled(
     mean = fmean(at_rung)
     count = min(len(at_rung), len(below))
     deviation = _compute_deviation(at_rung)
-    # the mean if the rest of the noise changed it as much as the step from below did
+    # m + (m - m'): the mean if the rest of the noise changed it as much as the step from
+    # below did
     extrapolated = 2.0 * mean - fmean(below)
     extrapolated_error = math.hypot(
         2.0 * deviation, _compute_deviation(below)
     ) / math.sqrt(count)
     sign = math.copysign(1.0, mean)
     quantile = _compute_quantile(count, looks)
+    # If the renders are as many as the trials, the standard error of their mean; else
+    # the deviation of a single render, as every trial has to be on the same side.
     error = deviation / math.sqrt(count) if count == trials else deviation
     is_mean_sure = sign * mean > quantile * error
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
@@ -369,6 +372,7 @@ def _may_settle(
             ladder[last_rung] / ladder[rung]
         )
 
+    # that of 2 m - m', as in `_is_settled`
     error = math.hypot(2.0 * estimate_deviation(level), estimate_deviation(level - 1))
     return error * _compute_quantile(count, looks) / math.sqrt(count) <= max_mean
 

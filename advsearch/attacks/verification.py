@@ -173,11 +173,10 @@ class Rule:
         return self.has_control and 2 * clean.successes < clean.trials
 
     def decide(self, successes: int, trials: int) -> bool | None:
-        """Return whether a configuration is a success by its trials; None if that
-        depends on the noise.
+        """Return whether a configuration is a success by its trials.
 
-        It does if there are both more successes and more failures than the rule allows
-        of failures.
+        None if that depends on the noise: there are both more successes and more
+            failures than the rule allows failures.
         """
         if min(successes, trials - successes) > self.count_allowed_failures(trials):
             return None
@@ -373,6 +372,7 @@ def verify(
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     has_several_looks = len(looks) > 1
+    # so many are made even if the verdict stands sooner
     min_trials = rule.min_trials if has_several_looks and not curtailed else 0
     u = domain.project(u)
     clean_trials = list(clean)
@@ -399,7 +399,7 @@ def verify(
             n_images=n_images,
             is_decided=is_decided,
         )
-        is_early = count < looks[-1]
+        is_early = count < looks[-1]  # whether trials may follow
         is_success = _is_found(
             rule, done, clean_trials, count, spp=spp, is_early=is_early
         )

@@ -268,6 +268,7 @@ class MapElites(Policy[ArchiveState]):
     handles_choices: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        """Check that ribs is installed and all settings are within their limits."""
         if find_spec("ribs") is None:
             raise InputError(
                 "policy 'archive' needs ribs, which is not installed: pip "
@@ -283,6 +284,12 @@ class MapElites(Policy[ArchiveState]):
     def start(
         self, domain: policies.Domain, generator: torch.Generator, steps: int
     ) -> ArchiveState:
+        """Start with an empty archive, and a generation of the initial point and
+        samples.
+
+        Raises:
+            InputError: the domain has too many numbers, or the archive too many cells.
+        """
         if domain.dim > MAX_DIM:
             raise InputError(
                 f"policy 'archive': expected at most {MAX_DIM} numbers, got "

@@ -217,6 +217,10 @@ class Auto(Policy[AutoState]):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
+        """Divide the renders, and start with the screen.
+
+        Without box coordinates there is nothing but the ascent, which starts at once.
+        """
         box = find_box_coordinates(domain)
         no_points = torch.empty(0, box.count)
         plan = make_plan(domain, box, steps)

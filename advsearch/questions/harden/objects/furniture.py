@@ -227,12 +227,12 @@ def _chair_paints(draw: ParameterSampler, total_height: float) -> dict[str, Pain
         "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040"
     )
     painted = draw.chance(0.4)
-    wild = paint_or_random(draw, total_height, solid(paint_color), wild=0.5)
+    wood_paint = paint_or_random(draw, total_height, solid(paint_color), wild=0.5)
 
     def grain(axis: int) -> Paint:
         """Return the paint of a part whose grain, if any, runs along an axis."""
         return (
-            wild
+            wood_paint
             if painted
             else wood(timber, scale=3.2, offset=offset, axis=axis, contrast=0.36)
         )
