@@ -315,8 +315,8 @@ def _is_settled(
     mean = fmean(at_rung)
     count = min(len(at_rung), len(below))
     deviation = _compute_deviation(at_rung)
-    # m + (m - m'): the mean if the rest of the noise changed it as much as the step from
-    # below did
+    # m + (m - m'): the mean if the rest of the noise changed it as much as the step
+    # from below did
     extrapolated = 2.0 * mean - fmean(below)
     extrapolated_error = math.hypot(
         2.0 * deviation, _compute_deviation(below)

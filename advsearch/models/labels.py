@@ -345,6 +345,7 @@ def list_sets_of_size(classes: int) -> list[str]:
 def _load_label_sets() -> dict[str, tuple[str, ...]]:
     """Load the names of classes of all `SETS`."""
     stored = json.loads((DATA / "labels.json").read_text("utf-8"))
+    # without its first name, which stands for the background
     stored["coco90"] = stored["coco91"][1:]
     return {name: tuple(stored[name]) for name in SETS}
 

@@ -156,6 +156,7 @@ class Detection(ClassTask):
     doubts: str = field(default="", metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
+        """Check that all options are within their limits and fit each other."""
         super().__post_init__()
         self.check_numbers(
             lambda value: 0.0 < value < 1.0,
@@ -334,6 +335,7 @@ class Detection(ClassTask):
 
     @property
     def ambiguities(self) -> str:
+        """Say which option the user has to state, as no output shows it."""
         if self.is_order_ambiguous and not (self.order or self.inferred_order):
             return (
                 "order: expected what tells scores from classes, and no output of "
@@ -351,6 +353,7 @@ class Detection(ClassTask):
 
     @property
     def remarks(self) -> tuple[str, ...]:
+        """Say how the model's output is read, where that was inferred."""
         remarks = []
         order = format_option(f"order: {self.inferred_order}")
         is_order_inferred = not self.order
@@ -505,11 +508,12 @@ class Detection(ClassTask):
         return torch.minimum(self._score_vanish(detections, truth), wrong_excess)
 
     def _score_displace(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Compute the lesser of two: how far the best overlap of a box that counts is
-        below `iou`, and that some box counts.
+        """Compute the lesser of two: that boxes miss the object, and that some box
+            counts.
 
-        The first is scaled so that a small step from `iou` is as long as one in
-        log-odds.
+        The first is how far the best overlap of a box that counts is below `iou`,
+        scaled so that a small step from `iou` is as long as one in log-odds. The second
+        is by how much the best score of a right class exceeds `confidence`.
         """
         scores = self._scores_of_classes(detections, truth.labels)
         score_excess = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
@@ -585,8 +589,10 @@ class Detection(ClassTask):
         return min(MIN_SCORE, self.confidence)
 
     def _is_broken(self, detections: Detections) -> bool:
-        """Whether a score or a box that counts is not finite, or all rows are NaN
-        although the model does not fill its outputs with NaN.
+        """Return whether the detections of an image cannot be judged.
+
+        A score or a box that counts is not finite; or all rows are NaN, although the
+        model does not fill its outputs with such rows.
         """
         has_only_nan_rows = "blank" in detections and not len(detections["boxes"])
         if has_only_nan_rows and not self.fills_with_nan:
@@ -615,8 +621,10 @@ class Detection(ClassTask):
 
     @staticmethod
     def _are_on(boxes: Tensor, true_box: Tensor) -> Tensor:
-        """Which boxes (D, 4) are on a thing with a true box (4,), however loosely, (D,)
-        bool.
+        """Return which boxes (D, 4) are on a thing with a true box (4,), however
+        loosely: (D,).
+
+        They overlap it a little, or lie mostly inside of it.
         """
         overlaps = compute_iou(boxes, true_box) >= MIN_OVERLAP
         lies_inside = compute_fraction_inside(boxes, true_box) >= MIN_FRACTION_INSIDE
@@ -653,12 +661,12 @@ class Detection(ClassTask):
         return is_on_nothing
 
     def _phantom_scores(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Return the score of each box as one where nothing is, (D,); 0 of one that is
-        not.
+        """Return the score (D,) of each box as a phantom: a box where nothing is.
 
-        The score is that of a target class, or of any class without a target. A box of
-        a right class is a phantom if it is on no thing of these classes, however
-        loosely; a box of another class, if it is elsewhere than the object.
+        It is 0 if the box is none. A box of a right class is a phantom if it is on no
+        thing of these classes, however loosely; a box of another class, if it is
+        elsewhere than the object. Only scores of target classes count, if there is a
+        target.
         """
         right_classes = set(truth.labels)
         if self.target is not None:

@@ -425,6 +425,7 @@ class Restarts(RacingPolicy[Race]):
     name: ClassVar[str] = "restarts"
 
     def __post_init__(self) -> None:
+        """Check that the policy is one, and the number of restarts."""
         if not isinstance(self.policy, Policy):
             raise InputError(
                 "policy of restarts: expected a policy, got "
@@ -482,6 +483,7 @@ class Portfolio(RacingPolicy[Race]):
     handles_choices: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        """Check that the policies are policies, and that there is one."""
         object.__setattr__(self, "policies", tuple(self.policies))
         if not self.policies or not all(
             isinstance(policy, Policy) for policy in self.policies

@@ -89,6 +89,7 @@ def _make_head(network: Any, embeddings: Tensor) -> nn.Linear:
     else:
         scale = network.logit_scale.exp()
     head = nn.Linear(embeddings.shape[1], embeddings.shape[0])
+    # An image's embedding has length 1 too, so that products are cosines.
     head.weight.copy_(scale.float() * embeddings)
     has_bias = hasattr(network, "logit_bias")
     head.bias.copy_(network.logit_bias.float() if has_bias else torch.zeros(()))

@@ -180,6 +180,7 @@ def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> Non
     """
     is_passed = {name: value is not None for name, value in arguments.items()}
     was_passed = json.loads(run.store.read_note(ARGUMENTS_NOTE) or "{}")
+    # What the first session noted stays.
     run.store.write_note(ARGUMENTS_NOTE, json.dumps({**is_passed, **was_passed}))
     for name, passed_before in was_passed.items():
         if passed_before != is_passed[name]:
@@ -204,6 +205,7 @@ class Hardening:
     """
 
     def __init__(self, run: RunDirectory, trainer: Trainer) -> None:
+        """Prepare the run, with what an earlier session of it has measured."""
         self.run = run
         self.trainer = trainer
         self.scenes = trainer.work
@@ -327,9 +329,14 @@ class Hardening:
     def _find_robust(
         self, measurement: str, controls: Collection[str]
     ) -> list[bool] | None:
-        """Return whether each scene withstood the searches over all of some controls.
+        """Return whether each measured scene withstood the searches over all of some
+        controls.
 
-        None if some are not measured yet.
+        None if a scene is not measured yet with one of them.
+
+        Args:
+            measurement: a key of `MEASUREMENTS`.
+            controls: of the searches.
         """
         is_robust = []
         for number in range(self.config.measured):

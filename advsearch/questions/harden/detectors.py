@@ -176,7 +176,13 @@ def _read_boxes(
     image: Mapping[str, Any],
     label_of_category: Mapping[Any, int],
 ) -> tuple[Tensor, Tensor]:
-    """Return boxes (n, 4) x0, y0, x1, y1 and labels (n,) of an image."""
+    """Return the boxes (n, 4), x0, y0, x1, y1, and the labels (n,) of an image.
+
+    Args:
+        annotations_of_image: COCO's annotations by the `id` of their image.
+        image: COCO's description of the image.
+        label_of_category: index of the model's label by COCO's category.
+    """
     annotations = annotations_of_image[image["id"]]
     boxes = torch.tensor(
         [annotation["bbox"] for annotation in annotations], dtype=torch.float32
@@ -230,10 +236,10 @@ def compute_network_loss(
     """
     inner: Any = getattr(network, "network", network)
     returned: Any = None
-    if hasattr(inner, "config"):
+    if hasattr(inner, "config"):  # of transformers
         labels = _transformers_labels(x, targets)
         returned = inner(pixel_values=x, labels=labels).loss
-    elif inner is not network:
+    elif inner is not network:  # of torchvision, in a wrapper of ours
         returned = inner(list(x), list(targets))
     elif len(inspect.signature(network.forward).parameters) > 1:
         returned = network(x, list(targets))
@@ -285,6 +291,7 @@ class DetectorTrainer(Trainer):
         custom_items: Sequence[Example] = (),
         loss: Loss | None = None,
     ) -> None:
+        """Set up the trainer; without a `loss` it is `default_loss`."""
         super().__init__(work, student, optimiser, custom_items)
         self.loss = loss or self.default_loss()
 
@@ -324,7 +331,14 @@ class DetectorTrainer(Trainer):
     def _attack(
         self, scene: workbench.Scene, name: str, control: str, seed: int
     ) -> tuple[Example, Example]:
-        """Attack the student in a scene; return a plain image and the worst one."""
+        """Attack the student in a scene; return a plain image and the worst one.
+
+        Args:
+            scene: to attack.
+            name: of its object.
+            control: that is searched.
+            seed: of the search and of the conditions of both images.
+        """
         model = self.student.model
         config = self.work.make_attack_config(
             (control,), name, seed=seed, trials=TRIALS, verify_spp=SPP
@@ -368,9 +382,11 @@ class DetectorTrainer(Trainer):
         network.eval()
 
     def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
-        """Return the network's input for an image, and the target in its pixels.
+        """Return the network's input (1, ...) for an image, and the target in its
+        pixels.
 
-        The target has "boxes" (K, 4), x0, y0, x1, y1, and "labels" (K,).
+        The target has "boxes" (K, 4), x0, y0, x1, y1, and "labels" (K,). A mirrored
+        image has mirrored boxes.
         """
         levels = item.levels
         boxes = item.boxes

@@ -62,8 +62,8 @@ def _patches(person: Any) -> list[Patch]:
     data = person.data
     vertices = person.standing_points.numpy().astype(np.float64)
     index = data["index"].astype(np.int64)
-    # the reference body: the mean, stored in tenths of millimetres, plus what the shares
-    # of one fixed phenotype add
+    # the reference body: the mean, stored in tenths of millimetres, plus what the
+    # shares of one fixed phenotype add
     reference = data["mean"][index] * 1e-4 + np.einsum(
         "r,rpc->pc", data["shares"][1, 1, 1, 1], data["basis"][:, index]
     )
