@@ -90,6 +90,11 @@ def make_margin_function(
     n_rendered = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
+        """Return the margin of a render for each seed.
+
+        The first `n_images` renders of each sample count are those whose images are
+        requested.
+        """
         numbers = range(n_rendered[spp], n_rendered[spp] + len(seeds))
         rows = enumerate(zip(seeds, numbers, strict=True), n_rendered.total())
         n_rendered[spp] += len(seeds)
@@ -275,11 +280,11 @@ def _climb_ladder(
     """
     margins_of_rungs: list[list[float]] = [[] for _ in ladder]
     n_looks = len(look_sizes)
-    looks = list(product(range(1, len(ladder)), look_sizes))
-    for look_index, (level, count) in enumerate(looks):
+    all_looks = list(product(range(1, len(ladder)), look_sizes))
+    for look_index, (level, count) in enumerate(all_looks):
         if not any(
             _may_settle(margins_of_rungs, ladder, *later_look, n_looks)
-            for later_look in looks[look_index:]
+            for later_look in all_looks[look_index:]
         ):
             break
         if not _may_settle(margins_of_rungs, ladder, level, count, n_looks):

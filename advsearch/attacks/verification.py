@@ -432,8 +432,14 @@ def _extend_clean_trials(
 ) -> int:
     """Run clean trials until `look` of them count; return how many there are then.
 
-    Over conditions, clean trials that are wrong do not count, so that more are run, up
-    to `max_trials`. New trials are appended to `clean_trials`.
+    Over conditions, clean trials that are wrong do not count, so that more are run.
+
+    Args:
+        clean_trials: so far; new ones are appended.
+        run_clean: runs trials, see `run_trials`.
+        rule: says which trials count.
+        look: number of trials that have to count.
+        max_trials: maximum number of trials.
     """
     count = look
     clean_trials += run_clean(trials=count, n_done=len(clean_trials))
@@ -454,10 +460,15 @@ def _is_found(
     spp: int,
     is_early: bool,
 ) -> bool:
-    """Return whether enough trials succeed at a look, and the clean configuration is
-    not wrong already.
+    """Return whether enough trials succeed at a look, and the clean ones are not wrong.
 
-    The look is at the first `count` trials; `is_early` is whether more could follow.
+    Args:
+        rule: says how many have to succeed.
+        trials: of the adversarial configuration.
+        clean_trials: of the same seeds, or more.
+        count: trials that are looked at, the first ones.
+        spp: samples per pixel.
+        is_early: whether more trials could follow.
     """
     clean_looked_at = clean_trials[:count]
     n_needed = rule.count_needed(rule.count_valid(clean_looked_at), early=is_early)
@@ -498,7 +509,17 @@ def _summarize_trials(
 ) -> Verification:
     """Return the verification that the trials of both groups make.
 
-    `is_early` is whether the needed successes are those of an early look.
+    Args:
+        rule: says what a success is, and how many are needed.
+        claim: the search's ending.
+        u: (d,) the configuration.
+        clean_trials, trials: of both groups, in the order of their seeds.
+        spp: samples per pixel.
+        confidence: of the interval of the success rate.
+        renders: that were spent.
+        stopped: why there are no more trials.
+        is_early: whether the needed successes are those of an early look.
+        begin: index of the first trial.
     """
     outcomes = _list_outcomes(rule, trials, clean_trials)
     n_counted = max(1, len(outcomes) - outcomes.count(None))

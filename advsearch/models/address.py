@@ -625,7 +625,11 @@ class AddressModel(models.RemoteNetwork):
     def _try_to_send(
         self, body: bytes, deadline: float, connections: list[_Connection]
     ) -> dict[str, Any] | Exception:
-        """Return the response to a body, or the error that a later try may not have."""
+        """Return the response to a body, or the error, as a later try may succeed.
+
+        The arguments are those of `_send_body`. The body of an HTTP error is read here,
+        as the connection is closed afterwards.
+        """
         try:
             return self._send_body(body, deadline, connections)
         except urllib.error.HTTPError as error:
@@ -684,7 +688,17 @@ class AddressModel(models.RemoteNetwork):
     def _send_body(
         self, body: bytes, deadline: float, connections: list[_Connection]
     ) -> dict[str, Any]:
-        """Send one body, and return the JSON object in the response."""
+        """Send one body, and return the JSON object in the response.
+
+        Args:
+            body: JSON.
+            deadline: of the connection, as `time.monotonic` counts.
+            connections: list that the connection is added to.
+
+        Raises:
+            ModelError: the response is too long, or something else. OSError,
+                http.client.HTTPException: it cannot be sent, or there is no response.
+        """
         key = models.read_key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)

@@ -188,6 +188,7 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         kwargs: dict[str, Tensor],
         output: Tensor,
     ) -> None:
+        """Record a call of a layer, which a hook calls after it."""
         input = args[0] if args else kwargs["input"]
         if len(input) == len(output) and input.dim() > 1:
             name = f"{names[layer] or 'the network'} ({type(layer).__name__})"

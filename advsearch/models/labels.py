@@ -176,7 +176,13 @@ def _find_class(
 
 
 def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
-    """Return a hint for an unknown label: names like it, or what labels there are."""
+    """Return a hint for an unknown label: names like it, or what labels there are.
+
+    Args:
+        term: that is unknown.
+        labels: of the model.
+        named: whether these are names, not placeholders.
+    """
     if not named:
         fitting = "".join(
             f" or `labels={name}`" for name in list_sets_of_size(len(labels))

@@ -413,7 +413,7 @@ class Model:
         return x.clone() if is_view else x
 
     def run_network(self, x: Tensor, *, raw: bool = False) -> Any:
-        """Run the network on a batch that `prepared` returned.
+        """Run the network on a batch that `prepare` returned.
 
         Returns:
             The output; with `raw`, what the network itself returns.

@@ -636,8 +636,17 @@ def _measure_change(
 def _check_gradient(
     model: Model, images: Tensor, gradient: Tensor, detached: bool
 ) -> None:
-    """Warn if a network's outputs do not change as its gradient predicts: it is masked,
-    cut off, or not of this network.
+    """Warn if a network's outputs do not change as its gradient predicts.
+
+    Its gradient may be masked, cut off, or not that of this network. The change over a
+    small step along the sign of the gradient is compared with what the gradient
+    predicts.
+
+    Args:
+        model: that is probed.
+        images: (N, H, W, 3).
+        gradient: (N, H, W, 3) of `_compute_checked_value`.
+        detached: whether the network detaches tensors, for the message.
     """
     # Suppression of boxes may make outputs jump in the larger step only.
     step_sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)

@@ -264,8 +264,12 @@ def _fisher_p_value(
 ) -> float:
     """Return the one-sided p-value of Fisher's exact test.
 
-    It is the probability that at most `right_inside` of the right predictions are
-    inside if the `inside` predictions there are drawn by chance from all.
+    It is the probability that at most `right_inside` of all right predictions are
+    inside if chance decides which `inside` predictions of all are there.
+
+    Args:
+        right_inside, inside: right predictions inside, and all there.
+        right_outside, outside: likewise outside.
     """
     # takes half a second, and a search needs none of it
     from scipy.stats import hypergeom

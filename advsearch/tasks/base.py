@@ -297,8 +297,8 @@ class Task(ABC):
     target: Truth = field(default=None, metadata=FROM_RUN)
 
     def __init_subclass__(cls, **more: Any) -> None:
-        """Let the methods of a user's class get copies of outputs, which they may
-        change.
+        """Give methods of a user's class copies of what they are passed, as they may
+        change it.
         """
         super().__init_subclass__(**more)
         receive_copies: tuple[Callable[..., Any], ...] = (

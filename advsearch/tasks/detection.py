@@ -474,8 +474,13 @@ class Detection(ClassTask):
     ) -> Tensor:
         """Apply a function to the detections of each image, (N,).
 
-        The value is NaN if a number that counts is not finite, and -1 if there is
-        nothing to find.
+        The value is NaN if a number that counts is not finite, and -1 if the object is
+        out of view, unless boxes where nothing is are sought.
+
+        Args:
+            output: of N images.
+            truth: of the scene.
+            function: from the detections of an image to its value.
         """
         is_out_of_view = truth.box is None and self.seek != "create"
         values = []
@@ -607,8 +612,10 @@ class Detection(ClassTask):
         return suppress(detections, self._min_score, self.suppression)
 
     def _is_elsewhere(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Which boxes neither fit the object nor lie mostly inside its box, (D,)
-        bool.
+        """Return which boxes (D,) are elsewhere than the object.
+
+        They neither fit its box nor lie mostly inside of it. All are if the object is
+        out of view.
         """
         boxes = detections["boxes"]
         if truth.box_fractions is None:
@@ -633,8 +640,10 @@ class Detection(ClassTask):
     def _is_loosely_on_object(
         self, detections: Detections, truth: DetectionTruth
     ) -> Tensor:
-        """Which boxes are on the object and fit no other thing of its class better,
-        (D,) bool.
+        """Return which boxes (D,) are on the object, however loosely.
+
+        A box that overlaps another thing of the right classes more than the object does
+        not count.
         """
         boxes = detections["boxes"]
         true_box = truth.box_fractions
@@ -780,7 +789,12 @@ class Detection(ClassTask):
     def _match_object(
         self, detections: Detections, truth: DetectionTruth
     ) -> ObjectMatch:
-        """Decide what becomes of the object in boxes that survived suppression."""
+        """Decide what becomes of the object in the boxes that survived suppression.
+
+        The outcomes are tried in order, the best for the model first; the first one
+        whose best box reaches `confidence` is returned with that box. Where phantoms
+        are sought, they come before all others.
+        """
         right_score = self._scores_of_classes(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)
         if self.seek == "create" and float(self._score_create(detections, truth)) > 0.0:
@@ -825,7 +839,15 @@ class Detection(ClassTask):
         is_candidate: Tensor,
         truth: DetectionTruth,
     ) -> ObjectMatch:
-        """Return an outcome with the best box among the candidates."""
+        """Return an outcome with the best box among the candidates.
+
+        Args:
+            outcome: that the candidates stand for.
+            detections: of the image.
+            scores: (D,) of each box for this outcome.
+            is_candidate: (D,) bool.
+            truth: of the scene.
+        """
         row = int(torch.where(is_candidate, scores, -1.0).argmax())
         score = float(scores[row])
         if "labels" in detections:

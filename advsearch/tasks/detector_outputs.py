@@ -217,6 +217,14 @@ def _split_images(
 ) -> list[dict[str, Tensor]]:
     """Split an output into the components of each of `count` images, unchecked.
 
+    It may be a list with an element for each image, rows with the index of their image,
+    or tensors whose first axis is the image.
+
+    Args:
+        returned: by the network.
+        count: number of images.
+        order_names: the order that the user stated, or none.
+
     Raises:
         ValueError: it is none of the forms of `EXPECTED`.
     """
@@ -250,7 +258,16 @@ def _split_batch_rows(
 ) -> list[dict[str, Tensor]]:
     """Split rows (D, 7) of all images by their column with the index of the image.
 
-    It is the first column, or the one of "batch" in the order.
+    It is the first column, or the one of "batch" in the order. A row with the index -1
+    is padding.
+
+    Args:
+        rows: of all images.
+        count: number of images.
+        order_names: the order that the user stated, or none.
+
+    Raises:
+        ValueError: there is no such column.
     """
     names_before: Sequence[str] = ()
     if "batch" in order_names:
@@ -872,7 +889,13 @@ def find_head_orders(
 
 
 def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> str:
-    """Return what to do about an output whose number of channels does not fit."""
+    """Return what to do about an output whose number of channels does not fit.
+
+    Args:
+        n_channels: of a box.
+        classes: number of classes.
+        may_be_rows: whether boxes are rows, which may begin with six numbers.
+    """
     excess_channels = {n_channels - 4 - classes, n_channels - 6 if may_be_rows else 0}
     fitting = [
         f"`labels={name}`"

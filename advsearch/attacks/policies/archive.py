@@ -208,10 +208,16 @@ def _find_cell_ranges(
 def _make_candidates(
     state: ArchiveState, observations: policies.Observations, rng: torch.Generator
 ) -> Tensor:
-    """Return candidates (n, d) for a surrogate to choose from: offspring in the box.
+    """Return candidates (n, d) for a surrogate to choose from: offspring, moved into
+    the box.
 
-    The parameters of the archive of some of them are sampled uniformly, so that they
-    may lie in any cell.
+    The parameters that span the archive are sampled uniformly for some of them, so that
+    they may lie in any cell.
+
+    Args:
+        state: of the search.
+        observations: have the box.
+        rng: of the samples.
     """
     box = observations.box
     uniform = torch.rand(N_CANDIDATES, box.count, generator=rng)

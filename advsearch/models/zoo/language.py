@@ -118,7 +118,16 @@ def _load_processor(loaded: LoadedNetwork) -> Any:
 def _check_length(
     loaded: LoadedNetwork, reader: _LanguageModel, max_new_tokens: int
 ) -> None:
-    """Raise InputError if image, prompt and answer have too many tokens."""
+    """Check that image, prompt and answer are not too long for the network.
+
+    Args:
+        loaded: the network.
+        reader: of images and prompt.
+        max_new_tokens: of the answer.
+
+    Raises:
+        InputError: they have too many tokens.
+    """
     config = loaded.network.config.get_text_config()
     max_tokens = getattr(config, "max_position_embeddings", None)
     n_tokens = (
@@ -542,8 +551,10 @@ def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Te
 
 
 def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
-    """Compare the likelihood of the longest name with that of the network itself, read
-    with the prompt at once.
+    """Compare the likelihood of the longest name with that of the network itself.
+
+    The latter reads image, prompt and name at once, where `_NameClassifier` reads them
+    in parts and keeps what it has read.
 
     Raises:
         ModelError: they differ.

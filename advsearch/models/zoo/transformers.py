@@ -210,6 +210,12 @@ def _load_config(
 ) -> Mapping[str, Any]:
     """Return the config of a repository or a directory, as JSON values.
 
+    Args:
+        transformers: the package.
+        name: of the repository or directory.
+        spec: what the user wrote, for messages.
+        where: arguments of the package, such as a revision.
+
     Raises:
         ModelError: it is a repository of open_clip, or cannot be found.
     """
@@ -425,11 +431,16 @@ MEMORY_FILE = Path("/proc/meminfo")  # Linux's file of memory sizes
 def check_fits(
     transformers: Any, name: str, where: Mapping[str, Any], spec: str
 ) -> None:
-    """Check that the weights of a repository or a directory fit into the free memory,
-    swap included.
+    """Check that the weights of a network fit into the free memory, swap included.
 
     They keep the dtype in which they are stored. Nothing is checked if the system does
     not report its free memory.
+
+    Args:
+        transformers: the package.
+        name: of the repository or directory.
+        where: arguments of the package, such as a revision.
+        spec: what the user wrote, for messages.
 
     Raises:
         ModelError: they are larger.

@@ -123,6 +123,11 @@ def check_settings(
 ) -> None:
     """Check that settings and Python arguments belong to the task.
 
+    Args:
+        config: the settings.
+        beside: further batches of images; for classifiers only.
+        loss: for detectors and segmenters only.
+
     Raises:
         InputError: one of them does not.
     """
@@ -315,7 +320,14 @@ class Hardening:
     def _record(
         self, measurement: str, control: str, number: int, is_wrong: bool
     ) -> None:
-        """Store whether an attack found a wrong prediction in a scene."""
+        """Store whether an attack found a wrong prediction in a scene.
+
+        Args:
+            measurement: a key of `MEASUREMENTS`.
+            control: that was searched.
+            number: of the scene.
+            is_wrong: whether it found one.
+        """
         kind = f"{measurement} {control}"
         self.is_wrong[kind, number] = is_wrong
         self.run.append_row(
@@ -442,7 +454,12 @@ class Hardening:
 def _compare_robustness(
     before: Sequence[bool] | None, after: Sequence[bool] | None
 ) -> dict[str, Any]:
-    """Return the fields of the paired comparison; empty if it is not measured."""
+    """Return the fields of the paired comparison of scenes; empty if they are not
+    measured.
+
+    Args:
+        before, after: whether each scene is robust, in the same order; None if unknown.
+    """
     if before is None or after is None:
         return {}
     pairs = list(zip(before, after, strict=True))

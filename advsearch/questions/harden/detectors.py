@@ -197,7 +197,12 @@ def _read_boxes(
 
 
 def _locate_image(directory: Path, name: str, coco_file: Path) -> Path:
-    """Return the path of an image of a COCO file.
+    """Return the path of an image that a COCO file names.
+
+    Args:
+        directory: of the images, resolved.
+        name: in the file, which is not trusted.
+        coco_file: for messages.
 
     Raises:
         FileFormatError: it is outside of the directory.
@@ -306,6 +311,11 @@ class DetectorTrainer(Trainer):
 
         There is a search for each control; its image is used whether the prediction is
         wrong or not.
+
+        Args:
+            title: of the stage that the progress reports.
+            split: name of the split that the scenes belong to.
+            scene_numbers: numbers of the scenes.
         """
         scene_split = self.work.splits[split]
         controls = tuple(self.config.controls)
@@ -420,7 +430,13 @@ class DetectorTrainer(Trainer):
     def save_images(
         self, run: RunDirectory, number: int, new: Sequence[Example]
     ) -> None:
-        """Write the images of a round in COCO's format."""
+        """Write the images of a round in COCO's format.
+
+        Args:
+            run: gets the files.
+            number: of the round.
+            new: its new items.
+        """
         directory = f"{IMAGE_DIRECTORY}/round-{number:03d}"
         images = []
         annotations = list[dict[str, Any]]()
@@ -510,7 +526,12 @@ class SegmenterTrainer(DetectorTrainer):
         """Return the network's input for an image, and the target of its pixels.
 
         The target has "classes" (h, w) int64 and "object" (h, w) bool at the size of
-        the network's output.
+        the network's output. Beside the object, classes are those that the original
+        model predicts.
+
+        Args:
+            item: with a `Region` as truth.
+            is_mirrored: whether image and target are mirrored.
         """
         region: Any = item.truth
         levels = item.levels.flip(1) if is_mirrored else item.levels

@@ -265,7 +265,11 @@ def _sample_lesson_configurations(
 ) -> list[Tensor]:
     """Sample the configurations (d,) of a lesson, that of the plain image first.
 
-    See `_make_rendered_lessons`.
+    Args:
+        problem: of the scene.
+        seed: of the samples.
+        n_tries: number of further configurations after the start; None for two only: a
+            random control changed by itself, and all of them.
     """
     domain = problem.domain
     generator = torch.Generator().manual_seed(seed)
@@ -358,10 +362,15 @@ def select_hard_lessons(
 def search_worse_images(
     selected: Sequence[Lesson], model: Model, steps: int = 1
 ) -> None:
-    """Search for worse images of lessons.
+    """Search for worse images of lessons, which are changed in place.
 
-    Textures take steps of the search; where several images were rendered, their losses
-    are computed again.
+    Textures take `steps` of the search. Lessons with several rendered images have the
+    loss of each computed again, which decides which one is the worst.
+
+    Args:
+        selected: the lessons.
+        model: that the images are to be hard for.
+        steps: of the search of textures.
     """
     for start in range(0, len(selected), BATCH_SIZE):
         batch = selected[start : start + BATCH_SIZE]
@@ -370,7 +379,11 @@ def search_worse_images(
 
 
 def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
-    """Compute the losses of lessons with several rendered images."""
+    """Compute the losses of all images of the lessons that have several rendered ones.
+
+    The images of all these lessons are evaluated as one batch, and their losses divided
+    among the lessons again.
+    """
     rendered_lessons = [
         lesson
         for lesson in batch

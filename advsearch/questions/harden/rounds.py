@@ -200,7 +200,12 @@ class Trainer(ABC):
     def _make_optimizer(
         self, parameters: Sequence[nn.Parameter], n_steps: int
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-        """Create the optimizer of a round, and its schedule of learning rates."""
+        """Create the optimizer of a round, and its schedule of learning rates.
+
+        Args:
+            parameters: that are trained.
+            n_steps: of the round.
+        """
         make_optimizer = self.optimiser or partial(
             torch.optim.AdamW, lr=self.config.rate, weight_decay=self.weight_decay
         )

@@ -140,9 +140,14 @@ class ClassifierTrainer(Trainer):
         return sampled_lessons
 
     def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Job]:
-        """Return the jobs of the controls that have a matrix of light transport.
+        """Return the jobs that make lessons with a matrix of light transport.
 
-        Only scenes of the training may share a texture, or have other controls vary.
+        There is one for each control that has such a matrix, and each scene. Only
+        scenes of the training may share a texture, or have other controls vary.
+
+        Args:
+            split: name of the split.
+            scene_numbers: of its scenes.
         """
         is_training = split == TRAINING
         n_views = self.n_views[0] if is_training else self.n_views[1]
@@ -257,7 +262,10 @@ def _make_job(
     plain: int,
     **options: Any,
 ) -> Job:
-    """Return the job that makes lessons of a scene; see `SceneJobs.sample_lessons`."""
+    """Return the job that makes lessons of a scene.
+
+    The arguments are those of `SceneJobs.sample_lessons`.
+    """
     return partial(
         SceneJobs.sample_lessons,
         split=split,
@@ -272,7 +280,13 @@ def _make_job(
 def _accuracy(
     model: Model, chosen: Sequence[Lesson], image_of: Callable[[Lesson], Tensor]
 ) -> float:
-    """Return the fraction of lessons whose images (H, W, 3) a model gets right."""
+    """Return the fraction of lessons whose images a model gets right.
+
+    Args:
+        model: returns logits.
+        chosen: lessons, at least one.
+        image_of: returns the image (H, W, 3) of a lesson.
+    """
     n_right = 0
     with torch.no_grad():
         for start in range(0, len(chosen), lessons.BATCH_SIZE):

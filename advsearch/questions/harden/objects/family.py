@@ -146,9 +146,15 @@ def paint_atlas(
     paints: Mapping[str, Paint],
     side: int = DEFAULT_ATLAS_SIZE,
 ) -> npt.NDArray[np.float32]:
-    """Paint the texture (side, side, 3), display-referred sRGB, row 0 at the top.
+    """Paint the texture (side, side, 3) of an object, row 0 at the top.
 
-    Values are multiples of 1/255.
+    It is display-referred sRGB; values are multiples of 1/255.
+
+    Args:
+        patches: of the object.
+        rectangles: where the chart of each patch is.
+        paints: by the tags of patches.
+        side: of the texture, in texels.
     """
     image = np.zeros((side, side, 3))
     is_used = np.zeros((side, side), dtype=bool)
@@ -190,6 +196,11 @@ def join_patches(
     """Join patches into a mesh of largest extent 1, centered and standing on z = 0.
 
     Every value is rounded to `DECIMALS`.
+
+    Args:
+        patches: of the object.
+        rectangles: where the chart of each patch is in the atlas.
+        side: of the atlas, in texels.
     """
     first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
     vertices = np.concatenate([patch.vertices for patch in patches])

@@ -430,14 +430,14 @@ def _lamp_base(
             [("base", under), ("base", side), ("base", top)], columns=44
         )
     belly = radius * draw(1.12, low=0.95, high=1.4)
-    at = draw(0.38, low=0.28, high=0.6) * low  # height of the belly
+    belly_height = draw(0.38, low=0.28, high=0.6) * low  # height of the belly
     waist = [(0.45 * belly, 0.72 * low)]
     if style == "gourd":
         waist = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
     knots = [
         (radius * 0.96, 1.2),
         (radius * 0.8, 2.4),
-        (belly, at),
+        (belly, belly_height),
         *waist,
         (stem_radius * 1.5, 0.86 * low),
         (stem_radius, 0.93 * low),

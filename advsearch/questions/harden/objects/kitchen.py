@@ -37,24 +37,38 @@ def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
         radius, height: of the teapot's body.
     """
     path = _spout_path(draw, radius, height)
-    root = draw(1.75, low=1.3, high=2.2)  # radius at the body
-    end = draw(0.72, low=0.55, high=0.95)  # radius at the tip
-    scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
+    root_radius = draw(1.75, low=1.3, high=2.2)  # radius at the body
+    tip_radius = draw(0.72, low=0.55, high=0.95)  # radius at the tip
+    scale = (
+        tip_radius
+        + (root_radius - tip_radius) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
+    )
     tangent, first, second = shapes.compute_frames(path, (0.0, 1.0, 0.0))
     # points of the path that the rings are at: over the lip at the tip (the last point
     # several times) and back down inside
-    order = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
-    inner = scale[[17, 16, 15, 14, 13]] - 0.24  # less the thickness of the wall
+    ring_index = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
+    inner_radii = scale[[17, 16, 15, 14, 13]] - 0.24  # less the thickness of the wall
     radii = np.concatenate(
-        [scale, [end - 0.06, end - 0.12, inner[0], inner[1], inner[2], inner[3], 0.0]]
+        [
+            scale,
+            [
+                tip_radius - 0.06,
+                tip_radius - 0.12,
+                inner_radii[0],
+                inner_radii[1],
+                inner_radii[2],
+                inner_radii[3],
+                0.0,
+            ],
+        ]
     )
     # the rings of the lip lie a little ahead of the tip, so that it is round
-    push = np.zeros(len(order))
-    push[18:21] = (0.1, 0.12, 0.06)
-    frame = (tangent[order], first[order], second[order])
+    ahead = np.zeros(len(ring_index))
+    ahead[18:21] = (0.1, 0.12, 0.06)
+    frame = (tangent[ring_index], first[ring_index], second[ring_index])
     return shapes.sweep(
         "spout",
-        path[order] + push[:, None] * tangent[order],
+        path[ring_index] + ahead[:, None] * tangent[ring_index],
         shapes.ellipse(1.0, 1.0, count=20),
         radii,
         frame=frame,
@@ -217,7 +231,7 @@ def _teapot_handle(
 
 
 def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
-    """Sample the paints of a teapot."""
+    """Sample the paints of a teapot of a height, by the tags of its parts."""
     offset = draw.offset()
     clay = draw.sample_color(
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
@@ -378,7 +392,13 @@ def _pan_rivets(radius: float, height: float) -> list[Patch]:
 
 
 def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, Paint]:
-    """Sample the paints of a pan with a radius and a depth."""
+    """Sample the paints of a pan, by the tags of its parts.
+
+    Args:
+        draw: samples the paints.
+        rim: radius of its rim.
+        depth: height of its rim.
+    """
     offset = draw.offset()
     coat = draw.sample_color("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
 

@@ -170,8 +170,14 @@ def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
 
 
 def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Array:
-    """Return a centered rounded rectangle as a closed counter-clockwise section (M,
-    2).
+    """Return a rounded rectangle around the origin as a closed section (M, 2).
+
+    It is counter-clockwise.
+
+    Args:
+        width, height: of the rectangle.
+        bevel: distance from a corner at which its rounding begins.
+        steps: edges of a rounded corner.
     """
     # The first two corners are repeated at the end: the outermost corners of the
     # polyline are not rounded, and are cut off.
@@ -230,8 +236,12 @@ def transform_patches(
     rotation: Array | None = None,
     offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Patch]:
-    """Rotate patches by a matrix (3, 3), then translate them, with what is painted on
-    them.
+    """Rotate patches, then translate them, together with what is painted on them.
+
+    Args:
+        patches: to move; they are not changed.
+        rotation: matrix (3, 3); None for no rotation.
+        offset: (3,).
     """
     matrix = np.eye(3) if rotation is None else rotation
     translation = np.asarray(offset, dtype=np.float64)
@@ -634,7 +644,15 @@ def sphere(
     rows: int = 24,
     columns: int = 40,
 ) -> list[Patch]:
-    """Create a sphere of three charts: two polar caps and a band."""
+    """Create a sphere of three charts: two polar caps and a band.
+
+    Args:
+        tag: of the paint.
+        radius: of the sphere.
+        centre: of the sphere.
+        rows: faces from pole to pole.
+        columns: faces around the z axis.
+    """
     angle = np.pi * np.arange(rows + 1) / rows - np.pi / 2
     curve = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     # exactly on the axis, which a cosine is not

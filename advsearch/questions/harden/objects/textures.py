@@ -299,7 +299,10 @@ def checks(t: Texels, a: Color, b: Color, cell: float) -> Array:
 
 
 def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
-    """Paint round dots in staggered rows over another paint; the radius is in cells."""
+    """Paint round dots over another paint, in rows that are staggered by half a cell.
+
+    Cells are about `cell` wide; the radius of the dots is in cells.
+    """
 
     def staggered(t: Texels) -> Array:
         """Return the mask of the dots; every other row is shifted by half a cell."""

@@ -384,7 +384,7 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
         The height of its shoulder, where the body begins to narrow; and its patches.
     """
     radius = draw(3.75, low=3.0, high=4.8)
-    neck = draw(1.35, low=1.0, high=1.7)
+    neck_radius = draw(1.35, low=1.0, high=1.7)
     shoulder = height * draw(0.62, low=0.45, high=0.68)
     rise = height * draw(0.15, low=0.08, high=0.22)
     slope = draw(0.35, low=0.1, high=0.8)  # 0: square shoulder, 1: sloping
@@ -394,22 +394,22 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
         (radius * taper, 0.02 * height),
         (radius, shoulder),
         (
-            neck + (radius - neck) * (0.55 - 0.35 * slope),
+            neck_radius + (radius - neck_radius) * (0.55 - 0.35 * slope),
             shoulder + rise * (0.6 - 0.25 * slope),
         ),
-        (neck * 1.03, shoulder + rise),
-        (neck * 0.95, height - 1.6),
+        (neck_radius * 1.03, shoulder + rise),
+        (neck_radius * 0.95, height - 1.6),
     ]
     curve = shapes.round_corners(
         corners, radius=[0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], steps=7
     )
     # the thicker ring around the mouth
-    wide = neck * 0.95 + draw(0.28, low=0.1, high=0.4)
+    ring_radius = neck_radius * 0.95 + draw(0.28, low=0.1, high=0.4)
     ring = [
-        (wide, height - 1.5),
-        (wide, height - 0.6),
-        (neck * 0.97, height - 0.5),
-        (neck * 0.93, height),
+        (ring_radius, height - 1.5),
+        (ring_radius, height - 0.6),
+        (neck_radius * 0.97, height - 0.5),
+        (neck_radius * 0.93, height),
     ]
     capped = draw.chance(0.4)
     outside = np.concatenate([shapes.subdivide(curve, longest=1.6), ring])
@@ -417,7 +417,7 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
         outside, wall=draw(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
     )
     if capped:
-        patches += _cap(draw, wide + 0.12, height)
+        patches += _cap(draw, ring_radius + 0.12, height)
     return shoulder, patches
 
 
