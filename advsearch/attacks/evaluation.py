@@ -325,8 +325,9 @@ class Policy(ABC, Generic[State]):
 
         Every evaluation is as `Evaluation.sanitize` leaves it: its gradient (None where
         it was not asked for or could not be paid) is finite, and its objective is
-        finite or -inf, which stands for "could not be evaluated". The objective is noisy: the same u with another
-        seed gives another value, and a maximum over many is biased upwards.
+        finite or -inf, which stands for "could not be evaluated". The objective is
+        noisy: the same u with another seed gives another value, and a maximum over many
+        is biased upwards.
         """
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:

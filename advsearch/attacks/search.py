@@ -351,7 +351,13 @@ class _Log:
             started = time.perf_counter()
 
     def _count(self, proposal: Proposal, evaluation: Evaluation, phase: Phase) -> None:
-        """Count the costs of an evaluation; one of the search may be a candidate."""
+        """Count the costs of an evaluation; one of the search may become a candidate.
+
+        Args:
+            proposal: of the policy.
+            evaluation: sanitized.
+            phase: "search" or "ranking".
+        """
         if proposal.gradient:
             self.gradients += 1
         self.renders += evaluation.cost
@@ -368,7 +374,14 @@ class _Log:
     def _make_record(
         self, proposal: Proposal, query: Query, evaluation: Evaluation, seconds: float
     ) -> StepRecord:
-        """Return the record of an evaluation, which is counted already."""
+        """Return the record of an evaluation, which `_count` has counted already.
+
+        Args:
+            proposal: of the policy.
+            query: that was made of it.
+            evaluation: sanitized.
+            seconds: that it took.
+        """
         objective = math.nan
         if evaluation.is_finite:
             objective = evaluation.objective

@@ -341,14 +341,15 @@ def verify(
     first look at which the claim is found to hold. Over conditions, a look is at that
     many trials that count (`OVER_LOOKS`), and the last look at that many in all.
 
-    Curtailed trials end with the first failure that is one more than the rule allows of
-    all of them. The verdict is that of all trials, whatever the rest would have said,
-    and the Clopper-Pearson interval of those that were made still covers the rate as
-    often as it says: it contains the exact interval of that stopping rule, under which
-    an outcome is the better the later it stops (Jennison and Turnbull 1983). Trials
-    with several looks are always curtailed, but have at least `Rule.min_trials`, so
-    that they say something of the rate; that their intervals cover it is shown by the
-    probability of every outcome (`benchmarks/verdicts.py`).
+    Curtailed trials end as soon as more have failed than the rule allows of all of
+    them: whatever the rest would say, the verdict would be the same. The
+    Clopper-Pearson interval of those that were made still covers the rate as often as
+    it says, as it contains the exact interval of that stopping rule, by which an
+    outcome is the better the later the trials end (Jennison and Turnbull 1983).
+
+    Trials with several looks are always curtailed, but there are at least
+    `Rule.min_trials`, so that they say something of the rate. That their intervals
+    cover it is shown by the probability of every outcome (`benchmarks/verdicts.py`).
 
     Args:
         evaluate: answers the queries.

@@ -163,8 +163,11 @@ class Source:
 def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
     """Return the source of a module, which is frozen.
 
-    Its dtype and device are those of its first floating-point parameter or buffer,
-    unless `fields`, which go to `Source`, state them.
+    Args:
+        module: the network.
+        name: of the model.
+        **fields: of `Source`. Dtype and device are by default those of the module's
+            first floating-point parameter or buffer.
 
     Raises:
         ModelError: it has lazy layers that have no weights yet.

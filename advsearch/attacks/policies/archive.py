@@ -303,6 +303,7 @@ class MapElites(Policy[ArchiveState]):
             )
         seed = policies.draw_seed(generator)
         measure_indices = self._find_measure_indices(domain)
+        # number of cells along each axis
         dims = [
             options or self.cells
             for options in domain.options[measure_indices].tolist()

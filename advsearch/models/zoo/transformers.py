@@ -94,6 +94,7 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         transformers.utils.logging.disable_progress_bar()
     where: dict[str, Any] = {"revision": revision} if revision else {}
     with report_library_errors(spec, ADVICE):
+        # otherwise each file would be tried for half a minute
         if not Path(name).is_dir() and _is_hub_unreachable(name):
             where["local_files_only"] = True
         saved = _load_config(transformers, name, spec, where)

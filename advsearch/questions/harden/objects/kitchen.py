@@ -37,8 +37,8 @@ def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
         radius, height: of the teapot's body.
     """
     path = _spout_path(draw, radius, height)
-    root_radius = draw(1.75, low=1.3, high=2.2)  # radius at the body
-    tip_radius = draw(0.72, low=0.55, high=0.95)  # radius at the tip
+    root_radius = draw(1.75, low=1.3, high=2.2)
+    tip_radius = draw(0.72, low=0.55, high=0.95)
     scale = (
         tip_radius
         + (root_radius - tip_radius) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3

@@ -418,6 +418,8 @@ def _round_spine(
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
     cosine = np.cos(angle)
     sine = np.sin(angle)
+    # points (x, z); -width / 2 + 0.25 is the edge of the covers, which the spine
+    # overlaps a little on both sides
     outer = np.stack(
         [-width / 2 + 0.25 - bulge * cosine - 0.1, half + half * sine], axis=1
     )
