@@ -356,7 +356,7 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
     network.
     """
     for library, recognizer in list_built_ins("recognizer").items():
-        if library in sys.modules:
+        if library in sys.modules:  # else no network of it can exist
             recognize: Callable[[nn.Module, Purpose], Source | None] = load_attribute(
                 recognizer.target
             )

@@ -512,7 +512,13 @@ def check_images(images: Tensor) -> Tensor:
 
 
 def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
-    """Read the output from what a network returned for `count` images.
+    """Read the output from what a network returned.
+
+    Args:
+        read: reads it; see `Read`.
+        returned: by the network.
+        count: number of images.
+        name: of the model, for messages.
 
     Raises:
         ModelError: there is no output, or not one for each image.
@@ -523,6 +529,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
         advice = _advise_on_missing_scores(returned)
         if not advice:
             likely_task = _guess_task(returned)
+            # `read` is usually the method of a task.
             task = getattr(getattr(read, "__self__", None), "name", None)
             # Actions look like rows of scores.
             if likely_task and task not in (likely_task, "command"):
@@ -587,6 +594,12 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
 
     Accepted are a tensor, an object with a tensor `logits`, a mapping with a tensor
     ``"logits"``, and a tuple or list whose first element is a tensor.
+
+    Args:
+        output: of the network.
+        count: number of images.
+        classes: number of classes; None if it is unknown.
+        name: of the model, for messages.
 
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.

@@ -244,6 +244,7 @@ class Detection(ClassTask):
                 else:
                     doubts = box_format.describe_fault(right_boxes)
                 return replace(task, doubts=doubts)
+        # no box of a right class, or no true box to compare with
         boxes = select_best_boxes(output)
         fault = box_format.describe_fault(boxes)
         doubts = fault and f"{fault}{box_format.suggest_plausible_formats(boxes)}"

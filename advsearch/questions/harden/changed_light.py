@@ -75,9 +75,10 @@ def change_white_light(
 ) -> assets.EnvironmentAsset:
     """Change the color temperature of an environment in half of the cases.
 
-    Relative to daylight (D65), what a black body of 2,700 K (an incandescent lamp)
-    gives in linear sRGB is about exp(`WARM`), and one of 10,000 K (a clear sky in the
-    shade) about exp(-0.24 `WARM`); the amount is uniform between.
+    The linear sRGB channels are multiplied by exp(a * `WARM`), with a uniform in
+    `WARM_RANGE`. Relative to daylight (D65), the light of a black body of 2,700 K (an
+    incandescent lamp) has a of about 1, and that of 10,000 K (a clear sky in the shade)
+    about -0.24.
     """
     if rng.random() >= WHITE_LIGHT_CHANGES:
         return environment

@@ -68,9 +68,14 @@ class ParameterSampler:
         return self.rng.uniform(0.0, 16.0, 3)
 
     def sample_color(self, canonical: str, *others: str, wild: float = 0.4) -> Color:
-        """Return a color near one of those named, or with probability `wild` any color.
+        """Return a color (3,) near one of those named, or with probability `wild` any
+        color.
 
         Without a generator it is the canonical one.
+
+        Args:
+            canonical, *others: codes of six hexadecimal digits, all equally likely.
+            wild: probability of any other color.
         """
         rng = self.rng
         if rng is None:

@@ -280,12 +280,14 @@ def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
     deep = draw.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
     accent = clouded(deep, factor=1.35, scale=2.2, offset=offset)
     outer = paint_or_random(draw, height, _ceramic(draw, height, glaze, accent))
+    # the inside is seldom decorated; else it is glazed or of one color
     inner = outer
     if not draw.chance(0.15):
         inner = glaze
         if draw.chance(0.5, canonical=True):
             inner = solid(draw.sample_color("efe6d4", "f3f1ec", wild=0.3))
     raw_clay = solid("a98663")
+    # the foot may be left without a glaze
     outside = outer
     if draw.chance(0.4, canonical=True):
         outside = over(outer, between(-1.0, 0.35, soft=0.1), raw_clay)
