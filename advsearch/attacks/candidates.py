@@ -228,6 +228,7 @@ def estimate_failure_rate(
     lower_x = weights * (failed & ~unknown)
     upper_x = weights * (failed | unknown)
     bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]  # (bets, 1)
+    # The sum over bets below is `N_BETS` times the capital, which is their mean.
     log_limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
 
     def is_too_low(p: float) -> bool:
@@ -447,6 +448,7 @@ def find_smallest_change(
         passed in the full budget, its `low` is 1 and its `u` None.
     """
     u = search(domain, 0)
+    # after one search and one configuration that goes through the trials
     state = Bracket(0.0, math.inf, None, 1, 1)
     if not passes(u, 0):
         return replace(state, low=1.0)

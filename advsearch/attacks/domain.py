@@ -62,6 +62,7 @@ class Block:
     reach: float | None = None
 
     def __post_init__(self) -> None:
+        """Check that every attribute is within its limits."""
         where = f" of {self.name!r}" if self.name else ""
         if self.size < 1:
             raise InputError(
@@ -165,6 +166,7 @@ class Domain:
     """(d,) float32 bounds; those of an l-infinity ball are cut into them already."""
 
     def __post_init__(self) -> None:
+        """Copy the start, compute the bounds of each element, and check all of them."""
         start = self.start.detach().to(torch.float32, copy=True)
         total = sum(block.size for block in self.blocks)
         if start.ndim != 1 or start.numel() != total:
@@ -255,11 +257,13 @@ class Domain:
         ]
 
     def project(self, u: Tensor) -> Tensor:
-        """Return the configuration (d,) of the domain that is nearest to u (d,), both
-        float32, finite, block by block (Euclidean; periodic blocks wrap instead).
-        Configurations inside come back bit for bit.
+        """Return the configuration (d,) of the domain that is nearest to u (d,).
 
-        An l-infinity ball cut by bounds is itself a box, so clipping is exact; for an
+        Nearest is meant block by block, by the Euclidean distance; periodic blocks wrap
+        instead. Both are float32 and finite. A u inside the domain comes back bit for
+        bit.
+
+        An l-infinity ball cut by bounds is itself a box, so clipping is exact. For an
         l2 ball see `project_l2_box`.
         """
         u = u.detach()
@@ -275,17 +279,18 @@ class Domain:
                 )
                 # rounding of the sum may leave the bounds
                 wrapped.clamp_(block.low, block.high)
+                # what clipping leaves alone is inside, and stays as it is
                 projected[part] = torch.where(
                     u[part] == projected[part], projected[part], wrapped
                 )
         return projected
 
     def violation(self, u: Tensor) -> float:
-        """Return how far u lies outside: 0 inside, infinity where u has NaN or infinite
-        elements.
+        """Return how far u (d,) lies outside of the domain.
 
-        It is the largest of the distances past a bound and of the excesses of l2 norms.
-        An excess is what a norm has beyond its radius and what rounding may add; it is
+        It is 0 inside, and infinity where u has NaN or infinite elements. Otherwise it
+        is the largest of the distances past a bound and of the excesses of l2 norms. An
+        excess is by how much a norm is beyond its radius and what rounding may add,
         divided by the radius if that is over 1.
         """
         excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
@@ -334,6 +339,7 @@ class Domain:
                     u[part] = self.start[part] + (noise * 2.0 - 1.0) * far_distance
                 else:  # uniform in the ball (Muller 1959)
                     direction = torch.randn(block.size, generator=generator)
+                    # A uniform number to the power 1/d is the radius of such a point.
                     length = block.epsilon * math.pow(float(noise[0]), 1.0 / block.size)
                     direction *= length / max(
                         float(torch.linalg.vector_norm(direction)), 1e-30
@@ -418,7 +424,8 @@ def project_l2_box(
     over 0. The point is rounded towards the centre, so that rounding leaves no ball.
     Points inside come back bit for bit; projecting again changes at most the last bits.
     """
-    # v_i^2 and room_i^2 in chunks, and their sums
+    # v_i^2 and room_i^2 in chunks, and their sums. Where u_i is within the bounds, v_i
+    # stands in for room_i, which is larger: for s up to 1 the minimum is the same.
     squares = []
     rooms = []
     squared_distance = 0.0
@@ -454,8 +461,10 @@ def _solve_multiplier(
         slope = 0.0
         for square, room in zip(squares, rooms, strict=True):
             scaled = square * s
+            # elements that have reached their bound grow no further with s
             slope += float(torch.dot(square, (scaled < room).to(square.dtype)))
             value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
+        # Newton's step; where nothing grows any more, it stays
         next_s = s + (radius**2 - value) / slope if slope > 0.0 else s
         if next_s <= s * (1.0 + 1e-7):
             break
@@ -604,6 +613,7 @@ class SampleSequence:
         self._sampler = sampler
         self._seed = seed
         self._name = name
+        # rounded down to a power of two, so that blocks divide a net
         rows = max(1, min(NET, MAX_BLOCK_VALUES // max(1, dimensions)))
         self._rows = 1 << (rows.bit_length() - 1)
         self._block_index = -1

@@ -272,6 +272,9 @@ class Policy(ABC, Generic[State]):
     handles_choices: ClassVar[bool] = False
 
     def __init_subclass__(cls, **more: Any) -> None:
+        """Refuse the old name of a method, and give a user's class copies of what it is
+        passed.
+        """
         super().__init_subclass__(**more)
         if "answer" in vars(cls):
             raise InputError(
@@ -320,10 +323,11 @@ class Policy(ABC, Generic[State]):
         """Return the state after what was proposed last was evaluated, all of it, or
         the first of it where the budget ends.
 
-        Every evaluation is `usable`: its gradient (None where it was not asked for or
-        could not be paid) is finite, and its objective is finite or -inf, which stands
-        for "could not be evaluated". The objective is noisy: the same u with another
-        seed gives another value, and a maximum over many is biased upwards.
+        Every evaluation is as `Evaluation.sanitize` leaves it: its gradient (None where
+        it was not asked for or could not be paid) is finite, and its objective is
+        finite or -inf, which stands for "could not be evaluated". The objective is
+        noisy: the same u with another seed gives another value, and a maximum over many
+        is biased upwards.
         """
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:

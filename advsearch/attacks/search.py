@@ -351,7 +351,13 @@ class _Log:
             started = time.perf_counter()
 
     def _count(self, proposal: Proposal, evaluation: Evaluation, phase: Phase) -> None:
-        """Count the costs of an evaluation; one of the search may be a candidate."""
+        """Count the costs of an evaluation; one of the search may become a candidate.
+
+        Args:
+            proposal: of the policy.
+            evaluation: sanitized.
+            phase: "search" or "ranking".
+        """
         if proposal.gradient:
             self.gradients += 1
         self.renders += evaluation.cost
@@ -368,7 +374,14 @@ class _Log:
     def _make_record(
         self, proposal: Proposal, query: Query, evaluation: Evaluation, seconds: float
     ) -> StepRecord:
-        """Return the record of an evaluation, which is counted already."""
+        """Return the record of an evaluation, which `_count` has counted already.
+
+        Args:
+            proposal: of the policy.
+            query: that was made of it.
+            evaluation: sanitized.
+            seconds: that it took.
+        """
         objective = math.nan
         if evaluation.is_finite:
             objective = evaluation.objective
@@ -410,11 +423,19 @@ def _explore(
     seed: int,
     is_out_of_time: IsOutOfTime,
 ) -> Ending:
-    """Let the policy propose until the budget is spent, or it has nothing more to
-    propose, or the time is over, or objectives are not finite; return which.
+    """Let the policy propose until there is a reason to stop; return that.
 
-    The end of the time counts as that of the budget. The log has the policy's state
-    and the evaluations since then, so that an interrupted search can use them.
+    Reasons are that the budget is spent, the time is over (which counts as the same),
+    the policy has nothing more to propose, or objectives are not finite. The log has
+    the policy's state and the evaluations since then, so that an interrupted search can
+    use them.
+
+    Args:
+        log: of the search; it is changed.
+        policy: that proposes.
+        steps: renders of the search.
+        seed: root seed of the policy's randomness.
+        is_out_of_time: returns whether the time is over.
     """
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name = policy.name
@@ -457,8 +478,12 @@ def _explore(
 def _limit_batch(
     proposals: Sequence[Proposal], domain: Domain, renders_left: int
 ) -> list[Proposal]:
-    """Return copies of the first proposals, as many and as costly as the renders
-    allow.
+    """Return copies of the first proposals, as many and as costly as the renders allow.
+
+    Args:
+        proposals: of the policy.
+        domain: states what gradients cost.
+        renders_left: of the budget.
     """
     batch = list[Proposal]()
     for proposal in proposals:

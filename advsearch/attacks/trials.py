@@ -90,6 +90,11 @@ def make_margin_function(
     n_rendered = Counter[int]()
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
+        """Return the margin of a render for each seed.
+
+        The first `n_images` renders of each sample count are those whose images are
+        requested.
+        """
         numbers = range(n_rendered[spp], n_rendered[spp] + len(seeds))
         rows = enumerate(zip(seeds, numbers, strict=True), n_rendered.total())
         n_rendered[spp] += len(seeds)
@@ -275,11 +280,11 @@ def _climb_ladder(
     """
     margins_of_rungs: list[list[float]] = [[] for _ in ladder]
     n_looks = len(look_sizes)
-    looks = list(product(range(1, len(ladder)), look_sizes))
-    for look_index, (level, count) in enumerate(looks):
+    all_looks = list(product(range(1, len(ladder)), look_sizes))
+    for look_index, (level, count) in enumerate(all_looks):
         if not any(
             _may_settle(margins_of_rungs, ladder, *later_look, n_looks)
-            for later_look in looks[look_index:]
+            for later_look in all_looks[look_index:]
         ):
             break
         if not _may_settle(margins_of_rungs, ladder, level, count, n_looks):
@@ -315,13 +320,16 @@ def _is_settled(
     mean = fmean(at_rung)
     count = min(len(at_rung), len(below))
     deviation = _compute_deviation(at_rung)
-    # the mean if the rest of the noise changed it as much as the step from below did
+    # m + (m - m'): the mean if the rest of the noise changed it as much as the step
+    # from below did
     extrapolated = 2.0 * mean - fmean(below)
     extrapolated_error = math.hypot(
         2.0 * deviation, _compute_deviation(below)
     ) / math.sqrt(count)
     sign = math.copysign(1.0, mean)
     quantile = _compute_quantile(count, looks)
+    # If the renders are as many as the trials, the standard error of their mean; else
+    # the deviation of a single render, as every trial has to be on the same side.
     error = deviation / math.sqrt(count) if count == trials else deviation
     is_mean_sure = sign * mean > quantile * error
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
@@ -369,6 +377,7 @@ def _may_settle(
             ladder[last_rung] / ladder[rung]
         )
 
+    # that of 2 m - m', as in `_is_settled`
     error = math.hypot(2.0 * estimate_deviation(level), estimate_deviation(level - 1))
     return error * _compute_quantile(count, looks) / math.sqrt(count) <= max_mean
 

@@ -173,11 +173,10 @@ class Rule:
         return self.has_control and 2 * clean.successes < clean.trials
 
     def decide(self, successes: int, trials: int) -> bool | None:
-        """Return whether a configuration is a success by its trials; None if that
-        depends on the noise.
+        """Return whether a configuration is a success by its trials.
 
-        It does if there are both more successes and more failures than the rule allows
-        of failures.
+        None if that depends on the noise: there are both more successes and more
+            failures than the rule allows failures.
         """
         if min(successes, trials - successes) > self.count_allowed_failures(trials):
             return None
@@ -342,14 +341,15 @@ def verify(
     first look at which the claim is found to hold. Over conditions, a look is at that
     many trials that count (`OVER_LOOKS`), and the last look at that many in all.
 
-    Curtailed trials end with the first failure that is one more than the rule allows of
-    all of them. The verdict is that of all trials, whatever the rest would have said,
-    and the Clopper-Pearson interval of those that were made still covers the rate as
-    often as it says: it contains the exact interval of that stopping rule, under which
-    an outcome is the better the later it stops (Jennison and Turnbull 1983). Trials
-    with several looks are always curtailed, but have at least `Rule.min_trials`, so
-    that they say something of the rate; that their intervals cover it is shown by the
-    probability of every outcome (`benchmarks/verdicts.py`).
+    Curtailed trials end as soon as more have failed than the rule allows of all of
+    them: whatever the rest would say, the verdict would be the same. The
+    Clopper-Pearson interval of those that were made still covers the rate as often as
+    it says, as it contains the exact interval of that stopping rule, by which an
+    outcome is the better the later the trials end (Jennison and Turnbull 1983).
+
+    Trials with several looks are always curtailed, but there are at least
+    `Rule.min_trials`, so that they say something of the rate. That their intervals
+    cover it is shown by the probability of every outcome (`benchmarks/verdicts.py`).
 
     Args:
         evaluate: answers the queries.
@@ -373,6 +373,7 @@ def verify(
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     has_several_looks = len(looks) > 1
+    # so many are made even if the verdict stands sooner
     min_trials = rule.min_trials if has_several_looks and not curtailed else 0
     u = domain.project(u)
     clean_trials = list(clean)
@@ -399,7 +400,7 @@ def verify(
             n_images=n_images,
             is_decided=is_decided,
         )
-        is_early = count < looks[-1]
+        is_early = count < looks[-1]  # whether trials may follow
         is_success = _is_found(
             rule, done, clean_trials, count, spp=spp, is_early=is_early
         )
@@ -432,8 +433,14 @@ def _extend_clean_trials(
 ) -> int:
     """Run clean trials until `look` of them count; return how many there are then.
 
-    Over conditions, clean trials that are wrong do not count, so that more are run, up
-    to `max_trials`. New trials are appended to `clean_trials`.
+    Over conditions, clean trials that are wrong do not count, so that more are run.
+
+    Args:
+        clean_trials: so far; new ones are appended.
+        run_clean: runs trials, see `run_trials`.
+        rule: says which trials count.
+        look: number of trials that have to count.
+        max_trials: maximum number of trials.
     """
     count = look
     clean_trials += run_clean(trials=count, n_done=len(clean_trials))
@@ -454,10 +461,15 @@ def _is_found(
     spp: int,
     is_early: bool,
 ) -> bool:
-    """Return whether enough trials succeed at a look, and the clean configuration is
-    not wrong already.
+    """Return whether enough trials succeed at a look, and the clean ones are not wrong.
 
-    The look is at the first `count` trials; `is_early` is whether more could follow.
+    Args:
+        rule: says how many have to succeed.
+        trials: of the adversarial configuration.
+        clean_trials: of the same seeds, or more.
+        count: trials that are looked at, the first ones.
+        spp: samples per pixel.
+        is_early: whether more trials could follow.
     """
     clean_looked_at = clean_trials[:count]
     n_needed = rule.count_needed(rule.count_valid(clean_looked_at), early=is_early)
@@ -498,7 +510,17 @@ def _summarize_trials(
 ) -> Verification:
     """Return the verification that the trials of both groups make.
 
-    `is_early` is whether the needed successes are those of an early look.
+    Args:
+        rule: says what a success is, and how many are needed.
+        claim: the search's ending.
+        u: (d,) the configuration.
+        clean_trials, trials: of both groups, in the order of their seeds.
+        spp: samples per pixel.
+        confidence: of the interval of the success rate.
+        renders: that were spent.
+        stopped: why there are no more trials.
+        is_early: whether the needed successes are those of an early look.
+        begin: index of the first trial.
     """
     outcomes = _list_outcomes(rule, trials, clean_trials)
     n_counted = max(1, len(outcomes) - outcomes.count(None))

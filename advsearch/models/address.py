@@ -248,7 +248,7 @@ class _TrackingHandler(urllib.request.AbstractHTTPHandler):
         kind = _SecureConnection if is_secure else _Connection
 
         def make_connection(host: str, **settings: Any) -> _Connection:
-            """Make a connection to a host, as `http_class` does."""
+            """Make a connection to a host as `http_class` does, and note it."""
             connection = kind(host, **settings)
             connection.deadline = self._deadline
             self._connections.append(connection)
@@ -359,10 +359,13 @@ class AddressModel(models.RemoteNetwork):
     def _get_answers(
         self, requests: Sequence[tuple[Image8Bit, int]]
     ) -> list[dict[str, Any]]:
-        """Return the answer to each image and turn: a stored one, or a new one, which
-        is stored as it arrives.
+        """Return the answer to each image and turn: a stored one, or a new one.
 
-        Trials are each sent, since their noise differs, and so their images.
+        New answers are stored as they arrive. The same image is asked about once for
+        each turn; trials are all sent, since their noise differs, and so their images.
+
+        Args:
+            requests: images, each with the number of the request about it, from 0.
         """
         keys = list[str]()
         answers = dict[str, Any]()
@@ -520,6 +523,8 @@ class AddressModel(models.RemoteNetwork):
             )
             failures = list[str]()
             retries = list[_Request]()
+            # whether nothing was sent before this wave, so that a refused connection
+            # means that there is no server
             is_first = self.spent["calls"] <= len(wave)
             for request, response in zip(wave, responses, strict=True):
                 if isinstance(response, dict):
@@ -620,7 +625,11 @@ class AddressModel(models.RemoteNetwork):
     def _try_to_send(
         self, body: bytes, deadline: float, connections: list[_Connection]
     ) -> dict[str, Any] | Exception:
-        """Return the response to a body, or the error that a later try may not have."""
+        """Return the response to a body, or the error, as a later try may succeed.
+
+        The arguments are those of `_send_body`. The body of an HTTP error is read here,
+        as the connection is closed afterwards.
+        """
         try:
             return self._send_body(body, deadline, connections)
         except urllib.error.HTTPError as error:
@@ -679,7 +688,17 @@ class AddressModel(models.RemoteNetwork):
     def _send_body(
         self, body: bytes, deadline: float, connections: list[_Connection]
     ) -> dict[str, Any]:
-        """Send one body, and return the JSON object in the response."""
+        """Send one body, and return the JSON object in the response.
+
+        Args:
+            body: JSON.
+            deadline: of the connection, as `time.monotonic` counts.
+            connections: list that the connection is added to.
+
+        Raises:
+            ModelError: the response is too long, or something else. OSError,
+                http.client.HTTPException: it cannot be sent, or there is no response.
+        """
         key = models.read_key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)

@@ -144,6 +144,7 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
     ]
     if not usable:
         return None
+    # layers with an output for each class
     heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     last = (heads or usable)[-1]
     attribute = "input" if heads else "output"
@@ -151,6 +152,7 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
         return None
 
     def read(batch: Tensor) -> Tensor:
+        """Return the features (N, F) of a batch, by running the network on it."""
         call = calls(model.module, batch, last.layer)[-1]
         value: Tensor = getattr(call, attribute)
         channels_last = value.movedim(last.axis, -1)
@@ -162,8 +164,12 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
 
 
 def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
-    """Return the calls of the layers of a module in their order, or those of a single
-    layer; none of a program.
+    """Return the calls of the layers of a module in their order, by hooks.
+
+    Args:
+        network: any; other things than modules, and programs, have no such calls.
+        x: a batch to run it on.
+        only: the only layer of interest; None for all.
     """
     calls: list[_Call] = []
     if not isinstance(network, nn.Module) or isinstance(
@@ -182,6 +188,7 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         kwargs: dict[str, Tensor],
         output: Tensor,
     ) -> None:
+        """Record a call of a layer, which a hook calls after it."""
         input = args[0] if args else kwargs["input"]
         if len(input) == len(output) and input.dim() > 1:
             name = f"{names[layer] or 'the network'} ({type(layer).__name__})"

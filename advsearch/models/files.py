@@ -179,7 +179,12 @@ def _find_archive_kind(archive: Archive) -> str:
 
 
 def _describe_file(path: Path, head: bytes) -> str:
-    """Describe a file that is no zip archive by its first bytes and its suffix."""
+    """Describe what a file may be that is no zip archive, and what to do about it.
+
+    Args:
+        path: of the file, whose suffix is looked at.
+        head: its first 16 bytes.
+    """
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30:
         return (
             "safetensors hold weights but no network; name what builds it: "
@@ -269,7 +274,13 @@ def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
 
 
 def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
-    """Return whether a program takes the images of a rig, (N, K, ...).
+    """Check the inputs of a program; return whether they are the images of a rig (N, K,
+    ...).
+
+    Args:
+        source: of the program, for messages.
+        names: of the inputs.
+        inputs: example values of each, with their shapes.
 
     Raises:
         ModelError: it takes neither these nor images, with or without vectors.

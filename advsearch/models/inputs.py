@@ -41,6 +41,7 @@ class WithImageSize(nn.Module):
     def __init__(
         self, network: Callable[..., Any], size_type: torch.dtype, layout: str
     ) -> None:
+        """Wrap the network; a wrapper is always in evaluation mode."""
         super().__init__()
         self.network = network
         self.size_type = size_type

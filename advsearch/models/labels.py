@@ -176,7 +176,13 @@ def _find_class(
 
 
 def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
-    """Return a hint for an unknown label: names like it, or what labels there are."""
+    """Return a hint for an unknown label: names like it, or what labels there are.
+
+    Args:
+        term: that is unknown.
+        labels: of the model.
+        named: whether these are names, not placeholders.
+    """
     if not named:
         fitting = "".join(
             f" or `labels={name}`" for name in list_sets_of_size(len(labels))
@@ -345,6 +351,7 @@ def list_sets_of_size(classes: int) -> list[str]:
 def _load_label_sets() -> dict[str, tuple[str, ...]]:
     """Load the names of classes of all `SETS`."""
     stored = json.loads((DATA / "labels.json").read_text("utf-8"))
+    # without its first name, which stands for the background
     stored["coco90"] = stored["coco91"][1:]
     return {name: tuple(stored[name]) for name in SETS}
 

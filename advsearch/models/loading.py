@@ -245,7 +245,16 @@ def _probe_source(
     names: tuple[str, ...] | None,
     origin: LabelsOrigin,
 ) -> Model:
-    """Create a model from a source and the options of `load_model`, and probe it."""
+    """Create a model from a source and the options of `load_model`, and probe it.
+
+    Args:
+        source: of the network.
+        options: that are set.
+        read: reads the network's output; None for logits.
+        name: of the model; None for that of the source.
+        names: of classes; None for those of the source.
+        origin: of the names, for messages.
+    """
     min_batch, max_batch = source.batch_limits
     max_batch = min(max_batch, options.get("max_batch") or max_batch)
     preprocessing = _make_preprocessing(source, options)
@@ -347,7 +356,7 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
     network.
     """
     for library, recognizer in list_built_ins("recognizer").items():
-        if library in sys.modules:
+        if library in sys.modules:  # else no network of it can exist
             recognize: Callable[[nn.Module, Purpose], Source | None] = load_attribute(
                 recognizer.target
             )
@@ -467,6 +476,12 @@ def _parse_numbers(
     key: str, value: Any, counts: tuple[int, ...], expected: str
 ) -> tuple[float, ...]:
     """Parse finite numbers from a number, a sequence, or a string with commas.
+
+    Args:
+        key: name of the option, for messages.
+        value: to parse.
+        counts: how many there may be.
+        expected: what is expected, for messages.
 
     Raises:
         InputError: they are no numbers, or their count is none of `counts`.

@@ -40,6 +40,15 @@ class _Recomputed(torch.autograd.Function):
     def forward(
         ctx: Any, ask: Callable[[Tensor], Any], structure: list[Any], images: Tensor
     ) -> tuple[Tensor, ...]:
+        """Return the tensors in what a function returns for images, without a graph.
+
+        Args:
+            ctx: stores what `backward` needs.
+            ask: the function; it is called again for the gradient.
+            structure: gets how the tensors are nested appended, as only tensors may be
+                returned.
+            images: (N, H, W, 3).
+        """
         tensors, tree = tree_flatten(ask(images))  # autograd is off in here
         structure.append(tree)
         ctx.ask = ask
@@ -51,6 +60,11 @@ class _Recomputed(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[None, None, Tensor]:
+        """Return the gradient by the images, for the gradients of all returned tensors.
+
+        The function is computed again, this time with a graph. Its other arguments have
+        no gradient (None).
+        """
         (images,) = ctx.saved_tensors
         # Gradients are on if this gradient is to be differentiated once more.
         create_graph = torch.is_grad_enabled()
@@ -385,8 +399,9 @@ class Model:
     def prepare(self, images: Tensor) -> Tensor:
         """Preprocess images (N, H, W, 3), at most a batch of them, for the network.
 
-        They get the network's dtype and device. Too small a batch is padded with the
-        last image. The result is a copy: the network may write into it.
+        They get the network's dtype and device. Too small a batch is padded with copies
+        of the last image. The result is a copy of the images: the network may write
+        into it.
         """
         missing = self.batch_limits[0] - len(images)
         batch = images
@@ -398,7 +413,7 @@ class Model:
         return x.clone() if is_view else x
 
     def run_network(self, x: Tensor, *, raw: bool = False) -> Any:
-        """Run the network on a batch that `prepared` returned.
+        """Run the network on a batch that `prepare` returned.
 
         Returns:
             The output; with `raw`, what the network itself returns.
@@ -420,7 +435,7 @@ class Model:
 
 
 def copy_sharing_weights(module: nn.Module) -> nn.Module:
-    """Return a copy that shares the weights, but has gradients of its own.
+    """Return a copy of a module that shares its weights, but has gradients of its own.
 
     Weights that were created in `torch.inference_mode` are copied: nothing can be
     differentiated through them.
@@ -429,6 +444,7 @@ def copy_sharing_weights(module: nn.Module) -> nn.Module:
     def without_inference(weights: torch.Tensor) -> torch.Tensor:
         return weights.clone() if weights.is_inference() else weights
 
+    # What `deepcopy` is to take in place of a copy of each parameter and buffer.
     memo: dict[int, Any] = {}
     for parameter in module.parameters():
         weights = without_inference(parameter.detach())
@@ -496,7 +512,13 @@ def check_images(images: Tensor) -> Tensor:
 
 
 def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
-    """Read the output from what a network returned for `count` images.
+    """Read the output from what a network returned.
+
+    Args:
+        read: reads it; see `Read`.
+        returned: by the network.
+        count: number of images.
+        name: of the model, for messages.
 
     Raises:
         ModelError: there is no output, or not one for each image.
@@ -507,6 +529,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
         advice = _advise_on_missing_scores(returned)
         if not advice:
             likely_task = _guess_task(returned)
+            # `read` is usually the method of a task.
             task = getattr(getattr(read, "__self__", None), "name", None)
             # Actions look like rows of scores.
             if likely_task and task not in (likely_task, "command"):
@@ -572,6 +595,12 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     Accepted are a tensor, an object with a tensor `logits`, a mapping with a tensor
     ``"logits"``, and a tuple or list whose first element is a tensor.
 
+    Args:
+        output: of the network.
+        count: number of images.
+        classes: number of classes; None if it is unknown.
+        name: of the model, for messages.
+
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.
     """
@@ -624,9 +653,12 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
 def mend_batch_norms(output: Any) -> None:
     """Give gradients that reach batch norms the memory layout of the norms' inputs.
 
-    For a single image torch 2.13 reads a gradient that comes from
-    ``flatten(2).transpose(1, 2)``, as in networks whose convolutions end in a
-    transformer, in a wrong order on the CPU, without a warning. Batches are right.
+    torch 2.13 reads some gradients of a single image in a wrong order on the CPU,
+    without a warning: those from ``flatten(2).transpose(1, 2)``, as in networks whose
+    convolutions end in a transformer. Batches are right.
+
+    Args:
+        output: of a network, whose graph gets hooks.
     """
 
     def with_strides(
@@ -641,6 +673,7 @@ def mend_batch_norms(output: Any) -> None:
         )
         return strided.copy_(gradient), *rest
 
+    # walk through the graph of the output, and hook every batch norm in it
     pending: list[Any] = [tensor.grad_fn for tensor in list_tensors(output)]
     visited = {None}
     while pending:

@@ -354,12 +354,11 @@ def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -
 
 
 def _describe_odd_scores(model: Model, rows: Tensor) -> str:
-    """Describe rows of scores (N, classes) that are neither logits nor probabilities;
-    "" for others.
+    """Describe rows of scores (N, classes) that are neither logits nor probabilities.
 
-    A black image distinguishes a sigmoid from means of the image, which are 0 there;
-    colors far outside [0, 1] distinguish it from small logits, as those of an untrained
-    network.
+    "" for others. Scores in [0, 1] may also be means of the image, or small logits as
+    of an untrained network. So they are computed for two more kinds of images: means
+    are 0 for a black one, and logits leave [0, 1] for colors far outside of it.
     """
     is_non_negative = float(rows.min()) >= 0.0
     if is_non_negative and float(rows.max()) <= 1.0:
@@ -377,6 +376,7 @@ def _describe_odd_scores(model: Model, rows: Tensor) -> str:
         return (
             "scores in [0, 1] that do not sum to 1, as after a sigmoid for each class"
         )
+    # of minus log-probabilities, exp(-x) sums to 1
     sum_error = (torch.exp(-rows).sum(dim=1) - 1.0).abs()
     if is_non_negative and bool((sum_error < PROBABILITY_TOLERANCE).all()):
         return (
@@ -432,11 +432,11 @@ def _check_range(model: Model, images: Tensor) -> None:
 
 @torch.no_grad()
 def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
-    """Return the numbers (K, n) that a network returns for images (K, H, W, 3), one by
-    one.
+    """Return the numbers (K, n) that a network returns for K images, one by one.
 
-    Scores in [0, 1] become logits, which do not saturate. None if there are no numbers,
-    they are not finite, or images have different counts of them.
+    Scores in [0, 1] become logits, which do not saturate. None if the network refuses
+    an image, there are no numbers, they are not finite, or images have different counts
+    of them.
     """
     rows = []
     for image in images:
@@ -460,7 +460,11 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
 
 
 def _compute_relative_change(outputs: Tensor) -> float:
-    """Return the median relative change of the numbers of outputs (K, n)."""
+    """Return the median, over the n numbers of outputs (K, n), of their relative
+    change.
+
+    That is the range over the K outputs, divided by the largest absolute value.
+    """
     change = outputs.amax(dim=0) - outputs.amin(dim=0)
     size = outputs.abs().amax(dim=0).clamp_min(torch.finfo(torch.float32).tiny)
     return float((change / size).median())
@@ -574,6 +578,7 @@ def _try_attached(
                 model, images, step, attached_gradient, gradient
             )
             detached_error = abs(change - detached_change)
+            # better than the network's own gradient, and good by itself
             max_error = min(detached_error, MAX_ATTACHED_ERROR * abs(attached_change))
             if abs(change - attached_change) < max_error:
                 return attached, attached_gradient
@@ -581,10 +586,10 @@ def _try_attached(
 
 
 def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows of `_run` for images, and the gradient of their
-    `_compute_checked_value` value.
+    """Return the rows of `_run` for images, and the gradient of one number of them.
 
-    The gradient is zero if nothing is detected.
+    That number is `_compute_checked_value`. The gradient is zero if nothing is
+    detected.
     """
     leaf = images.clone().requires_grad_()
     with torch.enable_grad():
@@ -595,7 +600,11 @@ def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _compute_checked_value(rows: Tensor) -> Tensor:
-    """Return a weighted sum of what `_run` returns, whose gradient is checked."""
+    """Return one number from the rows (N, n) of `_run`, whose gradient is checked.
+
+    It is a sum with weights from -1 to 1, so that columns do not cancel out as in the
+    sum of probabilities.
+    """
     return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
 
 
@@ -603,12 +612,17 @@ def _compute_checked_value(rows: Tensor) -> Tensor:
 def _measure_change(
     model: Model, images: Tensor, step: Tensor, *gradients: Tensor
 ) -> tuple[float, list[float], list[Tensor], float]:
-    """Measure how the `_compute_checked_value` value changes over a step to both sides
-    of images.
+    """Measure how the number of `_compute_checked_value` changes around images.
+
+    Args:
+        model: that is run.
+        images: (N, H, W, 3).
+        step: (N, H, W, 3), taken to both sides; the images are clipped to [0, 1] there.
+        *gradients: (N, H, W, 3) that predict the change.
 
     Returns:
-        The change, what each gradient predicts of it, the images at both ends of the
-        step, and the sum of the outputs' absolute values.
+        The change from one end to the other; what each gradient predicts of it; the
+        images at both ends; and the sum of the outputs' absolute values at one of them.
     """
     ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
     outputs = [_run(model, end) for end in ends]
@@ -622,8 +636,17 @@ def _measure_change(
 def _check_gradient(
     model: Model, images: Tensor, gradient: Tensor, detached: bool
 ) -> None:
-    """Warn if a network's outputs do not change as its gradient predicts: it is masked,
-    cut off, or not of this network.
+    """Warn if a network's outputs do not change as its gradient predicts.
+
+    Its gradient may be masked, cut off, or not that of this network. The change over a
+    small step along the sign of the gradient is compared with what the gradient
+    predicts.
+
+    Args:
+        model: that is probed.
+        images: (N, H, W, 3).
+        gradient: (N, H, W, 3) of `_compute_checked_value`.
+        detached: whether the network detaches tensors, for the message.
     """
     # Suppression of boxes may make outputs jump in the larger step only.
     step_sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)

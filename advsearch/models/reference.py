@@ -43,6 +43,12 @@ class ReferenceNet(nn.Module):
     """
 
     def __init__(self, classes: int, *, dropout: float = 0.1) -> None:
+        """Build the layers with random weights.
+
+        Args:
+            classes: number of logits.
+            dropout: probability that a pooled feature is dropped in training.
+        """
         super().__init__()
         layers: list[nn.Module] = [_Convolution(3, STEM, 5, stride=2), nn.SiLU()]
         width = STEM
@@ -95,6 +101,12 @@ class _Residual(nn.Module):
     """
 
     def __init__(self, inputs: int, outputs: int, *, stride: int) -> None:
+        """Build the layers of a block.
+
+        Args:
+            inputs, outputs: channels.
+            stride: of the first convolution, and of the shortcut's pooling.
+        """
         super().__init__()
         self.first = _Convolution(inputs, outputs, 3, stride=stride)
         self.second = _Convolution(outputs, outputs, 3)

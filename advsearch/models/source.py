@@ -163,8 +163,11 @@ class Source:
 def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
     """Return the source of a module, which is frozen.
 
-    Its dtype and device are those of its first floating-point parameter or buffer,
-    unless `fields`, which go to `Source`, state them.
+    Args:
+        module: the network.
+        name: of the model.
+        **fields: of `Source`. Dtype and device are by default those of the module's
+            first floating-point parameter or buffer.
 
     Raises:
         ModelError: it has lazy layers that have no weights yet.
@@ -341,11 +344,23 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
 
 
 def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType:
+    """Import a module, which may be in the current directory.
+
+    Args:
+        name: of the module.
+        spec: what the user wrote, for messages.
+        libraries: names that the module's may have been meant to be.
+
+    Raises:
+        ModelError: it cannot be imported.
+    """
     with current_directory_importable():
         try:
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
             message = f"module {name!r} needs {error.name!r}, which is not installed"
+            # the module itself is missing, or a package that it is in, and not one that
+            # it imports
             if error.name is not None and (
                 name == error.name or name.startswith(error.name + ".")
             ):
@@ -380,8 +395,15 @@ def find_near_names(name: str, known: Iterable[str]) -> list[str]:
 
 
 def import_library(name: str, spec: str, extra: str) -> Any:
-    """Return an optional library, that an extra of advsearch installs and a model
-    needs. Raises ModelError where it is not installed, or cannot be imported.
+    """Import an optional library that a model needs.
+
+    Args:
+        name: of the library.
+        spec: what the user wrote, for messages.
+        extra: of advsearch, which installs it.
+
+    Raises:
+        ModelError: it is not installed, or cannot be imported.
     """
     try:
         return importlib.import_module(name)

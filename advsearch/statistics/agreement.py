@@ -99,6 +99,7 @@ def correlation_interval(
     if not math.isfinite(value) or not np.isfinite(left_out).all():
         return None
     z = _to_fisher_z(left_out)
+    # the jackknife's, by the values without one unit each
     variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
     tail = (1.0 + CONFIDENCE) / 2.0
     half_width = float(stdtrit(n_units - 1, tail)) * math.sqrt(variance)

@@ -37,9 +37,9 @@ IntArray = npt.NDArray[np.int64]
 
 
 def sum_per_unit(values: npt.ArrayLike, units: IntArray) -> FloatArray:
-    """Return the sum (m,) of values (n,) over each unit, in the order of the units.
+    """Return the sum (m,) of the values of the rows (n,) of each unit.
 
-    `units` (n,) are the units of the rows.
+    `units` (n,) names the unit of each row; sums are in ascending order of these names.
     """
     _, unit_index = np.unique(units, return_inverse=True)
     weights = np.asarray(values, dtype=np.float64)
@@ -59,7 +59,7 @@ def mean_rate(counted: npt.ArrayLike, rows: npt.ArrayLike) -> float:
     n_rows = n_rows[n_rows > 0.0]
     if not len(n_rows):
         return math.nan
-    if n_rows.min() == n_rows.max():
+    if n_rows.min() == n_rows.max():  # the same, with less rounding
         return float(n_counted.sum() / n_rows.sum())
     return float((n_counted / n_rows).mean())
 
@@ -92,18 +92,21 @@ def rate_interval(
 
 
 def _betting_interval(samples: FloatArray, confidence: float) -> tuple[float, float]:
-    """Return the interval of the mean of independent samples (n,) in [0, 1], by
-    bets.
+    """Return the interval of the mean of independent samples (n,) in [0, 1], by bets.
+
+    A number is left out if bets that the mean is larger, or that it is smaller, have
+    made more than is likely by chance (`ConfidenceSequence`).
     """
     values, counts = np.unique(samples, return_counts=True)
+    # of the capital; 2, since there are two sides
     threshold = np.log(2.0 / (1.0 - confidence))
 
     def may_be_mean(mean: float) -> bool:
-        """Whether bets on "more than the mean" have not won."""
+        """Return whether bets on "more than the mean" have not won."""
         return bool(log_capital(mean, values, counts) < threshold)
 
     def is_too_large(mean: float) -> bool:
-        """Whether bets on "less than the mean" have won."""
+        """Return whether bets on "less than the mean" have won."""
         return bool(log_capital(1.0 - mean, 1.0 - values, counts) >= threshold)
 
     return find_threshold(may_be_mean), find_threshold(is_too_large)
@@ -158,7 +161,7 @@ def compare_paired(
     # 0 where only the first happens, 1 where only the second does, else 1/2
     unit_advantage = sum_per_unit((1.0 + second - 1.0 * first) / 2.0, units) / unit_rows
     lower, upper = _betting_interval(unit_advantage, CONFIDENCE)
-    copies = np.ones(len(unit_rows))
+    copies = np.ones(len(unit_rows))  # each value counts once
     max_log_capital = max(
         log_capital(0.5, unit_advantage, copies),
         log_capital(0.5, 1.0 - unit_advantage, copies),
@@ -166,6 +169,7 @@ def compare_paired(
     second_rate = mean_rate(sum_per_unit(second, units), unit_rows)
     first_rate = mean_rate(sum_per_unit(first, units), unit_rows)
     p_value = float(min(1.0, 2.0 * np.exp(-max_log_capital)))
+    # the mean advantage a in [0, 1] is a difference 2 a - 1 of rates
     return second_rate - first_rate, (2 * lower - 1, 2 * upper - 1), p_value
 
 
@@ -258,7 +262,15 @@ def one_sided_p_value(
 def _fisher_p_value(
     right_inside: int, inside: int, right_outside: int, outside: int
 ) -> float:
-    """Return the one-sided p-value of Fisher's exact test."""
+    """Return the one-sided p-value of Fisher's exact test.
+
+    It is the probability that at most `right_inside` of all right predictions are
+    inside if chance decides which `inside` predictions of all are there.
+
+    Args:
+        right_inside, inside: right predictions inside, and all there.
+        right_outside, outside: likewise outside.
+    """
     # takes half a second, and a search needs none of it
     from scipy.stats import hypergeom
 
@@ -283,6 +295,7 @@ def _permutation_p_value(
     sampled_units = rng.multivariate_hypergeometric(
         n_units, min(n_inside, int(n_units.sum())), N_PERMUTATIONS, method="marginals"
     )
+    # how often chance has at most as many inside; what was observed is one more
     n_as_few = (sampled_units @ values <= n_right_inside + 1e-9).sum()
     return float((1 + n_as_few) / (1 + N_PERMUTATIONS))
 
@@ -305,6 +318,8 @@ def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
         column[:, None] for column in distinct_rates.T
     )
     stake_fraction = 0.5 if is_cut else 1.0
+    # (distinct rates, m): what a stake of 1 gains; 0 on average where the rate is m on
+    # both sides
     gains = stake_fraction * (
         wrong_inside / (1.0 - NULL_RATES)
         - is_inside

@@ -52,6 +52,7 @@ def wilson_interval(rate: Any, n: Any) -> tuple[Any, Any]:
 
     Both are numbers or arrays, and so are the lower and upper bounds.
     """
+    # quantile of the normal distribution, one side of the interval
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
     center = rate + z * z / (2 * n)
     half_width = z * np.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))

@@ -40,7 +40,10 @@ class Dip:
 def _fit_falling(
     right: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Fit rates (m,) that do not rise, by isotonic regression."""
+    """Fit rates (m,) that do not rise, by isotonic regression.
+
+    `right` (m,) of `counts` (m,) images are right at each distance, in ascending order.
+    """
     from scipy.optimize import isotonic_regression  # takes a quarter of a second
 
     fitted: NDArray[np.float64] = isotonic_regression(
@@ -75,9 +78,11 @@ def find_dips(
     counts_before = np.concatenate([[0], np.cumsum(counts)])
     dips = []
     for near in range(n_distances - 1):
+        # the runs right behind it, by the index after their last distance
         end = np.arange(near + 2, n_distances + 1)
         right_beyond = right_before[end] - right_before[near + 1]
         counts_beyond = counts_before[end] - counts_before[near + 1]
+        # of as few right ones at the nearer distance, if chance divides them
         p_values = hypergeom.cdf(
             right[near],
             counts_beyond + counts[near],

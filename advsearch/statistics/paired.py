@@ -54,6 +54,7 @@ def _phi_coefficient(both: int, first: int, second: int, neither: int) -> float:
     product = (both + first) * (second + neither) * (both + second) * (first + neither)
     if not product:
         return 0.0
+    # n^2 times the covariance; a positive one is made smaller by the correction
     covariance = float(both * neither - first * second)
     if covariance > 0.0:
         n = both + first + second + neither

@@ -72,6 +72,7 @@ class FreeAnswer(Task):
     target: Words | None = field(default=None, metadata=tasks.FROM_RUN)
 
     def __post_init__(self) -> None:
+        """Check that both numbers are within their limits."""
         for name in ("tokens", "times"):
             value = getattr(self, name)
             if not isinstance(value, int) or not 1 <= value <= MAX_COUNT:
@@ -104,6 +105,12 @@ class FreeAnswer(Task):
     def read(
         self, returned: Any, count: int
     ) -> list[AnswerWithLogits | AnswersWithoutLogits]:
+        """Return the answers of a network, which have to be mappings, one for each
+        picture.
+
+        Raises:
+            ValueError: they are something else.
+        """
         keys = AnswerWithLogits.__required_keys__
         if isinstance(returned, (list, tuple)) and all(
             isinstance(answer, Mapping) and (keys <= answer.keys() or "texts" in answer)
@@ -197,8 +204,8 @@ class FreeAnswer(Task):
 def _compute_token_margin(
     logits: Tensor, begins: Callable[[str], Sequence[int]], words: Words
 ) -> Tensor:
-    """Compute the margin of the tokens that begin one of the words, at the step at
-    which it is largest.
+    """Compute by how much the tokens that begin one of the words lead at their best
+    step.
 
     Args:
         logits: (T, tokens) of each step of the answer.
@@ -206,7 +213,8 @@ def _compute_token_margin(
         words: at least one.
 
     Returns:
-        The largest logit of these tokens minus that of all others, ().
+        The largest logit of these tokens minus the largest of all others, (), at the
+        step at which that difference is largest.
 
     Raises:
         InputError: no token begins one of the words.

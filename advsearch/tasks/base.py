@@ -297,6 +297,9 @@ class Task(ABC):
     target: Truth = field(default=None, metadata=FROM_RUN)
 
     def __init_subclass__(cls, **more: Any) -> None:
+        """Give methods of a user's class copies of what they are passed, as they may
+        change it.
+        """
         super().__init_subclass__(**more)
         receive_copies: tuple[Callable[..., Any], ...] = (
             Task.truth_names,
@@ -527,6 +530,7 @@ class Task(ABC):
         """Evaluate each of N outputs."""
         with torch.no_grad():
             scores = self.score(output, truth).tolist()
+            # not `-loss`, which would be -0.0 for a loss of 0
             margins = (0.0 - self.loss(output, truth)).tolist()
             described = self.describe(output, truth, margins)
             return [

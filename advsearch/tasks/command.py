@@ -72,6 +72,10 @@ class Command(Task):
     )
 
     def __post_init__(self) -> None:
+        """Parse and check the options.
+
+        They are stored in one form, so that tasks with equal options compare as equal.
+        """
         # Normalise the options, so that equal tasks compare as equal.
         set_field = object.__setattr__  # the dataclass is frozen
         set_field(self, "state", _load_state(self.state))
@@ -223,6 +227,7 @@ class Command(Task):
                 f"elements, got {len(self.target)}"
             )
         # Otherwise an action could be right and a success at once.
+        # A loss of 1 is a distance of 2 envelopes.
         if float(self.loss(clean_action[None], self.target)) <= 1.0:
             raise InputError(
                 "target: expected an action more than two envelopes from the clean "
@@ -231,6 +236,7 @@ class Command(Task):
 
     @property
     def remarks(self) -> tuple[str, ...]:
+        """State the clean action and its envelope, once they are known."""
         if self.clean is None:
             return ()
         is_shared = len(self.envelope) == 1
@@ -264,10 +270,10 @@ class Command(Task):
         return () if truth is None else (self._format_action(truth.tolist()),)
 
     def _deviation(self, output: Tensor, center: Tensor | None) -> Tensor:
-        """Compute the deviation of each element from an action `center` (A,), in
-        envelopes, (N, A).
+        """Compute the deviation (N, A) of each element from an action `center` (A,).
 
-        It is 0 for an element that is NaN in `center`, which is not judged.
+        It is in envelopes: 1 is at the edge of what is allowed. An element that is NaN
+            in `center` is not judged, so that its deviation is 0.
         """
         if center is None:
             raise InputError(

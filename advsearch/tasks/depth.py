@@ -165,6 +165,7 @@ class Depth(Task):
     missing: str = field(default="", metadata=tasks.FROM_RUN)
 
     def __post_init__(self) -> None:
+        """Check that all options are within their limits."""
         self.check_numbers(
             lambda value: 0.0 < value < MAX_FACTOR,
             "a number over 0, under 100",
@@ -241,8 +242,12 @@ class Depth(Task):
         return replace(self, resolved_kind=kind, missing=self._missing(kind, truth))
 
     def _missing(self, kind: str, truth: DepthTruth | None) -> str:
-        """Return what the user has to state before predictions can be judged, "" if
+        """Return what the user has to state before predictions can be judged; "" if
         nothing.
+
+        Args:
+            kind: of the model's values, one of `KINDS`, or "" if it is unknown.
+            truth: of the scene; None if it is not known yet.
         """
         if not kind:
             return (
@@ -279,6 +284,7 @@ class Depth(Task):
 
     @property
     def remarks(self) -> tuple[str, ...]:
+        """Say how the model's numbers are read, once that is known."""
         if not self.resolved_kind:
             return ()
         text = (
@@ -443,6 +449,7 @@ class Depth(Task):
         if float(squared_relief) <= 1e-6 * float(disparity.square().sum()):
             # The product keeps the value attached to the graph.
             return log_factors.sum() * 0.0 + 1.0
+        # A predicted distance is the true one times exp(log_factors).
         predicted_disparity = disparity * (-log_factors).exp()
         predicted_relief = (predicted_disparity - behind)[is_known]
         return (predicted_relief * true_relief).sum() / squared_relief
@@ -563,15 +570,15 @@ def _find_maps(returned: Any) -> tuple[str, Any]:
 
 
 def _fit_scale_and_shift(values: Tensor, expected: Tensor, mask: Tensor) -> Tensor:
-    """Return a scale times the values plus a shift, fitted by least squares.
+    """Return `scale * values + shift`, (H, W), which fits what is expected by least
+    squares.
+
+    The scale is not negative: what the model predicts as near stays near.
 
     Args:
         values: (H, W).
         expected: (H, W), finite in the mask.
         mask: (H, W) bool, the pixels of the fit, at least one.
-
-    Returns:
-        (H, W). The scale is not negative: what the model predicts as near stays near.
     """
     x = values[mask]
     y = expected[mask]

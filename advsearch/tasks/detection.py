@@ -156,6 +156,7 @@ class Detection(ClassTask):
     doubts: str = field(default="", metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
+        """Check that all options are within their limits and fit each other."""
         super().__post_init__()
         self.check_numbers(
             lambda value: 0.0 < value < 1.0,
@@ -243,6 +244,7 @@ class Detection(ClassTask):
                 else:
                     doubts = box_format.describe_fault(right_boxes)
                 return replace(task, doubts=doubts)
+        # no box of a right class, or no true box to compare with
         boxes = select_best_boxes(output)
         fault = box_format.describe_fault(boxes)
         doubts = fault and f"{fault}{box_format.suggest_plausible_formats(boxes)}"
@@ -334,6 +336,7 @@ class Detection(ClassTask):
 
     @property
     def ambiguities(self) -> str:
+        """Say which option the user has to state, as no output shows it."""
         if self.is_order_ambiguous and not (self.order or self.inferred_order):
             return (
                 "order: expected what tells scores from classes, and no output of "
@@ -351,6 +354,7 @@ class Detection(ClassTask):
 
     @property
     def remarks(self) -> tuple[str, ...]:
+        """Say how the model's output is read, where that was inferred."""
         remarks = []
         order = format_option(f"order: {self.inferred_order}")
         is_order_inferred = not self.order
@@ -471,8 +475,13 @@ class Detection(ClassTask):
     ) -> Tensor:
         """Apply a function to the detections of each image, (N,).
 
-        The value is NaN if a number that counts is not finite, and -1 if there is
-        nothing to find.
+        The value is NaN if a number that counts is not finite, and -1 if the object is
+        out of view, unless boxes where nothing is are sought.
+
+        Args:
+            output: of N images.
+            truth: of the scene.
+            function: from the detections of an image to its value.
         """
         is_out_of_view = truth.box is None and self.seek != "create"
         values = []
@@ -505,11 +514,12 @@ class Detection(ClassTask):
         return torch.minimum(self._score_vanish(detections, truth), wrong_excess)
 
     def _score_displace(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Compute the lesser of two: how far the best overlap of a box that counts is
-        below `iou`, and that some box counts.
+        """Compute the lesser of two: that boxes miss the object, and that some box
+            counts.
 
-        The first is scaled so that a small step from `iou` is as long as one in
-        log-odds.
+        The first is how far the best overlap of a box that counts is below `iou`,
+        scaled so that a small step from `iou` is as long as one in log-odds. The second
+        is by how much the best score of a right class exceeds `confidence`.
         """
         scores = self._scores_of_classes(detections, truth.labels)
         score_excess = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
@@ -585,8 +595,10 @@ class Detection(ClassTask):
         return min(MIN_SCORE, self.confidence)
 
     def _is_broken(self, detections: Detections) -> bool:
-        """Whether a score or a box that counts is not finite, or all rows are NaN
-        although the model does not fill its outputs with NaN.
+        """Return whether the detections of an image cannot be judged.
+
+        A score or a box that counts is not finite; or all rows are NaN, although the
+        model does not fill its outputs with such rows.
         """
         has_only_nan_rows = "blank" in detections and not len(detections["boxes"])
         if has_only_nan_rows and not self.fills_with_nan:
@@ -601,8 +613,10 @@ class Detection(ClassTask):
         return suppress(detections, self._min_score, self.suppression)
 
     def _is_elsewhere(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Which boxes neither fit the object nor lie mostly inside its box, (D,)
-        bool.
+        """Return which boxes (D,) are elsewhere than the object.
+
+        They neither fit its box nor lie mostly inside of it. All are if the object is
+        out of view.
         """
         boxes = detections["boxes"]
         if truth.box_fractions is None:
@@ -615,8 +629,10 @@ class Detection(ClassTask):
 
     @staticmethod
     def _are_on(boxes: Tensor, true_box: Tensor) -> Tensor:
-        """Which boxes (D, 4) are on a thing with a true box (4,), however loosely, (D,)
-        bool.
+        """Return which boxes (D, 4) are on a thing with a true box (4,), however
+        loosely: (D,).
+
+        They overlap it a little, or lie mostly inside of it.
         """
         overlaps = compute_iou(boxes, true_box) >= MIN_OVERLAP
         lies_inside = compute_fraction_inside(boxes, true_box) >= MIN_FRACTION_INSIDE
@@ -625,8 +641,10 @@ class Detection(ClassTask):
     def _is_loosely_on_object(
         self, detections: Detections, truth: DetectionTruth
     ) -> Tensor:
-        """Which boxes are on the object and fit no other thing of its class better,
-        (D,) bool.
+        """Return which boxes (D,) are on the object, however loosely.
+
+        A box that overlaps another thing of the right classes more than the object does
+        not count.
         """
         boxes = detections["boxes"]
         true_box = truth.box_fractions
@@ -653,12 +671,12 @@ class Detection(ClassTask):
         return is_on_nothing
 
     def _phantom_scores(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Return the score of each box as one where nothing is, (D,); 0 of one that is
-        not.
+        """Return the score (D,) of each box as a phantom: a box where nothing is.
 
-        The score is that of a target class, or of any class without a target. A box of
-        a right class is a phantom if it is on no thing of these classes, however
-        loosely; a box of another class, if it is elsewhere than the object.
+        It is 0 if the box is none. A box of a right class is a phantom if it is on no
+        thing of these classes, however loosely; a box of another class, if it is
+        elsewhere than the object. Only scores of target classes count, if there is a
+        target.
         """
         right_classes = set(truth.labels)
         if self.target is not None:
@@ -772,7 +790,12 @@ class Detection(ClassTask):
     def _match_object(
         self, detections: Detections, truth: DetectionTruth
     ) -> ObjectMatch:
-        """Decide what becomes of the object in boxes that survived suppression."""
+        """Decide what becomes of the object in the boxes that survived suppression.
+
+        The outcomes are tried in order, the best for the model first; the first one
+        whose best box reaches `confidence` is returned with that box. Where phantoms
+        are sought, they come before all others.
+        """
         right_score = self._scores_of_classes(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)
         if self.seek == "create" and float(self._score_create(detections, truth)) > 0.0:
@@ -817,7 +840,15 @@ class Detection(ClassTask):
         is_candidate: Tensor,
         truth: DetectionTruth,
     ) -> ObjectMatch:
-        """Return an outcome with the best box among the candidates."""
+        """Return an outcome with the best box among the candidates.
+
+        Args:
+            outcome: that the candidates stand for.
+            detections: of the image.
+            scores: (D,) of each box for this outcome.
+            is_candidate: (D,) bool.
+            truth: of the scene.
+        """
         row = int(torch.where(is_candidate, scores, -1.0).argmax())
         score = float(scores[row])
         if "labels" in detections:

@@ -217,6 +217,14 @@ def _split_images(
 ) -> list[dict[str, Tensor]]:
     """Split an output into the components of each of `count` images, unchecked.
 
+    It may be a list with an element for each image, rows with the index of their image,
+    or tensors whose first axis is the image.
+
+    Args:
+        returned: by the network.
+        count: number of images.
+        order_names: the order that the user stated, or none.
+
     Raises:
         ValueError: it is none of the forms of `EXPECTED`.
     """
@@ -250,7 +258,16 @@ def _split_batch_rows(
 ) -> list[dict[str, Tensor]]:
     """Split rows (D, 7) of all images by their column with the index of the image.
 
-    It is the first column, or the one of "batch" in the order.
+    It is the first column, or the one of "batch" in the order. A row with the index -1
+    is padding.
+
+    Args:
+        rows: of all images.
+        count: number of images.
+        order_names: the order that the user stated, or none.
+
+    Raises:
+        ValueError: there is no such column.
     """
     names_before: Sequence[str] = ()
     if "batch" in order_names:
@@ -348,7 +365,16 @@ def _is_image_output(value: Any) -> bool:
 
 
 def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Tensor]:
-    """Find boxes and scores, with or without labels, or `either`, in an output.
+    """Find the components of detections in the output of one image, or of a batch.
+
+    Args:
+        returned: a tensor of rows of six numbers, named tensors, or a sequence of
+            tensors.
+        order_names: the order that the user stated, or none.
+
+    Returns:
+        "boxes" and "scores", perhaps with "labels"; or "boxes" and "either", the two
+        numbers of each box of which it is unknown which one is the score.
 
     Raises:
         ValueError: it is none of the forms of `EXPECTED`.
@@ -378,7 +404,10 @@ def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Ten
 
 
 def _split_columns(rows: Tensor, order_names: Sequence[str]) -> dict[str, Tensor]:
-    """Split the columns of rows (..., 6) by an order, if there is one."""
+    """Split the columns of rows (..., 6): four of a box, and two single numbers.
+
+    Without an order these two are "either", (..., 2).
+    """
     if not order_names:
         return {"boxes": rows[..., :4], "either": rows[..., 4:]}
     widths = [4 if name == "boxes" else 1 for name in order_names]
@@ -429,7 +458,8 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
 def _components_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
     """Identify the components of a tuple by shape and type.
 
-    Boxes have four columns, classes an integer type.
+    Boxes have four columns, and labels an integer type. Two other components without an
+    integer type are "either", (..., 2).
 
     Raises:
         ValueError: shapes and types do not identify them.
@@ -560,8 +590,12 @@ def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
 def _without_padding(
     components: dict[str, Tensor], is_padding: Tensor, values: Tensor
 ) -> Detections:
-    """Remove rows of padding (D,) bool, and count those that are NaN in their box and
-    their values (D, K) as `blank`.
+    """Remove rows of padding, and count those that are all NaN as `blank`.
+
+    Args:
+        components: of one image, with a row for each box.
+        is_padding: (D,) bool.
+        values: (D, K) the numbers of each box beside its coordinates.
     """
     if not bool(is_padding.any()):
         return components
@@ -814,6 +848,7 @@ def find_head_orders(
     for layout, n_channels in zip(LAYOUTS, returned.shape, strict=True):
         for head, first_score in HEADS.items():
             name = f"{head} {layout}"
+            # channels that are left over have to be mask coefficients
             n_masks = n_channels - first_score - classes
             if order not in ("", head, name) or (
                 n_masks and n_masks not in map_channels
@@ -854,7 +889,13 @@ def find_head_orders(
 
 
 def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> str:
-    """Return what to do about an output whose number of channels does not fit."""
+    """Return what to do about an output whose number of channels does not fit.
+
+    Args:
+        n_channels: of a box.
+        classes: number of classes.
+        may_be_rows: whether boxes are rows, which may begin with six numbers.
+    """
     excess_channels = {n_channels - 4 - classes, n_channels - 6 if may_be_rows else 0}
     fitting = [
         f"`labels={name}`"

@@ -45,6 +45,7 @@ class Rig(tasks.JointTask):
     cameras: int = field(default=1, metadata=tasks.FROM_RUN)  # how many there are
 
     def __post_init__(self) -> None:
+        """Check the rule, and that the task is a name, a mapping or a task."""
         if self.rule not in RULES:
             raise InputError(
                 f"task rig: rule: expected one of {', '.join(RULES)}, got {self.rule!r}"
@@ -125,6 +126,7 @@ class Rig(tasks.JointTask):
         """
         scores = self._map_images(self.part.score, output, truth)
         if self.target is not None or self.minimise:
+            # these scores are over 0 where an image is as it should be by the rule
             return -self._combine(-scores)
         return self._combine(scores)
 
@@ -145,7 +147,12 @@ class Rig(tasks.JointTask):
         return torch.stack(rows)
 
     def _combine(self, values: Tensor) -> Tensor:
-        """Combine losses or scores of images (N, K) by the rule, (N,)."""
+        """Combine losses of images (N, K) by the rule, (N,). A loss over 0 is a wrong
+        prediction.
+
+        Sorted, the smallest is over 0 if no image is right, the largest if not all are
+        right, and the middle one if most are wrong.
+        """
         if self.rule == "mean":
             return values.mean(dim=1)
         n_images = values.shape[1]
@@ -170,6 +177,7 @@ class Rig(tasks.JointTask):
     ) -> list[tasks.Judgement]:
         """See `Task.judge`; the payload has the judgement of each image."""
         with torch.no_grad():
+            # not `-loss`, which would be -0.0 for a loss of 0
             margins = (0.0 - self.loss(output, truth)).tolist()
             scores = self.score(output, truth).tolist()
         rig_judgements = []
@@ -206,6 +214,7 @@ class Rig(tasks.JointTask):
         """
         if self.rule == "mean":
             return min(judgements, key=lambda judgement: judgement.margin)
+        # By other rules the joint margin is that of one image.
         return min(judgements, key=lambda judgement: abs(judgement.margin - margin))
 
     def marks(

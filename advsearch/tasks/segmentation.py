@@ -151,11 +151,17 @@ class Segmentation(tasks.ClassTask):
         compute_margin: PixelMargin,
         labels: tasks.Labels,
     ) -> Tensor:
-        """Compute the margin at the pixel at which `accuracy` of them is reached, (N,).
+        """Compute the margin (N,) at the pixel at which `accuracy` of them is reached.
 
-        It is NaN if a margin is not finite, and that of a hidden object if it is out of
-        view. `compute_margin` is called with the logits (N * P, classes) of the pixels
-        and `labels`.
+        The object's pixels are sorted by their margin, in ascending order. The value is
+        NaN if a margin is not finite, and -1 if the object is out of view.
+
+        Args:
+            output: logits (N, classes, h, w).
+            truth: of the scene.
+            compute_margin: returns the margins of pixels from their logits (N * P,
+                classes) and the labels.
+            labels: classes that the margin is about.
         """
         pixels = self._object_logits(output, truth)
         if pixels is None:
@@ -273,6 +279,7 @@ class Segmentation(tasks.ClassTask):
         """
         is_right_class = torch.zeros_like(counts, dtype=torch.bool)
         is_right_class[list(truth.labels)] = True
+        # the most frequent right class, or else the most frequent wrong one
         top_class = int(counts.masked_fill(is_right_class != is_right, -1).argmax())
         if is_right or top_class not in self.nothing_classes:
             prediction = tasks.Prediction(

@@ -169,7 +169,9 @@ def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tenso
     """
     n_names = int(name_index.max()) + 1
     images_per_name = torch.bincount(name_index, minlength=n_names).double()
+    # of each image, so that every name has the same weight, and the sum is 1
     image_weights = 1.0 / (n_names * images_per_name[name_index])
+    # Centered features make the fit faster; the biases are shifted back below.
     center = features.double().mean(dim=0)
     centered = features.double() - center
     weights = torch.zeros(
@@ -185,6 +187,7 @@ def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tenso
     )
 
     def closure() -> Tensor:
+        """Return the loss, with its gradients by weights and biases."""
         optimizer.zero_grad()
         logits = functional.linear(centered, weights, biases)
         image_loss = functional.cross_entropy(logits, name_index, reduction="none")
@@ -218,8 +221,9 @@ def _list_visible(folder: Path) -> list[Path]:
 
 
 def _crop_center(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Crop an image (H, W, 3) around its center to the aspect ratio of a size (height,
-    width).
+    """Crop an image (H, W, 3) around its center to the aspect ratio of a size.
+
+    `size` is (height, width); only their ratio counts, nothing is resized.
     """
     height, width = image.shape[:2]
     crop_height = min(height, max(1, round(width * size[0] / size[1])))
@@ -289,6 +293,7 @@ class Similarity(tasks.Classification):
     )
 
     def __post_init__(self) -> None:
+        """Check that all options are within their limits and fit each other."""
         super().__post_init__()
         if self.method not in METHODS:
             raise InputError(

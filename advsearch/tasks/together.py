@@ -292,7 +292,12 @@ class EnsembleTask(JointTask):
         ]
 
     def _join_judgements(self, judgements: Sequence[Judgement]) -> Judgement:
-        """Join the models' judgements of one image."""
+        """Join the models' judgements of one image, in the order of the models.
+
+        Margin and outcome are those of the model with the smallest margin; the payload
+        has those of all by name. If a model returned NaN, the joint judgement is that
+        of NaN too.
+        """
         worst = min(judgements, key=lambda judgement: judgement.margin)
         margin = worst.margin
         if any(judgement.is_non_finite for judgement in judgements):

@@ -91,6 +91,15 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
 
 
 def _make_nested_policy(spec: Spec, where: str) -> Policy[Any]:
+    """Return the policy inside another one.
+
+    Args:
+        spec: a policy, a name, or a mapping with a `name` and options.
+        where: what it is of, for messages.
+
+    Raises:
+        InputError: it is something else.
+    """
     if isinstance(spec, Policy):
         return spec
     if isinstance(spec, str):

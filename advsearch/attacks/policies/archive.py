@@ -208,10 +208,16 @@ def _find_cell_ranges(
 def _make_candidates(
     state: ArchiveState, observations: policies.Observations, rng: torch.Generator
 ) -> Tensor:
-    """Return candidates (n, d) for a surrogate to choose from: offspring in the box.
+    """Return candidates (n, d) for a surrogate to choose from: offspring, moved into
+    the box.
 
-    The parameters of the archive of some of them are sampled uniformly, so that they
-    may lie in any cell.
+    The parameters that span the archive are sampled uniformly for some of them, so that
+    they may lie in any cell.
+
+    Args:
+        state: of the search.
+        observations: have the box.
+        rng: of the samples.
     """
     box = observations.box
     uniform = torch.rand(N_CANDIDATES, box.count, generator=rng)
@@ -268,6 +274,7 @@ class MapElites(Policy[ArchiveState]):
     handles_choices: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        """Check that ribs is installed and all settings are within their limits."""
         if find_spec("ribs") is None:
             raise InputError(
                 "policy 'archive' needs ribs, which is not installed: pip "
@@ -283,6 +290,12 @@ class MapElites(Policy[ArchiveState]):
     def start(
         self, domain: policies.Domain, generator: torch.Generator, steps: int
     ) -> ArchiveState:
+        """Start with an empty archive, and a generation of the initial point and
+        samples.
+
+        Raises:
+            InputError: the domain has too many numbers, or the archive too many cells.
+        """
         if domain.dim > MAX_DIM:
             raise InputError(
                 f"policy 'archive': expected at most {MAX_DIM} numbers, got "
@@ -290,6 +303,7 @@ class MapElites(Policy[ArchiveState]):
             )
         seed = policies.draw_seed(generator)
         measure_indices = self._find_measure_indices(domain)
+        # number of cells along each axis
         dims = [
             options or self.cells
             for options in domain.options[measure_indices].tolist()

@@ -217,6 +217,10 @@ class Auto(Policy[AutoState]):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
+        """Divide the renders, and start with the screen.
+
+        Without box coordinates there is nothing but the ascent, which starts at once.
+        """
         box = find_box_coordinates(domain)
         no_points = torch.empty(0, box.count)
         plan = make_plan(domain, box, steps)
@@ -421,6 +425,7 @@ class Restarts(RacingPolicy[Race]):
     name: ClassVar[str] = "restarts"
 
     def __post_init__(self) -> None:
+        """Check that the policy is one, and the number of restarts."""
         if not isinstance(self.policy, Policy):
             raise InputError(
                 "policy of restarts: expected a policy, got "
@@ -478,6 +483,7 @@ class Portfolio(RacingPolicy[Race]):
     handles_choices: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        """Check that the policies are policies, and that there is one."""
         object.__setattr__(self, "policies", tuple(self.policies))
         if not self.policies or not all(
             isinstance(policy, Policy) for policy in self.policies

@@ -401,6 +401,7 @@ class Choices(RacingPolicy[ChoicesState]):
     def propose(
         self, state: ChoicesState, n: int
     ) -> tuple[tuple[Proposal, ...], ChoicesState]:
+        """Propose what the race proposes, each with the options of its search."""
         proposals, state = super().propose(state, n)
         joined = tuple(
             replace(proposal, u=state.join_choices(proposal.u, runner))

@@ -55,10 +55,10 @@ Float64Array = npt.NDArray[np.float64]
 
 
 def utilities(values: Sequence[float]) -> list[float]:
-    """Return the weights of n objectives by their rank; see `NES`.
+    """Return the weights of n objectives by their ranks; `NES` has the formula.
 
-    They sum to zero and are larger for larger objectives. Equal objectives take up
-    several ranks and get the mean of their weights.
+    They sum to zero and are larger for larger objectives. Equal objectives take up as
+    many ranks as they are, and each gets the mean of the weights of these.
     """
     n = len(values)
     rank_weights = [
@@ -68,7 +68,7 @@ def utilities(values: Sequence[float]) -> list[float]:
     descending = sorted(values, reverse=True)
     weight_of_value = {}
     for value in set(values):
-        first = descending.index(value)
+        first = descending.index(value)  # the first of its ranks, from 0
         count = descending.count(value)
         mean_weight = math.fsum(rank_weights[first : first + count]) / count
         weight_of_value[value] = mean_weight / total - 1.0 / n
@@ -146,6 +146,7 @@ class NES(Policy[NESState]):
     uses_gradient: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        """Check that all settings are within their limits."""
         if not 0.0 < self.sigma <= 2.0:
             raise InputError(
                 "sigma: expected a number in (0, 2], a share of half the "
@@ -158,6 +159,7 @@ class NES(Policy[NESState]):
             )
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> NESState:
+        """Start at the domain's initial point, with `sigma` of each half range."""
         default = 4 + int(3 * math.log(domain.dim))
         population = self.population or default + default % 2
         deviation = torch.full_like(domain.start, self.sigma)
@@ -180,6 +182,11 @@ class NES(Policy[NESState]):
         return tuple(proposals), state
 
     def update(self, state: NESState, evaluated: Evaluated) -> NESState:
+        """Add evaluations to the generation; once it is complete, move the
+        distribution.
+
+        The formulas are those of `NES`; both samples of a pair are added up at once.
+        """
         state = replace(
             state,
             values=(
@@ -325,6 +332,7 @@ class CMAESState:
         else:
             values[:] = 0.0
         strategy = copy.deepcopy(self.strategy)
+        # in units of the step size, and worth as much as the objectives differ
         penalty = spread * np.array(self.violations) / max(strategy.sigma, 1e-30) ** 2
         with _isolate_numpy_random(self.seed, self.generation):
             # pycma minimises
@@ -374,6 +382,7 @@ class CMAES(Policy[CMAESState]):
     uses_gradient: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        """Check that all settings are within their limits."""
         if not 0.0 < self.sigma <= 2.0:
             raise InputError(
                 "sigma: expected a number in (0, 2], a share of half the "
@@ -388,6 +397,9 @@ class CMAES(Policy[CMAESState]):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> CMAESState:
+        """Start pycma at the domain's initial point, and ask it for a first
+        generation.
+        """
         d = domain.dim
         if d > MAX_DIM:
             raise InputError(

@@ -210,6 +210,7 @@ class Components:
         shrunk_variance = (
             (counts * variance + PRIOR_COUNT * UNIFORM_STD**2) / (counts + PRIOR_COUNT)
         ).clamp(max=0.999 * UNIFORM_STD**2)
+        # of a product of normal densities, precisions (1 / variance) add up
         precision = 1.0 / shrunk_variance - 1.0 / UNIFORM_STD**2
         stds = (1.0 / precision).sqrt().clamp(MIN_STD, MAX_STD)
         sample_means = self.means + mean_offset
@@ -368,6 +369,7 @@ class Mixture(Policy[MixtureState]):
     handles_choices: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
+        """Check that all settings are within their limits."""
         if not 1 <= self.components <= 20:
             raise InputError(
                 "components: expected 1 to 20 parts of a mixture, got "
@@ -384,6 +386,7 @@ class Mixture(Policy[MixtureState]):
     def start(
         self, domain: policies.Domain, generator: torch.Generator, steps: int
     ) -> MixtureState:
+        """Start with a generation of uniform samples."""
         if domain.dim > MAX_DIM:
             raise InputError(
                 f"policy 'mixture': expected at most {MAX_DIM} numbers, got "
@@ -407,10 +410,17 @@ class Mixture(Policy[MixtureState]):
     def update(
         self, state: MixtureState, evaluated: policies.Evaluated
     ) -> MixtureState:
+        """Log evaluations with their importance weights; fit a mixture after each
+        generation.
+
+        The weight of a sample is the uniform density over the one that it was drawn
+        from.
+        """
         points = state.points[state.n_evaluated :][: len(evaluated)]
         mixture = state.mixtures[-1]
         with policies.limit_to_single_thread():
             weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
+        # The density of a generation is `even` at least.
         max_weight = 1.0 if mixture is None else 1.0 / self.even
         rows = [
             (

@@ -76,6 +76,7 @@ def clip_gradient(
                 clipped_gradient[part] = clipped_gradient[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(clipped_gradient))
     lengths = (*lengths, length)[-MEMORY:]
+    # the upper one of an even number
     median_length = sorted(lengths)[len(lengths) // 2]
     is_too_long = length > CLIP * median_length > 0.0
     if is_too_long:
@@ -164,7 +165,9 @@ class Window:
 
     def lags(self, best: float) -> bool:
         """Return whether `best` beats the mean of this window by more than noise
-        explains: by two standard deviations of its values.
+        explains.
+
+        That is by more than two standard deviations of the window's values.
         """
         mean = sum(self.values) / len(self.values)
         squared_deviations = sum((value - mean) ** 2 for value in self.values)
@@ -179,6 +182,7 @@ class Window:
             best: objective of the search so far.
             halved: whether the step size is halved between the two.
         """
+        # shorter than this one by a fixed part of the steps, with two lower limits
         length = max(
             MIN_WINDOW,
             round(MIN_WINDOW_FRACTION * steps),
@@ -376,11 +380,12 @@ class PGD(AscentPolicy):
             raise self.make_range_error("momentum", "[0, 1)", 0.5)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
+        """Start at the initial point, or at a sample, with the first window."""
         seed = draw_seed(generator)
         u = domain.initial_point
         if self.random_start:
             u = domain.sample(seeded(seed, 0))[0]
-        # every step needs a gradient
+        # every step needs a gradient, which costs renders too
         steps = max(1, steps // (1 + domain.gradient_cost))
         if domain.exact:
             window_length = max(MIN_WINDOW_EXACT, round(MIN_WINDOW_FRACTION * steps))
@@ -402,6 +407,9 @@ class PGD(AscentPolicy):
         return state.step_size
 
     def retreat(self, state: Ascent) -> Ascent:
+        """Go back to the best configuration, or else try a random step from the
+        start.
+        """
         if state.peak is None:
             return self._move_uphill(
                 replace(state, direction=torch.zeros_like(state.u)),
@@ -410,6 +418,7 @@ class PGD(AscentPolicy):
         return replace(state, u=state.peak.u, direction=state.peak.direction)
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
+        """Add a gradient, scaled to mean magnitude 1, to the decayed earlier ones."""
         # m <- momentum * m + g / mean|g|; divided by the largest element first, so that
         # the sum of huge or tiny elements stays within float32
         scaled = gradient / float(gradient.abs().amax())
@@ -419,6 +428,11 @@ class PGD(AscentPolicy):
         return replace(state, direction=direction)
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
+        """Take a step from u; at the end of a window the step size may be halved
+        before.
+
+        Where each evaluation has other conditions, there are no windows.
+        """
         if math.isnan(state.start_objective):
             state = replace(state, start_objective=objective)
         if state.domain.draws_conditions:
@@ -517,6 +531,7 @@ class Adam(AscentPolicy):
     name: ClassVar[str] = "adam"
 
     def __post_init__(self) -> None:
+        """Check that all settings are within their limits."""
         if not 0.0 < self.step_size <= 2.0:
             raise self.make_range_error(
                 "step_size", "(0, 2], a share of half the range", 0.3
@@ -526,6 +541,7 @@ class Adam(AscentPolicy):
                 raise self.make_range_error(beta, "[0, 1)", 0.9)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
+        """Start at the domain's initial point, with means of zero."""
         steps = max(1, steps // (1 + domain.gradient_cost))
         zero = torch.zeros_like(domain.start)
         return Ascent(
@@ -558,6 +574,7 @@ class Adam(AscentPolicy):
         )
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
+        """Take a step along the mean gradient over its root mean square; see `Adam`."""
         if state.n_updates:
             # m' / sqrt(v'), without the bias of means that began at zero
             mean = state.direction / (1.0 - self.beta1**state.n_updates)

@@ -83,6 +83,7 @@ class Random(NonAdaptivePolicy):
     def propose(
         self, state: PointsState, n: int
     ) -> tuple[tuple[Proposal, ...], PointsState]:
+        """Propose n samples, of which those with even numbers are extreme ones."""
         numbers = range(state.n_proposed, state.n_proposed + n)
         return state.propose(
             state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0]
@@ -112,6 +113,8 @@ class Sobol(NonAdaptivePolicy):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> PointsState:
+        """Start the sequence, with its first chunk of points."""
+        # one dimension for each element, and one for the radius in each l2 ball
         n_l2_balls = sum(block.norm == "l2" for block in domain.blocks)
         size = domain.dim + n_l2_balls
         if size > MAX_SOBOL_DIM:
@@ -211,6 +214,7 @@ class Grid(NonAdaptivePolicy):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> PointsState:
+        """Start with all points of the grid, sorted from coarse to fine."""
         counts = _count_values(domain, steps, self.points)
         points = torch.cartesian_prod(*_make_axes(domain, counts))
         points = points.reshape(-1, domain.dim)
@@ -263,6 +267,7 @@ def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Ten
     max_level = torch.zeros(1, dtype=torch.long)
     level_sum = torch.zeros(1, dtype=torch.long)
     for level in map(_compute_levels, blocks, counts):
+        # each point so far with each value of this axis
         max_level = torch.maximum(max_level[:, None], level).flatten()
         level_sum = (level_sum[:, None] + level).flatten()
     sort_key = max_level * (int(level_sum.max()) + 1) + level_sum

@@ -309,9 +309,11 @@ def fit(
     )
     factor = torch.linalg.cholesky(matrix)
     right_sides = torch.stack([y.double(), torch.ones(n, dtype=torch.float64)], dim=1)
+    # K^-1 y and K^-1 1, with which generalised least squares give the mean
     solved_values, solved_ones = torch.cholesky_solve(right_sides, factor).T
     mean = float(solved_values.sum() / solved_ones.sum())
     weights = solved_values - mean * solved_ones
+    # (y - mean)' K^-1 (y - mean) / n
     variance = max(float(weights @ (y.double() - mean)) / n, 1e-30)
     likelihood = -0.5 * n * math.log(variance) - float(factor.diagonal().log().sum())
     return Surrogate(box, x, scales, factor, weights, mean, variance, likelihood)
@@ -331,6 +333,7 @@ def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
         fits = [fit(box, x, y, scales) for scales in candidates]
         return max(fits, key=lambda surrogate: surrogate.likelihood)
 
+    # one length scale for all coordinates, in units of `length_unit`
     best = find_most_likely(
         [
             Scales(torch.full((k,), length_unit * length).double(), noise)

@@ -118,7 +118,16 @@ def _load_processor(loaded: LoadedNetwork) -> Any:
 def _check_length(
     loaded: LoadedNetwork, reader: _LanguageModel, max_new_tokens: int
 ) -> None:
-    """Raise InputError if image, prompt and answer have too many tokens."""
+    """Check that image, prompt and answer are not too long for the network.
+
+    Args:
+        loaded: the network.
+        reader: of images and prompt.
+        max_new_tokens: of the answer.
+
+    Raises:
+        InputError: they have too many tokens.
+    """
     config = loaded.network.config.get_text_config()
     max_tokens = getattr(config, "max_position_embeddings", None)
     n_tokens = (
@@ -171,6 +180,16 @@ class _LanguageModel(nn.Module):
     """
 
     def __init__(self, loaded: LoadedNetwork, processor: Any, question: str) -> None:
+        """Prepare question and preprocessing for a network.
+
+        Args:
+            loaded: the network, with what belongs to it.
+            processor: of images and texts.
+            question: about each image.
+
+        Raises:
+            ModelError: its processor cannot be used.
+        """
         super().__init__()
         self.network = loaded.network
         self.processor = processor
@@ -210,8 +229,11 @@ class _LanguageModel(nn.Module):
         self._check_pixels(loaded.spec)
 
     def _check_pixels(self, spec: str) -> None:
-        """Raise ModelError if the processor treats a floating-point image otherwise
-        than the same image in 8 bits.
+        """Check that a floating-point image gives the same input as the image in 8
+        bits.
+
+        Raises:
+            ModelError: the processor treats them differently.
         """
         height, width = self.image_size
         vertical = torch.linspace(0, 200, height)[:, None]
@@ -361,6 +383,7 @@ class _LanguageModel(nn.Module):
 
         `past` is the cache of one image.
         """
+        # one copy of the cache for each row of tokens
         past.batch_repeat_interleave(len(tokens))
         logits: Tensor = self.network(
             input_ids=tokens, use_cache=True, **{self.cache: past}
@@ -379,6 +402,12 @@ class _NameClassifier(nn.Module):
     """
 
     def __init__(self, reader: _LanguageModel, tokens: Sequence[Sequence[int]]) -> None:
+        """Prepare the tables of tokens that `forward` reads likelihoods by.
+
+        Args:
+            reader: the network.
+            tokens: of each name, at least one.
+        """
         super().__init__()
         self.reader = reader
         self.tokens = [list(name_tokens) for name_tokens in tokens]
@@ -423,8 +452,9 @@ class _NameClassifier(nn.Module):
 
 
 def _find_stem(stems: Sequence[Sequence[int]], prefix: Sequence[int]) -> int:
-    """Return the index of the first stem that begins with a prefix; 0 if there is
-    none.
+    """Return the index of the first stem (tokens) that begins with a prefix.
+
+    0 if there is none, as for a name of one token without any stems.
     """
     for index, stem in enumerate(stems):
         if list(stem[: len(prefix)]) == list(prefix):
@@ -451,6 +481,12 @@ class _FreeAnswerer(nn.Module):
     """
 
     def __init__(self, reader: _LanguageModel, max_tokens: int) -> None:
+        """Prepare the answers of a network.
+
+        Args:
+            reader: the network.
+            max_tokens: maximum length of an answer.
+        """
         super().__init__()
         self.reader = reader
         self.tokenizer = reader.processor.tokenizer
@@ -515,8 +551,10 @@ def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Te
 
 
 def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
-    """Compare the likelihood of the longest name with that of the network itself, read
-    with the prompt at once.
+    """Compare the likelihood of the longest name with that of the network itself.
+
+    The latter reads image, prompt and name at once, where `_NameClassifier` reads them
+    in parts and keeps what it has read.
 
     Raises:
         ModelError: they differ.
@@ -533,6 +571,7 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
         raise _make_unsupported_error(
             loaded, "returns logits of another length than the text has"
         )
+    # the logits at a position are those of the next token
     likelihoods = logits[0, -len(name_tokens) - 1 : -1].float().log_softmax(dim=-1)
     expected = likelihoods.gather(1, name_tokens[:, None]).sum().double()
     computed = module(image[None])[0, index].double()

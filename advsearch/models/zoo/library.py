@@ -133,6 +133,7 @@ def measure_processor(processor: Any, spec: str) -> Processing:
     """
 
     def process_color(color: tuple[int, int, int], size: int = PROBE_SIZES[0]) -> Array:
+        """Return the output (3, h, w) for a square image of one color."""
         return _run_processor(
             processor, np.full((size, size, 3), color, np.uint8), spec
         )
@@ -150,6 +151,7 @@ def measure_processor(processor: Any, spec: str) -> Processing:
         axis=1,
     )
     tolerance = TOLERANCE * max(float(np.abs(gains).max()), 1e-12)
+    # grays have to be what gain and offset predict, everywhere in the image
     for level in (51, 128, 255):
         expected = offset + gains.sum(axis=1) * (level / 255.0)
         difference = process_color((level, level, level)) - expected[:, None, None]
@@ -160,6 +162,7 @@ def measure_processor(processor: Any, spec: str) -> Processing:
                 processing,
                 "changes pixels by something else than a gain and an offset",
             )
+    # Each output channel may depend on one input channel only, in one of two orders.
     diagonal_gains = {
         channels: np.diag(matrix)
         for channels, matrix in (("RGB", gains), ("BGR", gains[:, ::-1]))

@@ -107,6 +107,9 @@ def make_feature_source(
     )
 
     def compute_features(network: Any, images: Tensor) -> Any:
+        """Return the features (N, D) of images (N, 3, H, W), or else what the network
+        returns.
+        """
         compares = zero_shot.encodes_images_and_texts(network)
         encode = network.get_image_features if compares else network
         returned = encode(pixel_values=images)
@@ -147,6 +150,7 @@ def make_depth_source(loaded: LoadedNetwork) -> models.Source:
     is_padded = is_zoedepth and bool(getattr(loaded.processor, "do_pad", False))
 
     def ask(network: Any, images: Tensor) -> dict[str, Tensor]:
+        """Return the values (N, h, w) under their kind for images (N, 3, H, W)."""
         if not is_padded:
             return {kind: network(pixel_values=images).predicted_depth}
         # ZoeDepth takes images with a mirrored border, which its processor adds and its
@@ -179,12 +183,13 @@ SENTENCE = "the task is semantic"  # the text input of OneFormer
 def make_mask_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a network that returns masks and their classes.
 
-    Its output is the logarithms of scores (N, classes, H, W) of each pixel of the
-    input. The score of a class is the sum over queries of the probability that it is a
-    query's, times the probability that the pixel is in that query's mask (Cheng et al.
-    2021, arXiv
-    2107.06278, section 3.4, "semantic inference"). Masks are resized at the point at which
-    `post_process_semantic_segmentation` of each family resizes them.
+    Its output is the logarithm of a score (N, classes, H, W) of each class at each
+    pixel of the input. The network has queries, each with a mask and with probabilities
+    of classes. The score of a class is a sum over queries: the probability that the
+    query is of that class, times the probability that the pixel is in its mask (Cheng
+    et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Masks are resized
+    where `post_process_semantic_segmentation` of each family does it: before or after
+    that sum.
 
     Warns:
         ModelWarning: what the scores are.
@@ -209,6 +214,9 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
         sentence = torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
 
     def ask(network: Any, images: Tensor) -> Tensor:
+        """Return the logarithms of scores (N, classes, H, W) for images (N, 3, H,
+        W).
+        """
         size = (images.shape[2], images.shape[3])
         task_inputs = {}
         if sentence is not None:

@@ -94,6 +94,7 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         transformers.utils.logging.disable_progress_bar()
     where: dict[str, Any] = {"revision": revision} if revision else {}
     with report_library_errors(spec, ADVICE):
+        # otherwise each file would be tried for half a minute
         if not Path(name).is_dir() and _is_hub_unreachable(name):
             where["local_files_only"] = True
         saved = _load_config(transformers, name, spec, where)
@@ -209,6 +210,12 @@ def _load_config(
     transformers: Any, name: str, spec: str, where: Mapping[str, Any]
 ) -> Mapping[str, Any]:
     """Return the config of a repository or a directory, as JSON values.
+
+    Args:
+        transformers: the package.
+        name: of the repository or directory.
+        spec: what the user wrote, for messages.
+        where: arguments of the package, such as a revision.
 
     Raises:
         ModelError: it is a repository of open_clip, or cannot be found.
@@ -425,11 +432,16 @@ MEMORY_FILE = Path("/proc/meminfo")  # Linux's file of memory sizes
 def check_fits(
     transformers: Any, name: str, where: Mapping[str, Any], spec: str
 ) -> None:
-    """Check that the weights of a repository or a directory fit into the free memory,
-    swap included.
+    """Check that the weights of a network fit into the free memory, swap included.
 
     They keep the dtype in which they are stored. Nothing is checked if the system does
     not report its free memory.
+
+    Args:
+        transformers: the package.
+        name: of the repository or directory.
+        where: arguments of the package, such as a revision.
+        spec: what the user wrote, for messages.
 
     Raises:
         ModelError: they are larger.

@@ -89,6 +89,7 @@ def _make_head(network: Any, embeddings: Tensor) -> nn.Linear:
     else:
         scale = network.logit_scale.exp()
     head = nn.Linear(embeddings.shape[1], embeddings.shape[0])
+    # An image's embedding has length 1 too, so that products are cosines.
     head.weight.copy_(scale.float() * embeddings)
     has_bias = hasattr(network, "logit_bias")
     head.bias.copy_(network.logit_bias.float() if has_bias else torch.zeros(()))
@@ -219,6 +220,13 @@ def _check_scores(
 ) -> None:
     """Compare the score of noise and a text with that of the network itself.
 
+    Args:
+        network: with its text encoder.
+        classifier: that is checked, with the same weights.
+        tokenizer: of the network.
+        text: to compare with.
+        source: has the size of images.
+
     Raises:
         ModelError: they differ.
     """
@@ -293,10 +301,12 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
 def _build_owl(
     loaded: LoadedNetwork, network: Any, tokenizer: Any, words: Sequence[str]
 ) -> RunNetwork:
-    """Compare each patch of the image, which is one box, with the text of each name
-    (Minderer et al. 2022, arXiv 2205.06230, section 3).
+    """Return a function that compares each patch with the names' texts
+    (`BuildDetector`).
 
-    The texts of a name are averaged as CLIP's are. OWL's text encoder is then removed.
+    A patch of the image has one box (Minderer et al. 2022, arXiv 2205.06230, section
+    3). The texts of a name are averaged as CLIP's are. The network's text encoder is
+    removed then.
     """
     base_model = getattr(network, network.base_model_prefix)
     prompts = models.get_patterns(loaded.purpose.prompts)
@@ -318,10 +328,14 @@ def _build_owl(
 def _build_grounding_dino(
     loaded: LoadedNetwork, network: Any, tokenizer: Any, words: Sequence[str]
 ) -> RunNetwork:
-    """Read all names as one text, ``mug. cup. bowl.``, and score boxes by its tokens
-    (Liu et al. 2023, arXiv 2303.05499, section 3).
+    """Return a function that scores boxes by the tokens of one text (`BuildDetector`).
 
-    The score of a name is the largest of its tokens.
+    The text has all names, ``mug. cup. bowl.`` (Liu et al. 2023, arXiv 2303.05499,
+    section 3). The score of a name is the largest of its tokens.
+
+    Raises:
+        InputError: there are several prompts, the text is too long, or a name has a
+            full stop in it.
     """
     name = loaded.name
     prompt, *other_prompts = models.get_patterns(loaded.purpose.prompts or ("{}",))

@@ -123,6 +123,11 @@ def check_settings(
 ) -> None:
     """Check that settings and Python arguments belong to the task.
 
+    Args:
+        config: the settings.
+        beside: further batches of images; for classifiers only.
+        loss: for detectors and segmenters only.
+
     Raises:
         InputError: one of them does not.
     """
@@ -180,6 +185,7 @@ def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> Non
     """
     is_passed = {name: value is not None for name, value in arguments.items()}
     was_passed = json.loads(run.store.read_note(ARGUMENTS_NOTE) or "{}")
+    # What the first session noted stays.
     run.store.write_note(ARGUMENTS_NOTE, json.dumps({**is_passed, **was_passed}))
     for name, passed_before in was_passed.items():
         if passed_before != is_passed[name]:
@@ -204,6 +210,7 @@ class Hardening:
     """
 
     def __init__(self, run: RunDirectory, trainer: Trainer) -> None:
+        """Prepare the run, with what an earlier session of it has measured."""
         self.run = run
         self.trainer = trainer
         self.scenes = trainer.work
@@ -313,7 +320,14 @@ class Hardening:
     def _record(
         self, measurement: str, control: str, number: int, is_wrong: bool
     ) -> None:
-        """Store whether an attack found a wrong prediction in a scene."""
+        """Store whether an attack found a wrong prediction in a scene.
+
+        Args:
+            measurement: a key of `MEASUREMENTS`.
+            control: that was searched.
+            number: of the scene.
+            is_wrong: whether it found one.
+        """
         kind = f"{measurement} {control}"
         self.is_wrong[kind, number] = is_wrong
         self.run.append_row(
@@ -327,9 +341,14 @@ class Hardening:
     def _find_robust(
         self, measurement: str, controls: Collection[str]
     ) -> list[bool] | None:
-        """Return whether each scene withstood the searches over all of some controls.
+        """Return whether each measured scene withstood the searches over all of some
+        controls.
 
-        None if some are not measured yet.
+        None if a scene is not measured yet with one of them.
+
+        Args:
+            measurement: a key of `MEASUREMENTS`.
+            controls: of the searches.
         """
         is_robust = []
         for number in range(self.config.measured):
@@ -435,7 +454,12 @@ class Hardening:
 def _compare_robustness(
     before: Sequence[bool] | None, after: Sequence[bool] | None
 ) -> dict[str, Any]:
-    """Return the fields of the paired comparison; empty if it is not measured."""
+    """Return the fields of the paired comparison of scenes; empty if they are not
+    measured.
+
+    Args:
+        before, after: whether each scene is robust, in the same order; None if unknown.
+    """
     if before is None or after is None:
         return {}
     pairs = list(zip(before, after, strict=True))

@@ -24,14 +24,16 @@ WHITE_LIGHT_CHANGES = 0.5
 def vary_environment(
     environment: assets.EnvironmentAsset, rng: np.random.Generator
 ) -> assets.EnvironmentAsset:
-    """Mirror an environment, change its tint and contrast, and add a soft light.
+    """Change the tint and contrast of an environment; perhaps mirror it or add a soft
+    light.
 
-    It is mirrored and lit in half of the cases.
+    Each of the latter two happens in half of the cases.
     """
     radiance = environment.radiance
     if rng.random() < 0.5:
         radiance = radiance[:, ::-1]
     radiance = radiance * np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
+    # contrast: a power of the radiance relative to the mean
     mean = float(radiance.mean()) + 1e-6
     radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
     if rng.random() < 0.5:
@@ -48,12 +50,18 @@ def sample_lobe(
 ) -> npt.NDArray[np.float64]:
     """Sample a broad light from above the horizon, as an environment map (H, W).
 
-    Values are relative to the mean of the environment that it is added to.
+    It falls off as exp(sharpness * (cosine - 1)), with the cosine of the angle from its
+    middle. Values are relative to the mean of the environment that it is added to.
+
+    Args:
+        height, width: of the map, which has the zenith at the top and azimuths across.
+        rng: samples its direction, its size and its strength.
     """
     theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
     phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
     zenith = rng.uniform(0.1, 1.3)
     azimuth = rng.uniform(0.0, 2.0 * math.pi)
+    # of the angle between the direction of each texel and that of the light
     cosine = np.cos(theta) * math.cos(zenith) + np.sin(theta) * math.sin(
         zenith
     ) * np.cos(phi - azimuth)
@@ -67,9 +75,10 @@ def change_white_light(
 ) -> assets.EnvironmentAsset:
     """Change the color temperature of an environment in half of the cases.
 
-    Relative to daylight (D65), what a black body of 2,700 K (an incandescent lamp)
-    gives in linear sRGB is about exp(`WARM`), and one of 10,000 K (a clear sky in the
-    shade) about exp(-0.24 `WARM`); the amount is uniform between.
+    The linear sRGB channels are multiplied by exp(a * `WARM`), with a uniform in
+    `WARM_RANGE`. Relative to daylight (D65), the light of a black body of 2,700 K (an
+    incandescent lamp) has a of about 1, and that of 10,000 K (a clear sky in the shade)
+    about -0.24.
     """
     if rng.random() >= WHITE_LIGHT_CHANGES:
         return environment

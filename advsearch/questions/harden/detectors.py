@@ -176,7 +176,13 @@ def _read_boxes(
     image: Mapping[str, Any],
     label_of_category: Mapping[Any, int],
 ) -> tuple[Tensor, Tensor]:
-    """Return boxes (n, 4) x0, y0, x1, y1 and labels (n,) of an image."""
+    """Return the boxes (n, 4), x0, y0, x1, y1, and the labels (n,) of an image.
+
+    Args:
+        annotations_of_image: COCO's annotations by the `id` of their image.
+        image: COCO's description of the image.
+        label_of_category: index of the model's label by COCO's category.
+    """
     annotations = annotations_of_image[image["id"]]
     boxes = torch.tensor(
         [annotation["bbox"] for annotation in annotations], dtype=torch.float32
@@ -191,7 +197,12 @@ def _read_boxes(
 
 
 def _locate_image(directory: Path, name: str, coco_file: Path) -> Path:
-    """Return the path of an image of a COCO file.
+    """Return the path of an image that a COCO file names.
+
+    Args:
+        directory: of the images, resolved.
+        name: in the file, which is not trusted.
+        coco_file: for messages.
 
     Raises:
         FileFormatError: it is outside of the directory.
@@ -230,10 +241,10 @@ def compute_network_loss(
     """
     inner: Any = getattr(network, "network", network)
     returned: Any = None
-    if hasattr(inner, "config"):
+    if hasattr(inner, "config"):  # of transformers
         labels = _transformers_labels(x, targets)
         returned = inner(pixel_values=x, labels=labels).loss
-    elif inner is not network:
+    elif inner is not network:  # of torchvision, in a wrapper of ours
         returned = inner(list(x), list(targets))
     elif len(inspect.signature(network.forward).parameters) > 1:
         returned = network(x, list(targets))
@@ -285,6 +296,7 @@ class DetectorTrainer(Trainer):
         custom_items: Sequence[Example] = (),
         loss: Loss | None = None,
     ) -> None:
+        """Set up the trainer; without a `loss` it is `default_loss`."""
         super().__init__(work, student, optimiser, custom_items)
         self.loss = loss or self.default_loss()
 
@@ -299,6 +311,11 @@ class DetectorTrainer(Trainer):
 
         There is a search for each control; its image is used whether the prediction is
         wrong or not.
+
+        Args:
+            title: of the stage that the progress reports.
+            split: name of the split that the scenes belong to.
+            scene_numbers: numbers of the scenes.
         """
         scene_split = self.work.splits[split]
         controls = tuple(self.config.controls)
@@ -324,7 +341,14 @@ class DetectorTrainer(Trainer):
     def _attack(
         self, scene: workbench.Scene, name: str, control: str, seed: int
     ) -> tuple[Example, Example]:
-        """Attack the student in a scene; return a plain image and the worst one."""
+        """Attack the student in a scene; return a plain image and the worst one.
+
+        Args:
+            scene: to attack.
+            name: of its object.
+            control: that is searched.
+            seed: of the search and of the conditions of both images.
+        """
         model = self.student.model
         config = self.work.make_attack_config(
             (control,), name, seed=seed, trials=TRIALS, verify_spp=SPP
@@ -368,9 +392,11 @@ class DetectorTrainer(Trainer):
         network.eval()
 
     def make_input(self, item: Example, is_mirrored: bool) -> tuple[Tensor, Target]:
-        """Return the network's input for an image, and the target in its pixels.
+        """Return the network's input (1, ...) for an image, and the target in its
+        pixels.
 
-        The target has "boxes" (K, 4), x0, y0, x1, y1, and "labels" (K,).
+        The target has "boxes" (K, 4), x0, y0, x1, y1, and "labels" (K,). A mirrored
+        image has mirrored boxes.
         """
         levels = item.levels
         boxes = item.boxes
@@ -404,7 +430,13 @@ class DetectorTrainer(Trainer):
     def save_images(
         self, run: RunDirectory, number: int, new: Sequence[Example]
     ) -> None:
-        """Write the images of a round in COCO's format."""
+        """Write the images of a round in COCO's format.
+
+        Args:
+            run: gets the files.
+            number: of the round.
+            new: its new items.
+        """
         directory = f"{IMAGE_DIRECTORY}/round-{number:03d}"
         images = []
         annotations = list[dict[str, Any]]()
@@ -494,7 +526,12 @@ class SegmenterTrainer(DetectorTrainer):
         """Return the network's input for an image, and the target of its pixels.
 
         The target has "classes" (h, w) int64 and "object" (h, w) bool at the size of
-        the network's output.
+        the network's output. Beside the object, classes are those that the original
+        model predicts.
+
+        Args:
+            item: with a `Region` as truth.
+            is_mirrored: whether image and target are mirrored.
         """
         region: Any = item.truth
         levels = item.levels.flip(1) if is_mirrored else item.levels

@@ -189,10 +189,11 @@ def _find_right_classes(problem: Problem) -> tuple[int, ...]:
 def _make_texture_lessons(
     problem: Problem, views: int, seed: int, shares_texture: bool
 ) -> list[TextureLesson]:
-    """Make a lesson with a matrix of light transport for each view.
+    """Make a lesson with a matrix of light transport for each view of a scene.
 
-    Each has conditions of its own. Its texture begins at a random extreme
-    configuration, which is one object for all of them with `shares_texture`.
+    Each view has conditions of its own. Its texture begins at a random extreme
+    configuration. With `shares_texture` that is one tensor for all views, which a step
+    of one of them changes for all.
     """
     right_classes = _find_right_classes(problem)
     domain = problem.domain
@@ -235,10 +236,11 @@ def _sample_texture(domain: policies.Domain, seed: int) -> Tensor:
 def _make_rendered_lessons(
     problem: Problem, views: int, seed: int, n_tries: int | None
 ) -> list[RenderedLesson]:
-    """Make a lesson with renders of random configurations for each view.
+    """Make a lesson with renders of random configurations for each view of a scene.
 
-    The plain image is that of the start; without `n_tries` that of a random control
-    changed by itself, and the only other image has all of them changed.
+    With `n_tries` the plain image is that of the start, and there are as many others.
+    Without it, the plain image has one random control changed, and the only other image
+    has all of them changed.
     """
     right_classes = _find_right_classes(problem)
     render = problem.renderer.copy_with(quick=True)
@@ -263,7 +265,11 @@ def _sample_lesson_configurations(
 ) -> list[Tensor]:
     """Sample the configurations (d,) of a lesson, that of the plain image first.
 
-    See `_make_rendered_lessons`.
+    Args:
+        problem: of the scene.
+        seed: of the samples.
+        n_tries: number of further configurations after the start; None for two only: a
+            random control changed by itself, and all of them.
     """
     domain = problem.domain
     generator = torch.Generator().manual_seed(seed)
@@ -308,7 +314,7 @@ def sample_configurations(
         block.name.rpartition(".")[0] for block, _ in domain.list_block_slices()
     ]
     controls = list(dict.fromkeys(control_of_block))
-    # (count,) the index of the control that changes; after the last one, all change
+    # (count,) the index of the control that changes; one past the last means all
     turn = torch.arange(count) % (len(controls) + 1)
     for control, (block, columns) in zip(
         control_of_block, domain.list_block_slices(), strict=True
@@ -356,10 +362,15 @@ def select_hard_lessons(
 def search_worse_images(
     selected: Sequence[Lesson], model: Model, steps: int = 1
 ) -> None:
-    """Search for worse images of lessons.
+    """Search for worse images of lessons, which are changed in place.
 
-    Textures take steps of the search; where several images were rendered, their losses
-    are computed again.
+    Textures take `steps` of the search. Lessons with several rendered images have the
+    loss of each computed again, which decides which one is the worst.
+
+    Args:
+        selected: the lessons.
+        model: that the images are to be hard for.
+        steps: of the search of textures.
     """
     for start in range(0, len(selected), BATCH_SIZE):
         batch = selected[start : start + BATCH_SIZE]
@@ -368,7 +379,11 @@ def search_worse_images(
 
 
 def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
-    """Compute the losses of lessons with several rendered images."""
+    """Compute the losses of all images of the lessons that have several rendered ones.
+
+    The images of all these lessons are evaluated as one batch, and their losses divided
+    among the lessons again.
+    """
     rendered_lessons = [
         lesson
         for lesson in batch
@@ -394,9 +409,9 @@ def ascend_textures(
     gradients_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]],
     steps: int = 1,
 ) -> None:
-    """Take steps of steepest ascent of the textures of lessons.
+    """Take steps of steepest ascent with the textures of lessons, in place.
 
-    The gradients of views that share a texture are summed. Other lessons are unchanged.
+    Views that share a texture sum up their gradients. Other lessons are unchanged.
 
     Args:
         selected: the lessons.
@@ -443,6 +458,7 @@ def compute_texture_gradients(
         [lesson.compute_image(u) for lesson, u in zip(selected, textures, strict=True)]
     )
     right = [lesson.right_classes for lesson in selected]
+    # Images do not depend on each other, so the sum has the gradient of each.
     loss = negative_log_likelihood(model(change(images)), right).sum()
     return torch.autograd.grad(loss, textures)
 

@@ -101,6 +101,7 @@ def make_trainable(
     net = model.copy_network()
     net.eval().requires_grad_(True)
     if layers == "last":
+        # layers with parameters of their own, in the order of definition
         owners = [
             layer
             for layer in net.modules()
@@ -189,6 +190,7 @@ class Augmentation:
         angle = degrees * (math.pi / 180.0)
         cosine = scale * angle.cos()
         sine = scale * angle.sin()
+        # rows of the matrices from coordinates of the crop to those of the image
         rows = (
             torch.stack([cosine * mirror, -sine, shift[0]], 1),
             torch.stack([sine * mirror, cosine, shift[1]], 1),
@@ -247,6 +249,7 @@ class Augmentation:
         samples = torch.rand((len(x), 4), generator=generator).tolist()
         for index, (size, top, left, gray) in enumerate(samples):
             if is_hidden[index]:
+                # from 30 % of the largest side up to all of it
                 fraction = (0.3 + 0.7 * size) * self.largest_cutout
                 side = max(1, int(fraction * min(height, width)))
                 row = int(top * (height - side))

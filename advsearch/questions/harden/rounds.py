@@ -84,6 +84,7 @@ class Trainer(ABC):
         optimiser: MakeOptimizer | None = None,
         custom_items: Sequence[Any] = (),
     ) -> None:
+        """Set up the trainer, of which the class describes the arguments."""
         self.work = work
         self.config = work.config
         self.student = student
@@ -184,7 +185,13 @@ class Trainer(ABC):
     ) -> None:
         """Move the running average of the parameters towards their values after a step.
 
-        The decay is smaller in the first steps, so that the average forgets the start.
+        Its decay is smaller in the first steps, so that it soon forgets the weights
+        that the round began with.
+
+        Args:
+            n_steps: steps so far, this one included.
+            average: of each parameter; changed in place.
+            parameters: after the step.
         """
         decay = min(self.average_decay, n_steps / (n_steps + 5))
         for mean, parameter in zip(average, parameters, strict=True):
@@ -193,7 +200,12 @@ class Trainer(ABC):
     def _make_optimizer(
         self, parameters: Sequence[nn.Parameter], n_steps: int
     ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-        """Create the optimizer of a round, and its schedule of learning rates."""
+        """Create the optimizer of a round, and its schedule of learning rates.
+
+        Args:
+            parameters: that are trained.
+            n_steps: of the round.
+        """
         make_optimizer = self.optimiser or partial(
             torch.optim.AdamW, lr=self.config.rate, weight_decay=self.weight_decay
         )
@@ -220,8 +232,8 @@ def _copy_average(average: Sequence[Tensor], parameters: Sequence[Tensor]) -> No
 def adjust_warm_up(fraction: float, n_rates: int) -> float:
     """Return the fraction of the steps in which the learning rate rises.
 
-    It is a little larger where that is a single step, since OneCycleLR divides by the
-    steps of its rise less one.
+    OneCycleLR divides by the number of these steps less one. If that is a single step,
+    the fraction is returned a little larger, so that nothing is divided by zero.
     """
     is_single_step = math.isclose(fraction * n_rates, 1.0)
     return fraction * 1.001 if is_single_step else fraction
@@ -236,6 +248,9 @@ class Rounds:
     """
 
     def __init__(self, run: RunDirectory, trainer: Trainer) -> None:
+        """Prepare the rounds, with the results of those that an earlier session
+        ended.
+        """
         self.run = run
         self.trainer = trainer
         self.config = trainer.config
@@ -327,14 +342,17 @@ class Rounds:
         self.write_weights(WEIGHTS_FILE)
 
     def select_interpolation(self, held_back: Sequence[Any]) -> tuple[Score, float]:
-        """Set the student to the best interpolation between original and trained
-        weights.
+        """Load the best mixture of original and trained weights into the student.
 
-        The best one is right most often on the worst images among those whose clean
+        The best one is right most often on the worst images, among those whose clean
         accuracy has fallen by no more than allowed; if all have fallen more, it is the
-        one with the best clean accuracy. Interpolations nearer to the original have
-        learned less. Once that shows, the others are not evaluated, as each costs a
-        search of its own.
+        one with the best clean accuracy. `INTERPOLATIONS` are tried from the trained
+        weights towards the original ones, which have learned less and less. Once that
+        shows in the worst images, the rest is not evaluated, as each takes a search of
+        its own.
+
+        Args:
+            held_back: items of the validation.
 
         Returns:
             Its score, and the interpolation: a member of `INTERPOLATIONS`.
@@ -346,7 +364,9 @@ class Rounds:
         }
 
         def load_interpolated(interpolation: float) -> None:
-            """Load weights between both; those that are no floats are the trained."""
+            """Load weights between both; those that are no floats are the trained
+            ones.
+            """
             interpolated = {
                 name: torch.lerp(original[name], weight, interpolation)
                 for name, weight in trained.items()

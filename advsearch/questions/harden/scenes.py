@@ -246,9 +246,13 @@ class SceneJobs:
         )
 
     def _has_matrix(self, *controls: str) -> bool:
-        """Return whether a matrix gives the images of the first control.
+        """Return whether a matrix of light transport gives the images of the first
+        control.
 
-        The others vary at random.
+        The other controls vary at random meanwhile. It is False if they cannot do so.
+
+        Raises:
+            InputError: the first control alone cannot be searched in a training scene.
         """
         try:
             problem, _ = self.make_problem(
@@ -276,14 +280,18 @@ class SceneJobs:
     ) -> tuple[Problem, int]:
         """Return the problem of a scene, and the root seed of its samples.
 
-        `RANDOM_RANGES` vary at random, unless a control of the same kind is among the
-        others. A scene that is not held out must not have an object that is.
+        Beside the given controls, `RANDOM_RANGES` vary at random, but for those of the
+        same kind as one of the controls, such as "camera". A scene of the training must
+        not have an object that is held out.
 
         Args:
             split: the split.
             number: of the scene.
             controls: that are searched.
             varying_controls: that vary at random.
+
+        Raises:
+            InputError: its object is held out.
         """
         name, scene = split.load_scene(
             number, workbench.collect_scene_parameters(self.config)
@@ -316,7 +324,8 @@ class SceneJobs:
             changes: to the settings.
         """
         searched = {control: self.config.controls[control] for control in controls}
-        # A setting that none of the controls takes is None.
+        # A setting of the run that some of these controls take has their values; it is
+        # None if none of them takes it.
         changed: dict[str, Any] = {}
         for control, ranges in searched.items():
             control_settings = workbench.select_run_settings(

@@ -94,6 +94,7 @@ class ClassifierTrainer(Trainer):
         optimiser: MakeOptimizer | None = None,
         beside: Examples | None = None,
     ) -> None:
+        """Set up the trainer, of which the class describes the arguments."""
         super().__init__(work, student, optimiser)
         self.n_views = (self.config.views, 2)
         self.beside = beside
@@ -108,12 +109,15 @@ class ClassifierTrainer(Trainer):
     ) -> list[Lesson]:
         """Make lessons of the scenes of a split with these numbers.
 
-        There are lessons for each control with a matrix of light transport, and for all
-        others together. In the training a fourth of the scenes have one texture for all
-        views, in half of them the rendered controls vary by chance, and further scenes
-        come on top: of what is rendered, new scenes teach more than further views. Each
-        rendered scene of the training has a plain lesson too, where the original
-        model's predictions count.
+        A scene has lessons for each control with a matrix of light transport, and
+        lessons for all other controls together, which are rendered. In the training
+        there is more:
+
+        - a fourth of the scenes have one texture for all views, and in half of them
+          the rendered controls vary by chance (`sample_scene_options`);
+        - each rendered scene has a plain lesson too, where the predictions of the
+          original model count;
+        - further scenes are rendered: a new scene teaches more than one more view.
         """
         jobs = self._matrix_jobs(split, scene_numbers)
         rendered = self.work.rendered_controls
@@ -136,9 +140,14 @@ class ClassifierTrainer(Trainer):
         return sampled_lessons
 
     def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Job]:
-        """Return the jobs of the controls that have a matrix of light transport.
+        """Return the jobs that make lessons with a matrix of light transport.
 
-        Only scenes of the training may share a texture, or have other controls vary.
+        There is one for each control that has such a matrix, and each scene. Only
+        scenes of the training may share a texture, or have other controls vary.
+
+        Args:
+            split: name of the split.
+            scene_numbers: of its scenes.
         """
         is_training = split == TRAINING
         n_views = self.n_views[0] if is_training else self.n_views[1]
@@ -185,9 +194,11 @@ class ClassifierTrainer(Trainer):
         ]
 
     def sample_scene_options(self, control: str, number: int) -> tuple[bool, bool]:
-        """Return whether the views of a scene share a texture, and others vary too.
+        """Return whether the views of a scene share a texture, and whether other
+        controls vary.
 
-        It is random, and not every fourth scene, since objects take turns.
+        Both are random, not every fourth or second scene: objects take turns, so the
+            same ones would always be chosen.
         """
         seed = seeds.stream(self.config.seed, f"views of {control}", number)
         shared_draw, varied_draw = np.random.default_rng(seed).random(2)
@@ -251,7 +262,10 @@ def _make_job(
     plain: int,
     **options: Any,
 ) -> Job:
-    """Return the job that makes lessons of a scene; see `SceneJobs.sample_lessons`."""
+    """Return the job that makes lessons of a scene.
+
+    The arguments are those of `SceneJobs.sample_lessons`.
+    """
     return partial(
         SceneJobs.sample_lessons,
         split=split,
@@ -266,7 +280,13 @@ def _make_job(
 def _accuracy(
     model: Model, chosen: Sequence[Lesson], image_of: Callable[[Lesson], Tensor]
 ) -> float:
-    """Return the fraction of lessons whose images (H, W, 3) a model gets right."""
+    """Return the fraction of lessons whose images a model gets right.
+
+    Args:
+        model: returns logits.
+        chosen: lessons, at least one.
+        image_of: returns the image (H, W, 3) of a lesson.
+    """
     n_right = 0
     with torch.no_grad():
         for start in range(0, len(chosen), lessons.BATCH_SIZE):
@@ -295,6 +315,7 @@ class GradientComputer:
     def __init__(
         self, student: Trainable, original_model: Model, pool: Executor
     ) -> None:
+        """Set up without copies of the network; they are made as parts need them."""
         self._student = student
         self._original_model = original_model
         self._pool = pool
@@ -318,6 +339,7 @@ class GradientComputer:
         """
         # Textures come first, so that both passes have the same parts.
         batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
+        # so that the loss is a mean over plain images plus one over worst images
         plain_weight = 1.0 / len(batch)
         worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
 
@@ -339,6 +361,7 @@ class GradientComputer:
         def all_texture_gradients(
             texture_lessons: Sequence[TextureLesson],
         ) -> list[Tensor]:
+            """Return the gradients of all lessons, part by part on the threads."""
             parts = self._map_parts(texture_gradients, texture_lessons, seed)
             return list(itertools.chain.from_iterable(parts))
 
@@ -366,9 +389,11 @@ class GradientComputer:
         chosen: Sequence[Lesson],
         seed: int,
     ) -> list[Sequence[Any]]:
-        """Apply a function to parts of lessons on the threads.
+        """Apply a function to parts of lessons on the threads, and return its results
+        in order.
 
-        It is called with the part, a copy of the network, and a seed.
+        It is called with the part, a copy of the network for this part alone, and a
+        seed that depends on the number of the part.
         """
         parts = [
             chosen[start : start + LESSONS_PER_PART]

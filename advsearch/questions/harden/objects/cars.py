@@ -41,10 +41,13 @@ Height = Callable[[Array, Array, Array], Array]
 def _outline(
     angle: Array, front: float, rear: float, half: float, power: float, middle: float
 ) -> tuple[Array, Array]:
-    """Return x and y of a superellipse.
+    """Return x and y, each (N,), of points of a superellipse.
+
+    That is an oval between an ellipse (power 2) and a rectangle (a large power). Its
+    front and rear half may differ in length.
 
     Args:
-        angle: parameters of its points (N,).
+        angle: parameters of the points (N,), from -pi to pi; 0 is the front end.
         front, rear: x of its ends.
         half: its extent along y and -y.
         power: of the superellipse.
@@ -53,6 +56,7 @@ def _outline(
     cosine = np.cos(angle)
     sine = np.sin(angle)
     half_length = np.where(cosine >= 0.0, front - middle, middle - rear)
+    # x = a |cos|^(2/power) fulfils |x/a|^power + |y/b|^power = 1 with y likewise
     exponent = 2 / power
     x = middle + half_length * np.sign(cosine) * np.abs(cosine) ** exponent
     y = half * np.sign(sine) * np.abs(sine) ** exponent
@@ -70,15 +74,15 @@ def _shell(
         power: of the superellipses.
         middle: x of their center.
         height: returns z from fractions of the height, x and y.
-        corner: fraction of the columns, from the middle of front and rear, at which the
-            charts are cut.
+        corner: where charts are cut: at this fraction of all columns to both sides of
+            the middle of the front and of the rear.
     """
     angle = _outline_angles(rows, power, middle)
     points = _shell_points(
         rows=rows, power=power, middle=middle, height=height, angle=angle
     )
     normals = _shell_normals(points)
-    opposite = COLUMNS // 2
+    opposite = COLUMNS // 2  # column 0 is the middle of the rear, this of the front
     cut = int(COLUMNS * corner)
     patches = []
     for first, last in pairwise(
@@ -103,9 +107,10 @@ def _shell(
 def _outline_angles(rows: Array, power: float, middle: float) -> Array:
     """Return the angles (C,) of columns that are equally far apart along the widest
     outline.
+
+    C is `COLUMNS` + 1: the first and the last are the middle of the rear. The arguments
+    are those of `_shell`.
     """
-    # angles are equally far apart along the widest outline, symmetrical, from the
-    # rear's middle
     _, half, front, rear = rows[np.argmax(rows[:, 1])]
     fine = np.linspace(-np.pi, np.pi, 8001)
     x, y = _outline(
@@ -123,8 +128,10 @@ def _outline_angles(rows: Array, power: float, middle: float) -> Array:
 def _shell_points(
     rows: Array, power: float, middle: float, height: Height, angle: Array
 ) -> Array:
-    """Return the points (R, C, 3) of a stack of superellipses at the angles of the
-    columns.
+    """Return the points (R, C, 3) of a stack of superellipses, one row for each.
+
+    `angle` (C,) has the angles of the columns; the other arguments are those of
+    `_shell`.
     """
     points = np.empty((len(rows), COLUMNS + 1, 3))
     for row, (share, half, front, rear) in zip(points, rows, strict=True):
@@ -138,20 +145,26 @@ def _shell_points(
 
 
 def _shell_normals(points: Array) -> Array:
-    """Return the normals (R, C, 3) at points (R, C, 3) of a closed shell."""
+    """Return the unit normals (R, C, 3) of a closed shell with points (R, C, 3).
+
+    The first and the last column are the same points, so differences go on across them.
+    """
     wrapped_points = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
     column_tangent = np.gradient(wrapped_points, axis=1)[:, 1:-1]
     return shapes.normalize(np.cross(column_tangent, np.gradient(points, axis=0)))
 
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
-    """Return the function of x that a spline through knots (x, z) is."""
+    """Return z as a function of x along a spline through knots (x, z), x ascending."""
     curve = shapes.spline(knots, count=200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
 
 def _softest(*fields: Array) -> Array:
-    """Return the minimum of several distances, with corners rounded by about 3 cm."""
+    """Return the minimum of several distances (N,), with corners rounded by about 3 cm.
+
+    It is the smooth minimum -log(sum(exp(-30 d))) / 30, of distances cut to 1 m.
+    """
     return np.asarray(
         logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0
     )
@@ -228,7 +241,12 @@ def _cabin_height(share: Array, x: Array, y: Array) -> Array:
 
 
 def _inside(p: Array) -> dict[str, Array]:
-    """Return about how far points (N, 3) lie inside each of `OPENINGS` (N,)."""
+    """Return about how far points (N, 3) lie inside each opening, by its name in
+    `OPENINGS`.
+
+    The values (N,) are in metres, and below 0 outside. Where an opening is on one end
+    or side of the car only, they are -1 elsewhere. Numbers are measures of the car.
+    """
     x, y, z = p.T
     abs_y = np.abs(y)
     cabin_radius = _cabin_radius(x, y)
@@ -236,7 +254,8 @@ def _inside(p: Array) -> dict[str, Array]:
     half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
     sill = _WAIST(x) + 0.04
     lintel = sill + 0.83 * (_ROOF(x) - sill)
-    # distance behind the line of the windscreen's pillar
+    # distances behind the slanted line of the windscreen's pillar, and before that of
+    # the rear one
     pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
     rear = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
     lens = _inside_headlight(abs_y, x, z)
@@ -272,13 +291,20 @@ def _inside(p: Array) -> dict[str, Array]:
 
 
 def _inside_headlight(abs_y: Array, x: Array, z: Array) -> Array:
-    """Return how far points lie inside the outline of the headlights."""
+    """Return how far points lie inside the outline of the headlights, seen from the
+    front.
+
+    Arguments and result are (N,); `abs_y` is the distance from the middle of the car.
+    """
     lamp = abs_y - 0.42
     return _softest(lamp, x - 1.66, z - (0.565 + 0.1 * lamp), 0.665 + 0.2 * lamp - z)
 
 
 def _cabin_radius(x: Array, y: Array) -> Array:
-    """Return the radius of points in the superellipse of the cabin, 1 at its edge."""
+    """Return the radius (N,) of points in the superellipse of the cabin, 1 at its edge.
+
+    It is seen from above; x and y are (N,).
+    """
     reach = np.where(x >= MIDDLE, 0.9 - MIDDLE, MIDDLE + 1.86)
     return (
         np.abs((x - MIDDLE) / reach) ** _CABIN_POWER + np.abs(y / 0.72) ** _CABIN_POWER
@@ -286,7 +312,11 @@ def _cabin_radius(x: Array, y: Array) -> Array:
 
 
 def _inside_arches(abs_y: Array, x: Array, z: Array) -> list[Array]:
-    """Return how far points lie inside the front and the rear wheel arch."""
+    """Return how far points lie inside the front and the rear wheel arch, two arrays
+    (N,).
+
+    The arguments are (N,); `abs_y` is the distance from the middle of the car.
+    """
     return [
         np.where(abs_y > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0)
         for axle in AXLES
@@ -315,6 +345,8 @@ def _opening(name: str) -> shapes.Field:
 
 def _body_and_cabin() -> list[Patch]:
     """Create the body and the cabin with their openings."""
+    # rows of smaller and smaller outlines at the full height: they close body and cabin
+    # at the top, but for a hole in the body under the cabin
     deck = [
         (1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)
     ]
@@ -339,11 +371,14 @@ def _body_and_cabin() -> list[Patch]:
 
 
 def _wheels() -> list[Patch]:
-    """Create the four wheels, the front ones turned."""
-    half = TYRE / 2  # about the z axis, the outer side up, in the middle of the tyre
-    rim = 0.212
+    """Create the four wheels with tyres, rims and hubs. A rim has five forked spokes.
+
+    One wheel is built around the z axis, its outer side up, and copied to its places.
+    """
+    half = TYRE / 2  # z of the outer side; 0 is the middle of the tyre
+    rim = 0.212  # radius
     tyre = _tyre_profile(rim, half)
-    deep = half - 0.06
+    deep = half - 0.06  # z of the dark ground behind the spokes
     wheel = shapes.lathe([("rubber", tyre)], columns=28)
     wheel += shapes.lathe(
         [
@@ -375,6 +410,7 @@ def _wheels() -> list[Patch]:
     )
     patches = []
     for axle, side in WHEELS:
+        # The wheel's axis is laid along y, outwards; then the wheel rolls a little.
         turn = shapes.rotation("y", 17.0 * axle) @ shapes.rotation("x", -90.0 * side)
         patches += shapes.transform_patches(
             wheel, turn, (axle, side * (0.852 - TYRE / 2), WHEEL)
@@ -397,15 +433,20 @@ def _tyre_profile(rim: float, half: float) -> list[tuple[float, float]]:
 
 
 def _wells() -> list[Patch]:
-    """Create the wheel wells and the floor."""
+    """Create the inside of the wheel arches, and the floor of the car.
+
+    Each arch has a curved wall around the wheel, and a flat one towards the middle.
+    """
+    # around the axle: from below it at the front, over the top, to below it at the rear
     angle = np.radians(np.linspace(-30.0, 210.0, 17))
     outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     patches = []
     for axle, side in WHEELS:
         inner = np.array([axle, 0.0, WHEEL]) + ARCH * outwards
+        # the edges of the curved wall: in the car's side, and farther in
         rows = np.stack([inner + np.array([0.0, side * y, 0.0]) for y in (0.79, 0.56)])
         ring = rows[1]
-        if side > 0:
+        if side > 0:  # so that the faces of both sides look towards the wheel
             rows = rows[::-1]
             ring = ring[::-1]
         normals = np.broadcast_to(-outwards, rows.shape)
@@ -496,7 +537,11 @@ _DOORS = (
 
 @painter
 def _lacquer(t: Texels, color: Array) -> Array:
-    """Paint with the gaps of doors, hood and tailgate."""
+    """Paint lacquer, with dark lines for the gaps of doors, hood, tailgate and tank
+    lid.
+
+    A soft fold runs along both sides of the hood.
+    """
     x, y, z = t.xyz.T
     out = np.abs(y)
     hood = shapes.distance_to_polylines(
@@ -505,6 +550,7 @@ def _lacquer(t: Texels, color: Array) -> Array:
     gate = shapes.distance_to_polylines(
         out, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)]
     )
+    # distance to each gap, where it is on this side of the car; far away elsewhere
     gaps = [
         np.where(
             (out > 0.6) & (z < 1.02), shapes.distance_to_polylines(x, z, *_DOORS), 9.0
@@ -587,7 +633,11 @@ def _slats(t: Texels) -> Array:
 
 @painter
 def _plate(t: Texels, ground: Array) -> Array:
-    """A licence plate: dark strokes on a light ground; nobody's number."""
+    """Paint a licence plate: dark strokes on a light ground, which are nobody's number.
+
+    It has eight cells along y, and the fourth one is empty.
+    """
+    # from -1 to 1 over the plate, which is painted before it is moved to its place
     y = t.xyz[:, 1] / 0.26
     z = t.xyz[:, 2] / 0.056
     cell = (y + 0.86) / 0.215
@@ -597,6 +647,7 @@ def _plate(t: Texels, ground: Array) -> Array:
         & (np.floor(cell) != 3)
         & (t.xyz[:, 0] > -1.0)
     )
+    # from the middle of a cell: two upright strokes, and two bars between them
     cell_fraction = np.abs(cell % 1.0 - 0.5)
     strokes = (np.abs(cell_fraction - 0.27) < 0.09) | (
         (cell_fraction < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)

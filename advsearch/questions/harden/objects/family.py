@@ -55,15 +55,19 @@ class _Shelf:
 def _shelves(
     sizes: Sequence[tuple[float, float]], scale: float, side: int
 ) -> list[AtlasRectangle] | None:
-    """Pack rectangles (w, h), w >= h, on shelves of a square, the highest first.
+    """Pack rectangles on shelves of a square, the highest first; None if they do not
+    fit.
 
     A rectangle goes on the lowest shelf that has room for it, or opens a new shelf on
-    top of the others. None if they do not fit.
+    top of the others.
 
     Args:
-        sizes: in object units.
+        sizes: (width, height) of each, width >= height, in object units.
         scale: texels per unit.
         side: of the square in texels.
+
+    Returns:
+        The rectangles in the order of `sizes`, with gutters, in texels.
     """
     cells = [
         (
@@ -72,7 +76,7 @@ def _shelves(
         )
         for width, height in sizes
     ]
-    # by height, then width
+    # numbers of the cells by height, then width; of equal ones in their order
     order = sorted(
         range(len(cells)), key=lambda index: (-cells[index][1], -cells[index][0], index)
     )
@@ -84,7 +88,7 @@ def _shelves(
         if width > side:
             return None
         fitting = [shelf for shelf in shelves if shelf.filled + width <= side]
-        if fitting:
+        if fitting:  # The highest come first, so it is high enough.
             shelf = fitting[0]
         else:
             if top + height > side:
@@ -104,7 +108,11 @@ def pack_charts(
 ) -> list[AtlasRectangle]:
     """Pack charts of size (width, height) into a square at the largest scale that fits.
 
-    The scale is found by bisection.
+    They have a common scale, which is found by bisection. A chart that is higher than
+    wide is packed lying on its side (`is_rotated`).
+
+    Raises:
+        ValueError: there are too many charts for their gutters alone.
     """
     exact = [
         (round(width, DECIMALS), round(height, DECIMALS)) for width, height in sizes
@@ -112,7 +120,7 @@ def pack_charts(
     wide = [(max(size), min(size)) for size in exact]
     lower = 0.0
     upper = side / max(width for width, _ in wide)
-    best = _shelves(wide, lower, side)
+    best = _shelves(wide, lower, side)  # at scale 0 there are gutters only
     for _ in range(12):
         scale = (lower + upper) / 2
         rectangles = _shelves(wide, scale, side)
@@ -138,14 +146,20 @@ def paint_atlas(
     paints: Mapping[str, Paint],
     side: int = DEFAULT_ATLAS_SIZE,
 ) -> npt.NDArray[np.float32]:
-    """Paint the texture (side, side, 3), display-referred sRGB, row 0 at the top.
+    """Paint the texture (side, side, 3) of an object, row 0 at the top.
 
-    Values are multiples of 1/255.
+    It is display-referred sRGB; values are multiples of 1/255.
+
+    Args:
+        patches: of the object.
+        rectangles: where the chart of each patch is.
+        paints: by the tags of patches.
+        side: of the texture, in texels.
     """
     image = np.zeros((side, side, 3))
     is_used = np.zeros((side, side), dtype=bool)
     for patch, rectangle in zip(patches, rectangles, strict=True):
-        # Texels are in rows from the bottom.
+        # Coordinates of texels in the rectangle, row by row from the bottom.
         a = np.tile(_texel_centers(rectangle.width), rectangle.height)
         b = np.repeat(_texel_centers(rectangle.height), rectangle.width)
         u, v = (b, 1.0 - a) if rectangle.is_rotated else (a, b)
@@ -156,7 +170,9 @@ def paint_atlas(
         ]
         image[area] = color.reshape(rectangle.height, rectangle.width, 3)
         is_used[area] = True
+    # one color everywhere else, and rounded as machines differ in the last bits
     image[~is_used] = np.round(image[is_used].mean(axis=0), 2)
+    # rounded to 4 decimals first, so that all machines round halves to the same level
     levels = np.clip(np.round(image[::-1] * 255.0, 4) + 0.5, 0.5, 255.5).astype(
         np.uint8
     )
@@ -164,7 +180,11 @@ def paint_atlas(
 
 
 def _texel_centers(count: int) -> Array:
-    """Return chart coordinates (count,) of texels along an edge, clamped in gutters."""
+    """Return chart coordinates (count,) of the texels along one edge of its rectangle.
+
+    The chart goes from 0 to 1 within the gutters; in these, coordinates stay at 0 and
+    1.
+    """
     return np.clip((np.arange(count) + 0.5 - GUTTER) / (count - 2 * GUTTER), 0.0, 1.0)
 
 
@@ -176,6 +196,11 @@ def join_patches(
     """Join patches into a mesh of largest extent 1, centered and standing on z = 0.
 
     Every value is rounded to `DECIMALS`.
+
+    Args:
+        patches: of the object.
+        rectangles: where the chart of each patch is in the atlas.
+        side: of the atlas, in texels.
     """
     first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
     vertices = np.concatenate([patch.vertices for patch in patches])
@@ -344,8 +369,14 @@ def sample_material(
     clearcoat: float = 0.0,
     spread: float = 0.2,
 ) -> assets.Material:
-    """Sample a material with a roughness within `spread`, and sometimes another
-    coat.
+    """Sample a material: its roughness, sometimes another clearcoat, and rarely a
+        metal.
+
+    Args:
+        draw: samples it; the canonical instance has the values that are passed.
+        roughness: canonical value.
+        clearcoat: canonical value.
+        spread: how far the roughness may be from its canonical value.
     """
     sampled_roughness = draw(roughness, low=roughness - spread, high=roughness + spread)
     sampled_clearcoat = (

@@ -34,17 +34,19 @@ Point = tuple[float, float, float]
 def _post(
     tag: str, low: Point, high: Point, section: Array, ends: tuple[float, float]
 ) -> list[Patch]:
-    """Create a straight post between two points.
+    """Create a straight post between two points, with slightly beveled ends.
 
     Args:
         tag: of its paint.
         low, high: its ends.
-        section: (M, 2).
-        ends: scales of the section at both ends.
+        section: (M, 2), for a radius of 1.
+        ends: radii at `low` and at `high`; the radius changes evenly between them.
     """
     t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
+    # the first and last ring are smaller: the bevel
     scale = (ends[0] + (ends[1] - ends[0]) * t) * np.array([0.9, 1.0, 1.0, 1.0, 0.9])
+    # the section's first axis must not be along the post
     is_lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
     return shapes.sweep(
         tag,
@@ -147,7 +149,16 @@ def _chair_legs(
     section: Array,
     taper: tuple[float, float],
 ) -> list[Patch]:
-    """Create the four legs of a chair."""
+    """Create the four legs of a chair, which stand wider apart at the floor.
+
+    Args:
+        x, y: of the top of the leg at +x and +y; the others mirror it.
+        splay: by how much a foot lies farther out than its top, along x and y.
+        seat_height: of the upper side of the seat.
+        seat_thickness: of the seat.
+        section: (M, 2), for a radius of 1.
+        taper: radii at the floor and at the top.
+    """
     patches = list[Patch]()
     for sign_x, sign_y in product((-1.0, 1.0), repeat=2):
         foot = (sign_x * (x + splay), sign_y * (y + splay), 0.0)
@@ -170,9 +181,17 @@ def _chair_rungs(
     leg_radius: float,
     section: Array,
 ) -> list[Patch]:
-    """Create the rungs between the legs of a chair."""
+    """Create the rungs of a chair: one along each side, and one across between them.
+
+    Args:
+        draw: samples their height.
+        seat_height: of the upper side of the seat.
+        splay, x, y, section: as in `_chair_legs`.
+        leg_radius: of the legs; rungs are thinner.
+    """
     patches = list[Patch]()
     low = seat_height * draw(0.36, low=0.25, high=0.6)
+    # how far out the legs are at that height
     spread = splay * (1.0 - low / seat_height)
     front_x = x + spread
     side_y = y + spread
@@ -191,7 +210,15 @@ def _chair_rungs(
 
 
 def _chair_paints(draw: ParameterSampler, total_height: float) -> dict[str, Paint]:
-    """Sample the paints of a chair of a height."""
+    """Sample the paints of a chair by the tags of its parts.
+
+    All wood is painted with one paint, or else shows its grain along each part.
+    Cushions, and sometimes the seat, have a fabric.
+
+    Args:
+        draw: samples the paints.
+        total_height: of the chair.
+    """
     offset = draw.offset()
     timber = draw.sample_color(
         "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0
@@ -200,12 +227,12 @@ def _chair_paints(draw: ParameterSampler, total_height: float) -> dict[str, Pain
         "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040"
     )
     painted = draw.chance(0.4)
-    wild = paint_or_random(draw, total_height, solid(paint_color), wild=0.5)
+    wood_paint = paint_or_random(draw, total_height, solid(paint_color), wild=0.5)
 
     def grain(axis: int) -> Paint:
-        """Return the paint of a part whose grain runs along an axis."""
+        """Return the paint of a part whose grain, if any, runs along an axis."""
         return (
-            wild
+            wood_paint
             if painted
             else wood(timber, scale=3.2, offset=offset, axis=axis, contrast=0.36)
         )
@@ -237,10 +264,23 @@ def _chair_back(
     leg_radius: float,
     section: Array,
 ) -> list[Patch]:
-    """Create the back of a chair of one of several kinds."""
+    """Create the back of a chair: two posts, and what is between them.
+
+    That is vertical slats below a rail ("slats" with a second rail below them, "arch"
+    without), horizontal bars ("ladder"), or one board ("panel").
+
+    Args:
+        draw: samples the kind and its proportions.
+        x, y: of the tops of the legs, which the posts continue upwards.
+        seat_height: of the upper side of the seat.
+        total_height: of the top of the back.
+        lean: by how much the top lies farther back than the seat.
+        leg_radius: radius of the posts, at their lower end.
+        section: (M, 2) of the posts, for a radius of 1.
+    """
     style = draw.pick("slats", "ladder", "panel", "arch")
     patches: list[Patch] = []
-    foot = seat_height - 2.0
+    foot = seat_height - 2.0  # inside the seat
 
     def back_x(z: float) -> float:
         """Return the x of the leaning back at a height."""
@@ -262,7 +302,14 @@ def _chair_back(
     def slat(
         tag: str, z: float, width: float, height: float, center_y: float = 0.0
     ) -> list[Patch]:
-        """Create a part of the back around a height, in its plane."""
+        """Create a board of the back, which leans with it.
+
+        Args:
+            tag: of its paint.
+            z: height of its middle.
+            width, height: of the board.
+            center_y: y of its middle.
+        """
         return shapes.transform_patches(
             shapes.box(tag, (0.0, 0.0, 0.0), (depth, width, height), bevel=0.5),
             tilt,
@@ -320,7 +367,15 @@ def _shade(
     bottom_radius: float,
     top_radius: float,
 ) -> list[Patch]:
-    """Create an open lampshade with a thin wall, from a height to another."""
+    """Create an open lampshade with a thin wall.
+
+    Its profile is one closed loop: up the outside, over the rim, down the lining.
+
+    Args:
+        draw: samples how much it bulges.
+        low, high: heights of its edges.
+        bottom_radius, top_radius: of its edges.
+    """
     wall = 0.25
     belly = draw(0.0, low=-0.1, high=0.12) * bottom_radius
     outer = shapes.spline(
@@ -344,15 +399,17 @@ def _shade(
 def _lamp_base(
     draw: ParameterSampler, style: str, low: float, radius: float, stem_radius: float
 ) -> list[Patch]:
-    """Create the base of a lamp.
+    """Create the base of a lamp, from the table to the bulb.
 
     Args:
         draw: samples its proportions.
-        style: "disc", "body" or "gourd", which has a waist.
+        style: "disc" (a flat foot with a thin stem), "body" or "gourd" (a body with a
+            waist).
         low: height of its top.
         radius: of the foot.
         stem_radius: of the top.
     """
+    # profiles of points (r, z): the lower side, and the flat top
     under = [(0.0, 0.0), (radius - 0.4, 0.0)]
     top = [(stem_radius, low), (0.0, low)]
     if style == "disc":
@@ -373,14 +430,14 @@ def _lamp_base(
             [("base", under), ("base", side), ("base", top)], columns=44
         )
     belly = radius * draw(1.12, low=0.95, high=1.4)
-    at = draw(0.38, low=0.28, high=0.6) * low
+    belly_height = draw(0.38, low=0.28, high=0.6) * low  # height of the belly
     waist = [(0.45 * belly, 0.72 * low)]
     if style == "gourd":
         waist = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
     knots = [
         (radius * 0.96, 1.2),
         (radius * 0.8, 2.4),
-        (belly, at),
+        (belly, belly_height),
         *waist,
         (stem_radius * 1.5, 0.86 * low),
         (stem_radius, 0.93 * low),
@@ -405,7 +462,14 @@ def _lamp_base(
 def _shade_paint(
     draw: ParameterSampler, linen: Color, offset: Array, low: float, total_height: float
 ) -> Paint:
-    """Sample the paint of a lamp's shade between two heights."""
+    """Sample the paint of a lamp's shade.
+
+    Args:
+        draw: samples the pattern and the color of its second part.
+        linen: color of the cloth.
+        offset: (3,) into the noise.
+        low, total_height: heights of the shade's lower and upper edge.
+    """
     weave = clouded(linen, factor=0.93, scale=1.2, offset=offset)
     kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
     accent = draw.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
@@ -492,9 +556,16 @@ def _lamp_frame(
     bottom_radius: float,
     low: float,
 ) -> list[Patch]:
-    """Create the rod of a lamp, and the spokes that hold its shade."""
+    """Create the rod of a lamp and the three spokes that hold its shade.
+
+    Args:
+        total_height: of the lamp, which is the upper edge of the shade.
+        shade_height, top_radius, bottom_radius: of the shade.
+        low: height of the shade's lower edge.
+    """
     patches = list[Patch]()
     ring_z = total_height - 0.12 * shade_height
+    # radius of the shade there
     inside = top_radius + (bottom_radius - top_radius) * 0.12
     for angle in (20.0, 140.0, 260.0):
         spoke = shapes.sweep(
@@ -520,7 +591,13 @@ def _lamp_frame(
 def _lamp_paints(
     draw: ParameterSampler, low: float, total_height: float, style: str
 ) -> dict[str, Paint]:
-    """Sample the paints of a lamp."""
+    """Sample the paints of a lamp by the tags of its parts.
+
+    Args:
+        draw: samples the paints.
+        low, total_height: heights of the shade's edges.
+        style: of the base, as for `_lamp_base`.
+    """
     offset = draw.offset()
     linen = draw.sample_color(
         "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25

@@ -27,24 +27,48 @@ from advsearch.questions.harden.objects.textures import (
 
 
 def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
-    """Create a spout along +x with an open, hollow end."""
+    """Create a spout along +x with an open, hollow end.
+
+    One closed ring is swept along the path to the tip, then over the lip and back down
+    the inside for a few points, where it shrinks to a point.
+
+    Args:
+        draw: samples its proportions.
+        radius, height: of the teapot's body.
+    """
     path = _spout_path(draw, radius, height)
-    root = draw(1.75, low=1.3, high=2.2)
-    end = draw(0.72, low=0.55, high=0.95)
-    scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
-    tangent, first, second = shapes.compute_frames(path, (0.0, 1.0, 0.0))
-    # over the lip at the tip and back down inside
-    order = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
-    inner = scale[[17, 16, 15, 14, 13]] - 0.24
-    radii = np.concatenate(
-        [scale, [end - 0.06, end - 0.12, inner[0], inner[1], inner[2], inner[3], 0.0]]
+    root_radius = draw(1.75, low=1.3, high=2.2)
+    tip_radius = draw(0.72, low=0.55, high=0.95)
+    scale = (
+        tip_radius
+        + (root_radius - tip_radius) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
     )
-    push = np.zeros(len(order))
-    push[18:21] = (0.1, 0.12, 0.06)
-    frame = (tangent[order], first[order], second[order])
+    tangent, first, second = shapes.compute_frames(path, (0.0, 1.0, 0.0))
+    # points of the path that the rings are at: over the lip at the tip (the last point
+    # several times) and back down inside
+    ring_index = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
+    inner_radii = scale[[17, 16, 15, 14, 13]] - 0.24  # less the thickness of the wall
+    radii = np.concatenate(
+        [
+            scale,
+            [
+                tip_radius - 0.06,
+                tip_radius - 0.12,
+                inner_radii[0],
+                inner_radii[1],
+                inner_radii[2],
+                inner_radii[3],
+                0.0,
+            ],
+        ]
+    )
+    # the rings of the lip lie a little ahead of the tip, so that it is round
+    ahead = np.zeros(len(ring_index))
+    ahead[18:21] = (0.1, 0.12, 0.06)
+    frame = (tangent[ring_index], first[ring_index], second[ring_index])
     return shapes.sweep(
         "spout",
-        path[order] + push[:, None] * tangent[order],
+        path[ring_index] + ahead[:, None] * tangent[ring_index],
         shapes.ellipse(1.0, 1.0, count=20),
         radii,
         frame=frame,
@@ -52,7 +76,15 @@ def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
 
 
 def _spout_path(draw: ParameterSampler, radius: float, height: float) -> Array:
-    """Sample the path (18, 3) of a spout."""
+    """Sample the path (18, 3) of a spout in the x-z plane, from the body to the tip.
+
+    A curved one has the shape of an S: it bulges out and downwards in its lower half,
+        and is bent back a little before the tip.
+
+    Args:
+        draw: samples its style and its ends.
+        radius, height: of the teapot's body.
+    """
     style = draw.pick("curved", "straight")
     start = np.array([radius * 0.72, 0.0, height * draw(0.34, low=0.26, high=0.42)])
     tip = np.array(
@@ -62,6 +94,7 @@ def _spout_path(draw: ParameterSampler, radius: float, height: float) -> Array:
             height * draw(0.94, low=0.8, high=1.02),
         ]
     )
+    # how far it departs from a straight line, as a fraction of the radius
     bend = 0.22 if style == "curved" else 0.04
     middle = (start + tip) / 2 + np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
     above = (
@@ -95,9 +128,19 @@ def teapot(draw: ParameterSampler) -> Instance:
 def _teapot_body(
     draw: ParameterSampler, radius: float, height: float
 ) -> tuple[Array, list[Patch]]:
-    """Return the profile (K, 2) of the side, and the body with its lid and knob."""
+    """Return the profile (26, 2) of the side, and the body with its lid and knob.
+
+    Points of profiles are (r, z). The side goes from the foot over the belly to the
+    mouth.
+
+    Args:
+        draw: samples its proportions.
+        radius: of the belly.
+        height: of the mouth.
+    """
     foot = radius * draw(0.58, low=0.5, high=0.75)
     mouth = radius * draw(0.48, low=0.42, high=0.6)
+    # a fraction of the height, and of the radius halfway up to the belly
     belly_height = draw(0.45, low=0.35, high=0.58)
     fullness = draw(0.9, low=0.82, high=0.97)
     knots = [
@@ -110,7 +153,8 @@ def _teapot_body(
     side = shapes.spline(knots, count=26)
     dome = draw(1.5, low=0.7, high=2.4)
     knob_radius = draw(1.0, low=0.7, high=1.4)
-    top = height + dome + 0.2
+    top = height + dome + 0.2  # of the lid
+    # over the edge of the mouth, with a narrow groove where the lid begins
     rim = [
         (mouth, height),
         (mouth * 0.97, height + 0.02),
@@ -153,10 +197,17 @@ def _teapot_body(
 def _teapot_handle(
     draw: ParameterSampler, side: Array, radius: float, height: float
 ) -> list[Patch]:
-    """Create the handle on the +x side of a body with a profile (K, 2)."""
+    """Create the handle in the x-z plane, on the +x side of the body.
+
+    Args:
+        draw: samples its curve and its section.
+        side: profile (K, 2) of the body.
+        radius, height: of the body.
+    """
     span = draw(0.9, low=0.75, high=1.0)
     high = height * 0.84
     low = height * (0.84 - 0.62 * span)
+    # both ends lie a little inside the wall
     top_root, low_root = (shapes.radius_at_height(side, z) - 0.25 for z in (high, low))
     reach = radius * draw(0.72, low=0.5, high=0.9)
     lift = draw(0.05, low=-0.02, high=0.2) * height
@@ -175,12 +226,12 @@ def _teapot_handle(
         "handle",
         shapes.to_xz_plane(shapes.spline(knots, count=26)),
         section,
-        1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3,
+        1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3,  # thicker at both ends
     )
 
 
 def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
-    """Sample the paints of a teapot."""
+    """Sample the paints of a teapot of a height, by the tags of its parts."""
     offset = draw.offset()
     clay = draw.sample_color(
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
@@ -270,7 +321,13 @@ def _wall_rivets(side: Array, depth: float, wall: float) -> list[Patch]:
 
 
 def _pan_bracket(rim: float, depth: float, length: float, rise: float) -> list[Patch]:
-    """Create the bracket that holds the handle of a pan."""
+    """Create the bracket that holds the handle of a pan: a flat bar through the wall.
+
+    Args:
+        rim: radius of the pan's rim.
+        depth: of the pan.
+        length, rise: of the handle.
+    """
     spine = [
         (rim - 1.4, 0.72 * depth),
         (rim - 0.3, 0.75 * depth),
@@ -288,7 +345,17 @@ def _pan_bracket(rim: float, depth: float, length: float, rise: float) -> list[P
 def _pan_handle(
     draw: ParameterSampler, root: Array, length: float, rise: float
 ) -> list[Patch]:
-    """Create a handle along x from a root (3,), which rises and has a round end."""
+    """Create a handle along +x, which rises and has a round end.
+
+    Its section is scaled along the path: it is narrow at the root and has its full
+        width after a third.
+
+    Args:
+        draw: samples its curve and its section.
+        root: where it begins (3,).
+        length: along x.
+        rise: by how much it is higher at its end, about.
+    """
     knots = [
         (0.0, 0.0),
         (0.22 * length, 0.55 * rise),
@@ -296,12 +363,13 @@ def _pan_handle(
         (length, rise * draw(1.05, low=0.8, high=1.2)),
     ]
     path = shapes.spline(root + shapes.to_xz_plane(np.array(knots)), count=26)
-    t = np.linspace(0.0, 1.0, 26)
+    t = np.linspace(0.0, 1.0, 26)  # from the root to the end
     width = draw(1.15, low=0.85, high=1.5)
     thick = draw(0.62, low=0.45, high=0.9)
     shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (
         1.0 + draw(0.12, low=0.0, high=0.25) * np.sin(np.pi * t)
     )
+    # a quarter of an ellipse over the last 6 %
     round_end = np.sqrt(
         np.clip(1.0 - ((t - 0.94) / 0.06).clip(0.0, 1.0) ** 2, 0.0, 1.0)
     )
@@ -324,7 +392,13 @@ def _pan_rivets(radius: float, height: float) -> list[Patch]:
 
 
 def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, Paint]:
-    """Sample the paints of a pan with a radius and a depth."""
+    """Sample the paints of a pan, by the tags of its parts.
+
+    Args:
+        draw: samples the paints.
+        rim: radius of its rim.
+        depth: height of its rim.
+    """
     offset = draw.offset()
     coat = draw.sample_color("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
 

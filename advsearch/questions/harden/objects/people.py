@@ -34,9 +34,11 @@ FINISHES = {
 
 
 def _rest(charts: Array, points: Array) -> ChartToPoints:
-    """Return the function from chart coordinates to points of the reference body.
+    """Return the function from chart coordinates (N,), (N,) to points of a body (N, 3).
 
-    That stands as MakeHuman's does, whatever this body is like.
+    It interpolates the points (V, 3) at chart coordinates (V, 2) of one chart. They are
+    of the reference body, which stands as MakeHuman's does, so that all bodies are
+    painted alike. Outside the triangles it is the nearest point.
     """
     linear = LinearNDInterpolator(charts, points)
     nearest = NearestNDInterpolator(charts, points)
@@ -49,15 +51,25 @@ def _rest(charts: Array, points: Array) -> ChartToPoints:
 
 
 def _patches(person: Any) -> list[Patch]:
-    """Return the patches of a body, with smooth normals across the seams of charts."""
+    """Return the patches of a body, one for each chart of its texture.
+
+    Normals are smooth across the seams of charts. What is painted on a patch depends on
+    the corresponding points of the reference body.
+
+    Args:
+        person: of `workbench.library.make_person`.
+    """
     data = person.data
     vertices = person.standing_points.numpy().astype(np.float64)
     index = data["index"].astype(np.int64)
+    # the reference body: the mean, stored in tenths of millimetres, plus what the
+    # shares of one fixed phenotype add
     reference = data["mean"][index] * 1e-4 + np.einsum(
         "r,rpc->pc", data["shares"][1, 1, 1, 1], data["basis"][:, index]
     )
     reference[:, 2] -= reference[:, 2].min()
     charts = data["charts"].astype(np.float64)
+    # where the vertices and the faces of each chart begin
     first_vertex = np.cumsum([0, *data["points"]])
     first_face = np.cumsum([0, *data["triangles"]])
     faces = data["faces"].astype(np.int64)
@@ -98,7 +110,18 @@ def _smooth_normals(
     first_vertex: assets.IntArray,
     first_face: assets.IntArray,
 ) -> Array:
-    """Return normals (V, 3) that are smooth across the seams of charts."""
+    """Return normals (V, 3) that are smooth across the seams of charts.
+
+    Vertices of several charts that are the same point of the body share one normal: the
+        mean of the normals of all faces around it, weighted by area.
+
+    Args:
+        vertices: (V, 3), chart after chart.
+        index: (V,) number of the body's point that each vertex is.
+        faces: (F, 3), chart after chart; numbers of vertices within the chart.
+        first_vertex, first_face: where the vertices and faces of each chart begin, and
+            where all end.
+    """
     all_faces = np.concatenate(
         [
             faces[a:b] + start
@@ -120,7 +143,10 @@ def _smooth_normals(
 
 @painter
 def _woven(t: Texels, color: Array, depth: float) -> Array:
-    """Cloth: fine threads, and folds as faint clouds that are longer than wide."""
+    """Paint cloth: fine threads, and folds as faint clouds that are longer than wide.
+
+    `depth` is about by how much they change the color, as a fraction.
+    """
     folds = noise(t.xyz * np.array([9.0, 9.0, 4.0])) - 0.5
     thread = noise(t.xyz * 180.0) - 0.5
     return np.clip(
@@ -130,8 +156,9 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
 
 @painter
 def _jeans(t: Texels, color: Array) -> Array:
-    """Paint woven cloth with seams and hems."""
+    """Paint woven cloth with seams down the legs and a hem at both ankles."""
     x, _, z = t.xyz.T
+    # distance to the seam, which is in the plane x = 0.005; far away above and below it
     seam = np.where((z < 0.88) & (z > 0.08), np.minimum(np.abs(x - 0.005), 9.0), 9.0)
     hem = np.abs(z - 0.085)
     return mix(
@@ -143,7 +170,11 @@ def _jeans(t: Texels, color: Array) -> Array:
 
 @painter
 def _face(t: Texels, color: Array, hair: Array) -> Array:
-    """Paint skin with lips, cheeks and eyebrows."""
+    """Paint skin with lips, cheeks and eyebrows at the front of the head.
+
+    Their places are those of the reference body, in metres. Shades of lips and cheeks
+    are multiples of the skin's color (3,); eyebrows have the color of the hair (3,).
+    """
     x, y, z = t.xyz.T
     abs_y = np.abs(y)
     is_front = x > 0.1
@@ -180,7 +211,10 @@ def _leather(t: Texels, color: Array) -> Array:
 
 @painter
 def _irises(t: Texels, color: Array) -> Array:
-    """Paint eyes that look ahead: white, iris and pupil."""
+    """Paint eyes that look ahead: white, iris and pupil.
+
+    `color` (3,) is that of the iris. Places are those of the reference body, in metres.
+    """
     x, y, z = t.xyz.T
     # from the nearest pupil; all that is not at the front is white
     pupil_distance = np.where(
@@ -201,7 +235,7 @@ def person(draw: ParameterSampler) -> Instance:
     """Make a person of random phenotype, pose and clothes."""
     is_woman = draw.chance(0.5)
     gender = 0.0 if is_woman else 1.0
-    height_reduction = 0.08 if is_woman else 0.0
+    height_reduction = 0.08 if is_woman else 0.0  # metres
     phenotype = {
         "gender": gender,
         "height": draw(1.7, low=1.52, high=1.9) - height_reduction,

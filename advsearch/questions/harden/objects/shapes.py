@@ -49,11 +49,17 @@ def arc_lengths(curve: Array) -> Array:
 
 
 def distance_to_polylines(x: Array, y: Array, *paths: Points) -> Array:
-    """Return the distance of points (N,) to the nearest of several polylines (K, 2)."""
+    """Return the distance (N,) from points to the nearest of several polylines.
+
+    Args:
+        x, y: coordinates of the points (N,).
+        paths: polylines (K, 2).
+    """
     distance = np.full(len(x), np.inf)
     for (x0, y0), (x1, y1) in chain.from_iterable(map(pairwise, paths)):
         dx = x1 - x0
         dy = y1 - y0
+        # the nearest point of the segment, as a fraction of its length
         t = np.clip(((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
         distance = np.minimum(distance, np.hypot(x - x0 - t * dx, y - y0 - t * dy))
     return distance
@@ -65,11 +71,13 @@ def to_xz_plane(curve: Array) -> Array:
 
 
 def rotation(axis: str, degrees: float) -> Array:
-    """Return the right-handed rotation (3, 3) about the axis "x", "y" or "z", in
-    degrees.
+    """Return the matrix (3, 3) of a right-handed rotation about a coordinate axis.
+
+    It turns column vectors. The axis is "x", "y" or "z".
     """
     cosine = np.cos(np.radians(degrees))
     sine = np.sin(np.radians(degrees))
+    # the plane in which it turns, from i towards j
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.eye(3)
     matrix[[i, i, j, j], [i, j, i, j]] = cosine, -sine, sine, cosine
@@ -77,10 +85,11 @@ def rotation(axis: str, degrees: float) -> Array:
 
 
 def spline(points: Points, count: int) -> Array:
-    """Sample the Catmull-Rom curve through points (K, D) at `count` points, ends
+    """Sample a Catmull-Rom curve through points (K, D) at `count` points, ends
     included.
 
-    Its knots are spaced by chord length.
+    Its parameter is the length along the polyline of the points, so that unevenly
+    spaced points do not make it overshoot.
     """
     knots = np.asarray(points, dtype=np.float64)
     arc_length = arc_lengths(knots)
@@ -94,12 +103,12 @@ def spline(points: Points, count: int) -> Array:
 def round_corners(
     corners: Points, radius: float | Sequence[float], steps: int = 5
 ) -> Array:
-    """Round the inner corners of an open polyline (K, D).
+    """Round the inner corners of an open polyline (K, D), by parabolas.
 
     Args:
-        corners: the polyline.
+        corners: the polyline; its first and last point stay as they are.
         radius: distance from a corner at which its rounding begins, for all corners or
-            (K - 2,); at most half an edge.
+            (K - 2,). It is reduced to half of the shorter edge at the corner.
         steps: edges of a rounded corner.
     """
     points = np.asarray(corners, dtype=np.float64)
@@ -112,6 +121,7 @@ def round_corners(
     ):
         to_previous = previous - corner
         to_next = following - corner
+        # a little less than half an edge, so that two roundings never meet
         reach = min(
             float(corner_radius),
             0.499 * float(np.linalg.norm(to_previous)),
@@ -123,6 +133,7 @@ def round_corners(
         start = corner + normalize(to_previous) * reach
         end = corner + normalize(to_next) * reach
         t = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        # quadratic Bezier curve whose control point is the corner
         rounded_points.extend(
             (1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end
         )
@@ -131,12 +142,13 @@ def round_corners(
 
 
 def subdivide(points: Points, longest: float) -> Array:
-    """Divide the edges of a polyline that are longer than `longest` into equal
+    """Divide each edge of a polyline (K, D) that is longer than `longest` into equal
     pieces.
     """
     curve = np.asarray(points, dtype=np.float64)
     parts = [curve[:1]]
     for start, end in pairwise(curve):
+        # The ratio is rounded, so that rounding errors add no piece.
         n_pieces = max(
             1, int(np.ceil(round(float(np.linalg.norm(end - start)) / longest, 6)))
         )
@@ -151,15 +163,24 @@ def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
 
     Its circumradius is 1, and a flat side is at the bottom.
     """
+    # two corners more than there are: the outermost are not rounded, and cut off
     angle = 2 * np.pi * (np.arange(sides + 2) - 0.5) / sides - np.pi / 2
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return round_corners(ring, radius=bevel, steps=steps)[1:-1]
 
 
 def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Array:
-    """Return a centered rounded rectangle as a closed counter-clockwise section (M,
-    2).
+    """Return a rounded rectangle around the origin as a closed section (M, 2).
+
+    It is counter-clockwise.
+
+    Args:
+        width, height: of the rectangle.
+        bevel: distance from a corner at which its rounding begins.
+        steps: edges of a rounded corner.
     """
+    # The first two corners are repeated at the end: the outermost corners of the
+    # polyline are not rounded, and are cut off.
     half_width = width / 2
     half_height = height / 2
     corners = [
@@ -215,8 +236,12 @@ def transform_patches(
     rotation: Array | None = None,
     offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> list[Patch]:
-    """Rotate patches by a matrix (3, 3), then translate them, with what is painted on
-    them.
+    """Rotate patches, then translate them, together with what is painted on them.
+
+    Args:
+        patches: to move; they are not changed.
+        rotation: matrix (3, 3); None for no rotation.
+        offset: (3,).
     """
     matrix = np.eye(3) if rotation is None else rotation
     translation = np.asarray(offset, dtype=np.float64)
@@ -257,9 +282,10 @@ def grid(
 
     Args:
         tag: of the paint.
-        points: u runs along columns and v along rows; du x dv points outwards.
+        points: u grows from column to column, and v from row to row; the cross
+            product of these directions points outwards.
         normals: (R, C, 3).
-        size: width and height of the chart.
+        size: width and height of the chart in object units.
         down: v of the rows (R,), increasing from 0 to 1.
         across: u of the columns (C,), increasing from 0 to 1.
     """
@@ -301,7 +327,9 @@ def grid(
 
 
 def _along(curve: Array) -> tuple[Array, float]:
-    """Return the normalized arc lengths (K,) of a polyline, and its length."""
+    """Return the arc lengths (K,) of a polyline as fractions of its length, and the
+    length.
+    """
     arc_length = arc_lengths(curve)
     return arc_length / arc_length[-1], float(arc_length[-1])
 
@@ -317,9 +345,12 @@ def _fan(count: int) -> assets.IntArray:
 
 
 def _profile_normals(parts: Sequence[Array]) -> list[Array]:
-    """Return the unit normals (dz, -dr) of consecutive polylines (r, z).
+    """Return the unit normals (K, 2), as (r, z), of each of several consecutive
+    polylines.
 
-    Where a polyline ends on the axis, its normal there is along the axis. Where two
+    A polyline has points (r, z) and is walked with the material on its left. Its normal
+    is its direction (dr, dz) turned to the right, (dz, -dr), which points outwards.
+    Where it ends on the axis, the normal there is along the axis. Where two polylines
     meet at less than `HARD_ANGLE` degrees, they share the mean of their normals.
     """
     all_directions = []
@@ -330,7 +361,7 @@ def _profile_normals(parts: Sequence[Array]) -> list[Array]:
             [segments[:1], polyline[2:] - polyline[:-2], segments[-1:]]
         )
         for end in (0, -1):
-            if polyline[end, 0] < 1e-9:
+            if polyline[end, 0] < 1e-9:  # on the axis: horizontal, as at a pole
                 directions[end] = (segments[end][0], 0.0)
         all_directions.append(normalize(directions))
     for number in range(len(parts) - 1):
@@ -350,8 +381,10 @@ def _profile_normals(parts: Sequence[Array]) -> list[Array]:
 
 
 def _around(curve: Array, theta: Array) -> Array:
-    """Rotate a curve (K, 2) of points (r, z) to angles (M,) about the z axis: (K, M,
-    3).
+    """Turn a curve (K, 2) of points (r, z) about the z axis to angles (M,), in radians.
+
+    Returns:
+        (K, M, 3): the points of each angle.
     """
     heights = np.broadcast_to(curve[:, 1:], (len(curve), len(theta)))
     return np.stack(
@@ -362,12 +395,13 @@ def _around(curve: Array, theta: Array) -> Array:
 def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     """Create a piece of a surface of revolution that starts or ends on the axis.
 
-    Its chart is a disc with the distance from the pole as radius.
+    Its chart is a disc with the pole in the middle; the distance from there is the arc
+    length along the profile, as a fraction of the whole.
 
     Args:
         tag: of the paint.
         profile: (K, 2) points (r, z).
-        normals: (K, 2) of these.
+        normals: (K, 2), as (r, z), at these points.
         columns: faces around.
     """
     ends_on_axis = profile[-1, 0] < 1e-9
@@ -429,11 +463,16 @@ def _revolve_from_pole(curve: Array, theta: Array) -> Array:
 
 
 def _disc_triangles(columns: int, curve: Array) -> assets.IntArray:
-    """Return the triangles (F, 3) of a disc with rings of vertices around a pole."""
+    """Return the triangles (F, 3) of a disc with rings of vertices around a pole.
+
+    Vertex 0 is the pole; then come rings of `columns` vertices, one for each later
+    point of the curve (K, 2). The triangles are counter-clockwise seen from above.
+    """
     column = np.arange(columns)
     next_column = (column + 1) % columns
     faces = [_fan(columns)]
     for row in range(len(curve) - 2):
+        # numbers of the first vertices of two rings
         inner = 1 + row * columns
         outer = 1 + (row + 1) * columns
         faces += [
@@ -448,13 +487,20 @@ def _disc_triangles(columns: int, curve: Array) -> assets.IntArray:
 def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]:
     """Create a piece of a surface of revolution as an unrolled band.
 
-    A band that would be a long strip is cut into 2 or 4 charts.
+    A band that is much wider than high is cut into 2 or 4 charts.
+
+    Args:
+        tag: of the paint.
+        profile: (K, 2) points (r, z).
+        normals: (K, 2), as (r, z), at these points.
+        columns: faces around.
     """
     theta = 2 * np.pi * np.arange(columns + 1) / columns
     theta[-1] = 0.0  # the seam's two columns are the same points, to the bit
     points = _around(profile, theta)
     normal = _around(normals, theta)
     down, length = _along(profile)
+    # a typical circumference: nearly the largest, whatever the profile does at its ends
     width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
     if width <= 3 * length:
         n_pieces = 1
@@ -480,7 +526,7 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
             material on the left: along the bottom away from the axis, up the outside,
             over the lip, down the inside. A piece becomes a disc where it is mostly
             flat and touches the axis, a band otherwise.
-        columns: faces around.
+        columns: faces around the axis.
     """
     curves = [np.asarray(curve, dtype=np.float64) for _, curve in profile]
     patches = []
@@ -517,6 +563,7 @@ def vessel(
     max_radius = float(outside[:, 0].max())
     fillet = min(1.5 * wall, 0.3 * max_radius)  # radius between wall and floor
     floor_radius = radius_at_height(inner[::-1], floor)
+    # Above the fillet, and not where the two sides of a narrow container meet.
     is_wall = (inner[:, 1] > floor + fillet) & (inner[:, 0] > 0.05 * max_radius)
     inner = inner[is_wall]
     corner = np.array([floor_radius, floor])
@@ -524,6 +571,7 @@ def vessel(
     inside = np.concatenate([inner, _bezier(inner[-1], corner, fillet_end)])
     # The base is hollow inside a foot ring.
     foot = outside[0]
+    # how far the middle of the base lies above the foot ring
     inset = min(0.35 * wall, 0.3 * floor)
     base = [(0.0, inset), (0.86 * foot[0], inset), (0.9 * foot[0], foot[1]), foot]
     pieces = [
@@ -536,16 +584,20 @@ def vessel(
 
 
 def _bezier(start: Array, control: Array, end: Array) -> Array:
-    """Return four points (4, 2) of a quadratic Bezier curve, without its start."""
+    """Return four points (4, 2) of a quadratic Bezier curve, its end but not its
+    start.
+    """
     t = np.linspace(0.0, 1.0, 5)[1:, None]
     return np.asarray((1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end)
 
 
 def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
-    """Return the normals of a profile, and the inside of its wall from the lip down.
+    """Return the normals (K, 2) of a profile, and the inside of its wall from the lip
+    down.
 
-    In tight bends the offset curve runs backwards; such points are removed, again and
-    again, but never the last one.
+    The inside is the profile moved inwards by the thickness of the wall. In tight bends
+    it would run backwards; the points that do so are removed, and again those that then
+    do, but never the last one.
     """
     normal = _profile_normals([outside])[0]
     inner = outside - wall * normal
@@ -562,12 +614,20 @@ def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
 
 
 def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
-    """Return points (5, 2) of a half circle from the outside of a wall to its
+    """Return five points (5, 2) of the half circle from the outside of a wall to its
     inside.
+
+    Both ends of the half circle are left out.
+
+    Args:
+        outside: profile (K, 2) that ends at the lip.
+        wall: thickness of the wall.
+        normal: (K, 2) of the profile, outwards.
     """
     lip_angle = np.pi * np.arange(1, 6) / 6
     lip_center = outside[-1] - wall / 2 * normal[-1]
     lip_across = wall / 2 * normal[-1]
+    # `lip_across` turned by a quarter to the left: on along the profile
     lip_up = np.array([-lip_across[1], lip_across[0]])
     lip: Array = (
         lip_center
@@ -584,10 +644,20 @@ def sphere(
     rows: int = 24,
     columns: int = 40,
 ) -> list[Patch]:
-    """Create a sphere of three charts: two polar caps and a band."""
+    """Create a sphere of three charts: two polar caps and a band.
+
+    Args:
+        tag: of the paint.
+        radius: of the sphere.
+        centre: of the sphere.
+        rows: faces from pole to pole.
+        columns: faces around the z axis.
+    """
     angle = np.pi * np.arange(rows + 1) / rows - np.pi / 2
     curve = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    # exactly on the axis, which a cosine is not
     curve[[0, -1], 0] = 0.0
+    # the caps reach from the poles to 45 degrees of latitude
     cut = rows // 4
     pieces = [
         (tag, curve[: cut + 1]),
@@ -606,12 +676,13 @@ def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, A
         first: vector whose part normal to the path is the first normal at the start.
 
     Returns:
-        Three arrays (N, 3).
+        Three arrays (N, 3): tangents, first normals, second normals.
     """
     tangent = normalize(np.gradient(path, axis=0))
     normal = np.empty_like(path)
     current = np.asarray(first, dtype=np.float64)
     for i, direction in enumerate(tangent):
+        # the normal before, less what of it is along the new tangent
         current = normalize(current - (current @ direction) * direction)
         normal[i] = current
     return tangent, normal, np.cross(tangent, normal)
@@ -627,14 +698,16 @@ def sweep(
     caps: bool = False,
     frame: tuple[Array, Array, Array] | None = None,
 ) -> list[Patch]:
-    """Move a closed section along a path (N, 3).
+    """Create the surface that a closed section sweeps along a path (N, 3).
 
     Args:
+        tag: of the paint.
+        path: the centres of the section.
         section: (M, 2) counter-clockwise, coordinates along the first and second
             normal.
         scale: one number, (N,) or (N, 2): the section's scale at each centre; 0 closes
             the surface in a point.
-        first: where the section's first axis points at the start.
+        first: direction (3,) of the section's first axis at the start of the path.
         caps: close both ends with flat faces and a hard edge.
         frame: tangents and normals to use in place of `compute_frames(path, first)`.
     """
@@ -658,6 +731,7 @@ def sweep(
     closed = np.concatenate([points, points[:, :1]], axis=1)
     closed_normals = np.concatenate([normals, normals[:, :1]], axis=1)
     down = mean_lengths(points)
+    # nearly the largest circumference, whatever the scale is at the ends
     width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
     patches = [
         grid(
@@ -684,8 +758,9 @@ def _sweep_points(
     first_normal: Array,
     second_normal: Array,
 ) -> Array:
-    """Return the points (N, M, 3) of a section that is scaled and moved along a
-    path.
+    """Return the points (N, M, 3) of a section (M, 2) at each of the centres (N, 3).
+
+    There it is scaled by `scales` (N, 2), and its two axes are the normals (N, 3).
     """
     scaled_section = section[None] * scales[:, None]
     return (
@@ -696,14 +771,19 @@ def _sweep_points(
 
 
 def _sweep_normals(points: Array, tangent: Array) -> Array:
-    """Return the normals (N, M, 3) of a swept surface.
+    """Return the unit normals (N, M, 3) of a swept surface with points (N, M, 3).
 
-    Where its first or last ring is a point, they are along the path, outwards.
+    Where the first or last ring is a single point, they are along the path, outwards.
+
+    Args:
+        points: ring by ring.
+        tangent: unit tangents (N, 3) of the path.
     """
     ring_tangent = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
     normals = np.cross(ring_tangent, np.gradient(points, axis=0))
     normal_length = np.linalg.norm(normals, axis=-1)
     normals = normalize(normals)
+    # outwards is backwards at the first ring, and forwards at the last
     for row, direction in ((0, -1.0), (-1, 1.0)):
         is_point = normal_length[row] < 1e-7 * float(normal_length.max())
         normals[row][is_point] = direction * tangent[row]
@@ -711,7 +791,12 @@ def _sweep_normals(points: Array, tangent: Array) -> Array:
 
 
 def mean_lengths(points: Array, axis: int = 0) -> Array:
-    """Return mean lengths along an axis of a grid of points (R, C, 3), from 0."""
+    """Return how far the rows of a grid of points (R, C, 3) are from the first one,
+    (R,).
+
+    It is the length along the grid, and the mean over its columns. With axis 1 it is
+    that of the columns (C,), and the mean over rows.
+    """
     steps = np.linalg.norm(np.diff(points, axis=axis), axis=-1).mean(axis=1 - axis)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -719,8 +804,10 @@ def mean_lengths(points: Array, axis: int = 0) -> Array:
 def cap(tag: str, ring: Array, normal: Array) -> Patch:
     """Create a flat face that is bounded by a convex ring (M, 3).
 
-    The ring is counter-clockwise seen from outside; `normal` is the unit normal. The
-    chart is the face's bounding rectangle, with u from the center to the first point.
+    The ring is counter-clockwise seen from outside, and `normal` (3,) is the outward
+    unit normal. The face is a fan of triangles around its middle. The chart is its
+    bounding rectangle, with u in the direction from the middle to the first point of
+    the ring.
     """
     centre = ring.mean(axis=0)
     x = normalize(ring[0] - centre)
@@ -772,7 +859,7 @@ def box(
     """
     half = np.asarray(size, dtype=np.float64) / 2
     bevel = min(bevel, 0.95 * float(half.min()))
-    core = half - bevel
+    core = half - bevel  # half the size of what lies within the rounded edges
     patches = []
     for axis in range(3):
         i = (axis + 1) % 3
@@ -786,6 +873,7 @@ def box(
             down = (v + half[j]) / (2 * half[j])
             across = (u + half[i]) / (2 * half[i])
             if side < 0:
+                # `_rounded_face` turns the lower face around, and with it u
                 across = 1.0 - across[::-1]
             patches.append(
                 grid(
@@ -801,9 +889,10 @@ def box(
 
 
 def _edge_coordinates(flat: float, bevel: float, steps: int, cells: int) -> Array:
-    """Return ascending coordinates along an axis of a box's face.
+    """Return ascending coordinates along an axis of a box's face, around its middle.
 
-    They are denser in the rounded edges, where they are at equal angles.
+    The rounded edges at both ends take equal angles of up to 45 degrees, where the next
+    face begins.
 
     Args:
         flat: half the length of the flat part.
@@ -820,13 +909,13 @@ def _rounded_face(
 ) -> tuple[Array, Array]:
     """Return normals and points (V, U, 3) of a face of a box with rounded edges.
 
-    Points of the face of the cube are moved towards the nearest point of the box less
-    its bevel, until they are `bevel` away from it.
+    A point on the face of the sharp box is moved towards the nearest point of the core,
+    which is the box made smaller by the bevel on each side, until it is `bevel` away.
 
     Args:
-        axis: that the face is across.
+        axis: that the face is perpendicular to: 0, 1 or 2.
         side: 1 of the upper face, -1 of the lower one.
-        u, v: coordinates (U,) and (V,) along the next two axes.
+        u, v: coordinates (U,) and (V,) along the next two axes, `axis` + 1 and + 2.
         half: half the size of the box (3,).
         bevel: radius of the edges.
     """
@@ -870,11 +959,12 @@ That avoids slivers.
 def carve_patches(
     patches: Iterable[Patch], inside: Field, tag: str | None
 ) -> list[Patch]:
-    """Cut patches along the surface of a field, and give the inside another tag.
+    """Cut patches along the surface where a field is 0, and give the inside another
+    tag.
 
     Args:
         patches: smooth ones that are not transformed yet.
-        inside: positive inside.
+        inside: the field, positive inside.
         tag: of the inside; None removes it.
     """
     carved_patches = []
@@ -888,6 +978,7 @@ def carve_patches(
         distance = np.abs(end_values[is_crossed])
         fraction = distance / distance.sum(axis=1, keepdims=True)
         is_near = fraction < SNAP
+        # the cut goes through that vertex instead, which saves a sliver
         value[crossed_edges[is_near]] = 0.0
         if value.max() <= 0.0:
             carved_patches.append(patch)
@@ -905,7 +996,10 @@ def carve_patches(
 
 
 def crop_chart(patch: Patch) -> Patch:
-    """Return the patch with a chart that is cropped to what its faces use."""
+    """Return the patch with its chart cropped to the part that its faces use.
+
+    That part is stretched to [0, 1]^2 again, and the size is that of the part.
+    """
     used_uvs = patch.uvs[np.unique(patch.faces)]
     lower = used_uvs.min(axis=0)
     extent = np.ptp(used_uvs, axis=0)
@@ -932,8 +1026,11 @@ def _edges(patch: Patch) -> assets.IntArray:
 def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
     """Split the triangles of a patch where the values (V,) of its vertices change sign.
 
+    Each edge whose ends have different signs gets one new vertex, where the value is 0.
+
     Returns:
-        The patch, and whether each of its faces is inside (F,).
+        The patch with new vertices and faces, and whether each face is inside (F,),
+        that is where the values are positive.
     """
     edges = _edges(patch)
     is_crossed = value[edges[:, 0]] * value[edges[:, 1]] < 0.0
@@ -967,8 +1064,13 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
 def _split_faces(
     patch: Patch, value: Array, cut_of_edge: dict[tuple[int, int], int]
 ) -> tuple[list[tuple[int, int, int]], list[bool]]:
-    """Split faces at the cut vertices of their edges, and tell for each whether it is
-    inside.
+    """Split the faces that change sign, and tell for each part whether it is inside.
+
+    Args:
+        patch: before its new vertices are added.
+        value: of its vertices (V,), positive inside.
+        cut_of_edge: number of the new vertex of each edge that is cut, by the numbers
+            of its ends, the smaller one first.
     """
     faces: list[tuple[int, int, int]] = []
     is_inside: list[bool] = []
@@ -978,6 +1080,8 @@ def _split_faces(
             faces.append(tuple(int(i) for i in face))  # type: ignore[arg-type]
             is_inside.append(bool(face_values.sum() > 0.0))
             continue
+        # The parts on both sides share the cuts, whose value is 0; each part is a
+        # triangle or a quadrangle, which is divided as a fan.
         outline = _outline_with_cuts(face, value, cut_of_edge)
         for sign in (1.0, -1.0):
             polygon = [
@@ -992,9 +1096,9 @@ def _split_faces(
 def _outline_with_cuts(
     face: assets.IntArray, value: Array, cut_of_edge: Mapping[tuple[int, int], int]
 ) -> list[tuple[int, float]]:
-    """Return the vertices of a triangle with the cuts of its edges between them.
+    """Return the vertices around a triangle, with the cuts of its edges between them.
 
-    Each has its value; that of a cut is 0.
+    Each is its number and its value; the value of a cut is 0.
     """
     outline: list[tuple[int, float]] = []
     for i in range(3):

@@ -68,14 +68,20 @@ class ParameterSampler:
         return self.rng.uniform(0.0, 16.0, 3)
 
     def sample_color(self, canonical: str, *others: str, wild: float = 0.4) -> Color:
-        """Return a color near one of those named, or with probability `wild` any color.
+        """Return a color (3,) near one of those named, or with probability `wild` any
+        color.
 
         Without a generator it is the canonical one.
+
+        Args:
+            canonical, *others: codes of six hexadecimal digits, all equally likely.
+            wild: probability of any other color.
         """
         rng = self.rng
         if rng is None:
             return parse_hex_color(canonical)
         if rng.random() < wild:
+            # any hue; saturated colors a little more often; no black
             return np.array(
                 colorsys.hsv_to_rgb(
                     rng.random(), rng.random() ** 0.7, rng.uniform(0.15, 0.97)
@@ -113,9 +119,9 @@ Mask = Callable[[Texels], Array]  # (N,) weights in [0, 1]
 def painter(
     paint: Callable[Concatenate[Texels, Options], Array],
 ) -> Callable[Options, Paint]:
-    """Decorate a function of texels and options into a function of the options.
+    """Decorate a function of texels and options into a function of the options alone.
 
-    That returns the paint, or the mask.
+    What that returns is a function of texels: a paint or a mask with these options.
     """
 
     @wraps(paint)
@@ -138,10 +144,12 @@ _LATTICE = np.random.Generator(np.random.PCG64(20)).random((16, 16, 16))
 def noise(points: Array) -> Array:
     """Return smooth value noise (N,) in [0, 1] at points (N, 3).
 
-    Its scale is 1, and its period 16 along each axis.
+    It interpolates random values at the points of a lattice whose spacing is 1. They
+    repeat after 16 along each axis.
     """
     cell = np.floor(points)
     fraction = points - cell
+    # bent so that linear interpolation has no creases at the lattice (smoothstep)
     smooth = cell + fraction * fraction * (3.0 - 2.0 * fraction)
     return np.asarray(map_coordinates(_LATTICE, smooth.T, order=1, mode="grid-wrap"))
 
@@ -173,8 +181,13 @@ def solid(t: Texels, color: Color | str) -> Array:
 def mottled(
     t: Texels, a: Color, b: Color, scale: float, offset: Array, contrast: float = 2.0
 ) -> Array:
-    """Paint clouds of two colors, `scale` wide."""
+    """Paint clouds of two colors, `scale` wide.
+
+    With a `contrast` above 1, more of the surface has one of the two colors unmixed.
+    `offset` (3,) is added to positions, so that instances have different clouds.
+    """
     position = t.xyz / scale + offset
+    # two octaves; the second is shifted, so that both have no common center
     clouds = (noise(position) + noise(position * 2.0 + 5.3) * 0.5) / 1.5
     return mix(a, b, np.clip((clouds - 0.5) * contrast + 0.5, 0.0, 1.0))
 
@@ -191,7 +204,10 @@ def clouded(
 def speckled(
     base: Paint, color: Color, scale: float, offset: Array, amount: float = 0.16
 ) -> Paint:
-    """Paint small irregular specks over another paint; `amount` is about their area."""
+    """Paint small irregular specks, `scale` wide, over another paint.
+
+    They take about the fraction `amount` of its area. `offset` (3,) is as of `mottled`.
+    """
     return over(
         base,
         lambda t: step(noise(t.xyz / scale + offset), 1.0 - 1.1 * amount, soft=0.12),
@@ -216,19 +232,26 @@ def wood(
     axis: int = 2,
     contrast: float = 0.45,
 ) -> Array:
-    """Paint wood with growth rings about `scale` apart, and fibers along an axis."""
+    """Paint wood with growth rings about `scale` apart, and fibers along an axis.
+
+    `color` is that of its light parts; `contrast` is by how much the grain is darker,
+    as a fraction. `offset` (3,) is as of `mottled`.
+    """
     stretch = np.full(3, 1.0 / scale)
-    stretch[axis] = 0.12 / scale
+    stretch[axis] = 0.12 / scale  # the grain is long along the axis
     grain_position = t.xyz * stretch + offset
     cross_axes = [i for i in range(3) if i != axis]
+    # a slanted plane wave, bent by noise
     ring = (
         grain_position[:, cross_axes[0]]
         + 0.6 * grain_position[:, cross_axes[1]]
         + 1.6 * noise(grain_position * 0.45)
     )
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring * 0.8)
+    # finer across the axis than the rings are
     fibre = noise(grain_position * np.where(np.arange(3) == axis, 1.0, 4.0))
     grain = contrast * (0.55 * rings**2 + 0.45 * fibre)
+    # 1.12 makes up for some of what the grain darkens
     return np.asarray(np.clip(color * (1.0 - grain)[:, None] * 1.12, 0.0, 1.0))
 
 
@@ -236,7 +259,10 @@ def wood(
 def rings(
     t: Texels, a: Color, b: Color, period: float, share: float = 0.5, axis: int = 2
 ) -> Array:
-    """Paint stripes across an axis; color b takes `share` of every period."""
+    """Paint stripes across an axis, one in every `period`; color b takes `share` of it.
+
+    Where the axis is z, these are rings around an upright object.
+    """
     return mix(
         a,
         b,
@@ -245,8 +271,10 @@ def rings(
 
 
 def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
-    """Return chart coordinates in cells about `cell` wide, an integer number per
-    chart.
+    """Return chart coordinates (N,) across and up, in cells about `cell` wide.
+
+    The chart has a whole number of cells along each side, so that patterns meet at
+    seams.
     """
     return t.u * max(1, round(t.size[0] / cell)), t.v * max(1, round(t.size[1] / cell))
 
@@ -255,7 +283,9 @@ def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
 def stripes(
     t: Texels, a: Color, b: Color, cell: float, share: float = 0.5, slant: int = 0
 ) -> Array:
-    """Paint stripes up the chart, `cell` apart; they shift by `slant` cells to the
+    """Paint stripes of color b on a, which run up the chart, about `cell` apart.
+
+    They take `share` of the width, and shift by `slant` cells from the bottom to the
     top.
     """
     across, _ = _cells(t, cell)
@@ -269,12 +299,15 @@ def stripes(
 @painter
 def checks(t: Texels, a: Color, b: Color, cell: float) -> Array:
     """Paint a checkerboard with squares `cell` wide."""
-    across, up = _cells(t, 2 * cell)
+    across, up = _cells(t, 2 * cell)  # a pattern repeats after two squares
     return mix(a, b, (np.floor(2 * across) + np.floor(2 * up)) % 2.0)
 
 
 def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
-    """Paint round dots in staggered rows over another paint; the radius is in cells."""
+    """Paint round dots over another paint, in rows that are staggered by half a cell.
+
+    Cells are about `cell` wide; the radius of the dots is in cells.
+    """
 
     def staggered(t: Texels) -> Array:
         """Return the mask of the dots; every other row is shifted by half a cell."""
@@ -291,6 +324,7 @@ def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
 def zigzag(t: Texels, a: Color, b: Color, cell: float) -> Array:
     """Paint chevrons around the chart, `cell` high."""
     across, up = _cells(t, cell)
+    # distance from the middle of a line whose height follows a triangular wave
     return mix(
         a,
         b,
@@ -331,9 +365,14 @@ def facing(
     high: float,
     soft: float = 0.02,
 ) -> Array:
-    """Return the mask of a label between two heights.
+    """Return the mask of a label: texels between two heights that face an azimuth.
 
-    It is within `half_width` degrees of the azimuth `degrees` about z.
+    Args:
+        t: points to paint.
+        degrees: azimuth about z of the middle of the label.
+        half_width: how far it reaches to both sides, in degrees.
+        low, high: heights.
+        soft: width of the ramp at its lower and upper edge.
     """
     weight = band_mask(t.xyz[:, 2], low, high, soft=soft)
     in_band = np.nonzero(weight)[0]

@@ -56,19 +56,22 @@ HEXAGONS = shapes.normalize(
 
 
 def football_seams(direction: Array) -> tuple[Array, Array]:
-    """Return the distances of unit directions (N, 3) to the seams of a football.
+    """Return how far unit directions (N, 3) are from the seams of a football.
 
-    The panels are those of a truncated icosahedron: the one that a direction crosses
-    has the largest projection on its normal over its offset from the centre.
+    The panels are the faces of a truncated icosahedron. A direction crosses the face
+    for which its projection on the face's normal, over the face's distance from the
+    centre, is largest.
 
     Returns:
         About the distance to the nearest seam (N,), and whether the panel is a pentagon
         (N,).
     """
-    # offsets of the two kinds of faces from the centre
+    # projections over the distances of both kinds of faces from the centre, if that of
+    # the corners is 1
     pentagon = direction @ PENTAGONS.T / 0.9393
     hexagon = direction @ HEXAGONS.T / 0.9149
     both = np.sort(np.concatenate([pentagon, hexagon], axis=1), axis=1)
+    # At a seam the two largest are equal.
     return both[:, -1] - both[:, -2], pentagon.max(axis=1) > hexagon.max(axis=1)
 
 
@@ -98,13 +101,16 @@ def _press_seams(
 ) -> list[Patch]:
     """Press grooves along seams into a sphere.
 
-    Normals stay those of the sphere: the groove is a shade, not an edge.
+    Normals stay those of the sphere: in a picture the groove is a dark line, not an
+        edge.
 
     Args:
         patches: of the sphere, around the origin.
         radius: of the sphere.
-        depth: of the groove, as a fraction of the radius; it falls as a Gaussian.
-        seam: returns the distance (N,) of unit directions (N, 3) to the seam.
+        depth: of the groove, as a fraction of the radius; it falls with the distance
+            from the seam as a Gaussian.
+        seam: returns the distance (N,) of directions (N, 3) of about length 1 to the
+            seam.
     """
     pressed = []
     for patch in patches:
@@ -117,8 +123,11 @@ def _press_seams(
 
 @painter
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
-    """Paint dark pentagons, light hexagons and gray seams."""
+    """Paint dark pentagons, light hexagons and gray seams on a sphere around the
+    origin.
+    """
     seam_distance, pentagon = football_seams(shapes.normalize(t.xyz))
+    # both a little darker in irregular clouds
     base = (
         mix(light, dark, pentagon.astype(np.float64))
         * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
@@ -130,6 +139,7 @@ def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
 def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array:
     """Paint six segments in colors, and light caps at both poles."""
     turn = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
+    # turn: the angle about z, in turns from 0 to 1
     segment = np.minimum((turn * 6).astype(np.int64), 5)  # a turn may round to 1
     is_pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
     return np.where(is_pole[:, None], light, np.array(colors)[segment])
@@ -193,7 +203,18 @@ def _ball_surface(
     patches: list[Patch],
     dark: Array,
 ) -> tuple[Paint, list[Patch]]:
-    """Sample the paint of a ball of a style, and return it with the ball's patches."""
+    """Sample the paint of a ball of a style, and return it with the ball's patches.
+
+    A football and a basketball have grooves pressed into their patches.
+
+    Args:
+        draw: samples colors.
+        style: "football", "beach", "basket", "tennis", "star", "plain" or "wild".
+        light, dark: colors of some styles.
+        radius: of the ball.
+        offset: (3,) into the noise.
+        patches: of a sphere.
+    """
     if style == "beach":
         bright = [
             draw.sample_color(code, wild=0.5)
@@ -229,6 +250,7 @@ def _ball_surface(
             patches,
             radius,
             0.008,
+            # grooves narrower than those of a basketball
             lambda d: football_seams(shapes.normalize(d))[0] * 1.5,
         )
     return paint, patches
@@ -267,22 +289,25 @@ def _banana_shape(
 ) -> tuple[Array, Array]:
     """Return the path (N, 3) of a banana from its stem, and its radius (N,) along it.
 
+    The path is in the x-y plane.
+
     Args:
         draw: samples the thickness of the stem.
-        bend: by how many degrees the path turns, a little more at both ends.
+        bend: by how many degrees the path turns from end to end.
         length: of the path.
         stem: length of the stem.
         thick: the largest radius.
     """
     count = 44
     t = np.linspace(0.0, 1.0, count)
+    # direction of each step, from -bend/2 to bend/2; it turns faster at both ends
     angle = np.radians(bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2)[:-1]
     path = np.zeros((count, 3))
     path[1:, 0] = np.cumsum(np.sin(angle)) * (length / (count - 1))
     path[1:, 1] = np.cumsum(np.cos(angle)) * (length / (count - 1))
 
-    position = t * length
-    # rises from the stem, and falls to a blunt tip
+    position = t * length  # distance from the end of the stem
+    # the radius rises from the stem, and falls to a blunt tip
     rise = np.clip((position - stem) / (0.26 * length), 0.0, 1.0) ** 0.75
     fall = np.clip((length - position) / (0.24 * length), 0.0, 1.0) ** 0.62
     body = np.sin(0.5 * np.pi * rise) * np.maximum(np.sin(0.5 * np.pi * fall), 0.26)
@@ -296,15 +321,22 @@ def _banana_shape(
 
 
 def _banana_section(draw: ParameterSampler) -> Array:
-    """Sample the section (M, 2) of a banana, with five ridges."""
+    """Sample the section (30, 2) of a banana, about a unit circle, with five ridges."""
     ridge = draw(0.06, low=0.02, high=0.1)
     phi = 2 * np.pi * np.arange(30) / 30
+    # |cos(2.5 phi)| has five maxima around the circle
     lumps = 1.0 + ridge * (np.abs(np.cos(2.5 * phi)) - 0.6)
     return np.stack([np.cos(phi), np.sin(phi)], axis=1) * lumps[:, None]
 
 
 def _banana_paint(draw: ParameterSampler, path: Array, stem: float) -> Paint:
-    """Sample the paint of a banana: green and brown towards its ends, with flecks."""
+    """Sample the paint of a banana: green and brown towards its ends, with flecks.
+
+    Args:
+        draw: samples its color and how many flecks it has.
+        path: (N, 3) of the banana, whose ends are those of the stem and of the tip.
+        stem: length of the stem.
+    """
     offset = draw.offset()
     skin = draw.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
     tip, brown, green = map(parse_hex_color, ("3a2a18", "6b4520", "a9b13c"))
@@ -373,11 +405,21 @@ def book(draw: ParameterSampler) -> Instance:
 def _round_spine(
     thick: float, width: float, bulge: float, board: float, height: float
 ) -> list[Patch]:
-    """Create the rounded spine of a book."""
+    """Create the rounded spine of a book.
+
+    Its section in the x-z plane lies between two half ellipses that bulge towards -x.
+
+    Args:
+        thick, width, height: of the book.
+        bulge: by how much it bulges.
+        board: its thickness, which is that of the covers.
+    """
     half = thick / 2
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
     cosine = np.cos(angle)
     sine = np.sin(angle)
+    # points (x, z); -width / 2 + 0.25 is the edge of the covers, which the spine
+    # overlaps a little on both sides
     outer = np.stack(
         [-width / 2 + 0.25 - bulge * cosine - 0.1, half + half * sine], axis=1
     )
@@ -391,7 +433,12 @@ def _round_spine(
 def _book_paints(
     draw: ParameterSampler, height: float, width: float, thick: float
 ) -> tuple[Paint, Paint, Paint]:
-    """Sample the paints of the cover, the pages and the spine of a book."""
+    """Sample the paints of the cover, the pages and the spine of a book, in this order.
+
+    Args:
+        draw: samples the paints.
+        height, width, thick: of the book.
+    """
     offset = draw.offset()
     cloth = draw.sample_color(
         "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
@@ -413,6 +460,7 @@ def _book_paints(
 
     def pages_paint(t: Texels) -> Array:
         """Paint the edges of pages: fine lines along them."""
+        # fine across the sheets (z), and long along them
         lines = noise(
             np.stack(
                 [t.xyz[:, 2] * 9.0, 0.08 * t.xyz[:, 0], 0.08 * t.xyz[:, 1]], axis=1
@@ -423,7 +471,7 @@ def _book_paints(
 
     def spine(t: Texels) -> Array:
         """Paint two bands at each end, and words in a block in the middle."""
-        y = np.abs(t.xyz[:, 1]) / height
+        y = np.abs(t.xyz[:, 1]) / height  # 0 in the middle, 1/2 at the ends
         band = np.maximum(
             step(0.008 - np.abs(y - 0.36), 0.0, soft=0.006),
             step(0.008 - np.abs(y - 0.42), 0.0, soft=0.006),
@@ -431,6 +479,7 @@ def _book_paints(
         block = step(0.16 - y, 0.0, soft=0.01) * step(
             0.22 * thick - np.abs(t.xyz[:, 2] - thick / 2), 0.0, soft=0.05
         )
+        # noise that changes along the spine only, nearly: bars instead of letters
         words = step(
             noise(
                 np.stack([t.xyz[:, 1] * 1.8, t.xyz[:, 2] * 0.2, 0 * y], axis=1) + 3.0
@@ -444,11 +493,15 @@ def _book_paints(
 
 
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
-    """Extrude the section of the spine along y.
+    """Extrude the section of the spine along y, and close it at both ends.
 
-    Its outer curve (K, 2) goes upwards in (x, z), its inner one downwards.
+    Args:
+        outer: (K, 2) points (x, z) of its outer side, upwards.
+        inner: (K, 2) points (x, z) of its inner side, downwards.
+        height: of the book; the extent along y.
     """
     loop = np.concatenate([outer, inner])[::-1]
+    # the path leads along -y, and the section's axes are x and z
     frame = (
         np.tile([0.0, -1.0, 0.0], (2, 1)),
         np.tile([1.0, 0.0, 0.0], (2, 1)),
@@ -462,6 +515,7 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
         float(np.ptp(outer[:, 0])) + float(np.linalg.norm(outer[0] - inner[-1])),
     )
     for side in (1.0, -1.0):
+        # the face at this end, as a grid of two rows: the outer and the inner curve
         rows = [
             np.insert(curve, 1, side * height / 2, axis=1)
             for curve in (outer, inner[::-1])
@@ -490,21 +544,29 @@ def _front(
     height: float,
     thick: float,
 ) -> Paint:
-    """Paint the front cover with a title and decoration.
+    """Paint the covers of a book, with a title and decoration on the front.
 
-    A title "plain" has none; "picture" has a picture with a round spot, "frame" a frame
-    around the cover; "blocks" and "frame" have a ring as a seal. All but plain ones
-    have lines of words.
+    A title "plain" has nothing. "picture" has a picture with a round spot in it;
+    "frame" has a frame along the edges; "blocks" and "frame" have a ring as a seal. All
+    but "plain" have lines of words.
+
+    Args:
+        draw: samples the color of a picture.
+        base: paint of both covers.
+        gold: color of the decoration and the words.
+        title: "plain", "picture", "frame" or "blocks".
+        width, height, thick: of the book.
     """
     accent = draw.sample_color("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
     def inside(x: Array, y: Array, half_width: float, half_height: float) -> Array:
-        """Return the mask of a rectangle around the origin."""
+        """Return the mask of a rectangle around the origin, for points (x, y)."""
         in_width = step(half_width - np.abs(x), 0.0, soft=0.12)
         return in_width * step(half_height - np.abs(y), 0.0, soft=0.12)
 
     def paint(t: Texels) -> Array:
         """Paint the base, and on the upper side the decoration and the words."""
+        # from the middle of the cover, which is a little beside that of the book
         x = t.xyz[:, 0] - 0.25
         y = -t.xyz[:, 1]
         top = (t.xyz[:, 2] > thick - 0.1).astype(np.float64)
@@ -525,6 +587,7 @@ def _front(
                 x, y, 0.43 * width - 0.28, 0.45 * height - 0.28
             )
             color = mix(color, gold, frame * top)
+        # rows 2 units high; along a row noise decides where there is a word
         words = step(
             noise(np.stack([x * 1.5, 0 * x, np.floor(y / 2.0)], axis=1) + 7.0),
             0.3,
@@ -604,9 +667,15 @@ FINISHES = {
 
 
 def _word_strokes(letters: str, height: float) -> list[Array]:
-    """Return the polylines (K, 2) of a word around the origin, letters `height` high."""
+    """Return the strokes of a word around the origin, each a polyline (K, 2).
+
+    Args:
+        letters: keys of `_STROKES`.
+        height: of a letter.
+    """
     strokes = []
     for k, letter in enumerate(letters):
+        # letters are 0.74 apart and 0.6 wide: half of the gap, 0.07, is at their left
         left = ((k - len(letters) / 2) * 0.74 + 0.07) * height
         corner = np.array([left, -height / 2])
         strokes += [np.array(path) * height + corner for path in _STROKES[letter]]
@@ -615,14 +684,20 @@ def _word_strokes(letters: str, height: float) -> list[Array]:
 
 @painter
 def _face(t: Texels, red: Array, radius: float) -> Array:
-    """Paint the word in white on red, with a white rim, on an octagon before it is
-    raised.
+    """Paint the plate of a stop sign around the origin, which looks along +x.
+
+    The word and a rim are white on red.
+
+    Args:
+        t: points of the plate.
+        red: color.
+        radius: from the middle of the octagon to its corners.
     """
-    apothem = radius * np.cos(np.pi / 8)
+    apothem = radius * np.cos(np.pi / 8)  # from the middle to the sides
     side_angles = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
     y = t.xyz[:, 1]
     z = t.xyz[:, 2]
-    # of the octagon through each texel, the apothem
+    # apothem of the octagon whose outline goes through each texel
     out = np.max([y * np.cos(a) + z * np.sin(a) for a in side_angles], axis=0)
     rim = step(out - 0.915 * apothem, 0.0, soft=0.006)
     rim = rim * step(0.985 * apothem - out, 0.0, soft=0.006)
@@ -674,7 +749,13 @@ def stop_sign(draw: ParameterSampler) -> Instance:
 
 
 def _sign_plate(radius: float, height: float) -> list[Patch]:
-    """Create the octagonal plate of a stop sign."""
+    """Create the octagonal plate of a stop sign, which looks along +x, in front of the
+    post.
+
+    Args:
+        radius: from its middle to its corners.
+        height: of its middle.
+    """
     ring = shapes.polygon(8, bevel=0.02, steps=2) * radius
     ahead = np.array([1.0, 0.0, 0.0])
     # an octagon that looks along +x, its middle at the origin
@@ -691,7 +772,12 @@ def _sign_plate(radius: float, height: float) -> list[Patch]:
 
 
 def _sign_post(height: float, radius: float) -> list[Patch]:
-    """Create the post of a stop sign."""
+    """Create the post of a stop sign: a closed tube that ends behind the plate.
+
+    Args:
+        height: of the middle of the plate.
+        radius: of the plate.
+    """
     tube = shapes.round_corners(
         [
             (0.03, 0.0),

@@ -252,7 +252,16 @@ def _hammer_handle(
 def _hammer_paints(
     draw: ParameterSampler, front: float, length: float
 ) -> dict[str, Paint]:
-    """Sample the paints of a hammer."""
+    """Sample the paints of the head and the handle of a hammer.
+
+    The striking face is bright metal. A handle is of wood, dipped in color at its end,
+    or has a ribbed rubber grip.
+
+    Args:
+        draw: samples the paints.
+        front: distance of the striking face from the middle of the head, at -y.
+        length: of the handle, along -x.
+    """
     offset = draw.offset()
     steel = draw.sample_color("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
     metal = over(
@@ -293,13 +302,13 @@ def _hammer_paints(
 def _weights(
     draw: ParameterSampler, style: str, at: float, length: float, radius: float
 ) -> list[Patch]:
-    """Create the weight on one end of the bar, built along z and rotated afterwards.
+    """Create the weight at the upper end of a dumbbell whose bar is along z.
 
     Args:
-        draw: chooses the nut of plates.
+        draw: chooses the nut of "plates".
         style: "hex", "globe", "plates" (three, each smaller, and a nut) or "round".
         at: z of its inner side.
-        length: along z.
+        length: along z, but for a globe, which is as long as it is thick.
         radius: of the weight.
     """
     if style == "hex":
@@ -328,7 +337,7 @@ def _weights(
     for i in range(n_plates):
         thickness = length / n_plates * 0.94  # the rest is a gap
         plate_radius = radius * (1.0 - 0.17 * i)
-        hub_radius = 0.55 * plate_radius
+        hub_radius = 0.55 * plate_radius  # of the flat middle of both sides
         bevel = min(0.25 * thickness, 0.6)
         side = shapes.round_corners(
             [
@@ -395,7 +404,16 @@ def dumbbell(draw: ParameterSampler) -> Instance:
 def _dumbbell_paints(
     draw: ParameterSampler, grip: float, style: str, length: float, radius: float
 ) -> dict[str, Paint]:
-    """Sample the paints of a dumbbell."""
+    """Sample the paints of a dumbbell: of its weights, and of its knurled bar.
+
+    The dumbbell is painted before it is laid down, so that its bar is along z.
+
+    Args:
+        draw: samples the paints.
+        grip: half the length of the bar between the weights.
+        style: of the weights, as for `_weights`.
+        length, radius: of the weights.
+    """
     offset = draw.offset()
     iron = draw.sample_color(
         "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", wild=0.25
@@ -407,6 +425,7 @@ def _dumbbell_paints(
         offset=offset,
         amount=draw(0.08, low=0.0, high=0.2),
     )
+    # z of the outer side of a weight
     tip = grip + (length if style != "globe" else 1.75 * radius)
     accent = draw.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
     if draw.chance(0.5, canonical=True):
@@ -423,6 +442,7 @@ def _dumbbell_paints(
 
         weight = over(weight, on_both_ends, solid(accent))
     steel = draw.sample_color("b4b8bd", "8d9298", "2b2d30", wild=0.2)
+    # fine slanted lines on the part that is held
     knurl = over(
         solid(steel),
         lambda t: (

@@ -73,6 +73,7 @@ def make_handle(
         section = shapes.rectangle(
             2 * half_thickness, 2 * half_width, bevel=0.6 * half_thickness
         )
+    # up to a quarter thicker at both ends
     root_flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
     return shapes.sweep("handle", shapes.to_xz_plane(curve), section, root_flare)
 
@@ -126,10 +127,10 @@ def _ceramic(
     """Sample a decoration as a potter or a printer puts it around a vessel.
 
     Args:
-        draw: samples its kind, its proportions and the second color.
+        draw: samples its kind, its proportions and its second color.
         height: of the vessel.
-        glaze: the ground of most decorations, or the plain vessel.
-        accent: the paint of a single band, and of a dip.
+        glaze: the ground of most decorations; alone on a plain vessel.
+        accent: the paint of a single band, and of the upper part of a dipped vessel.
     """
     kind = draw.pick(
         "band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings"
@@ -235,14 +236,21 @@ def mug(draw: ParameterSampler) -> Instance:
 def _mug_body(
     draw: ParameterSampler, height: float
 ) -> tuple[float, Array, list[Patch]]:
-    """Create a mug without its handle; also return its wall's thickness and its side's
-    profile.
+    """Create a mug without its handle.
+
+    Args:
+        draw: samples its proportions.
+        height: of the mug.
+
+    Returns:
+        The thickness of its wall; the profile (14, 2) of its side, points (r, z) from
+        the foot's edge upwards; and its patches.
     """
     top = draw(4.15, low=3.6, high=5.0)
     foot = top * draw(0.93, low=0.72, high=1.02)
     belly = draw(0.0, low=-0.06, high=0.13) * top
     wall = draw(0.36, low=0.28, high=0.5)
-    low = draw(0.7, low=0.3, high=1.2)
+    low = draw(0.7, low=0.3, high=1.2)  # size of the round edge at the foot
     corners = [
         (foot - low, 0.0),
         (foot, low),
@@ -256,7 +264,7 @@ def _mug_body(
 
 
 def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
-    """Sample the paints of a mug."""
+    """Sample the paints of a mug of a height, by the tags of its parts."""
     offset = draw.offset()
     clay = draw.sample_color(
         "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
@@ -272,12 +280,14 @@ def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
     deep = draw.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
     accent = clouded(deep, factor=1.35, scale=2.2, offset=offset)
     outer = paint_or_random(draw, height, _ceramic(draw, height, glaze, accent))
+    # the inside is seldom decorated; else it is glazed or of one color
     inner = outer
     if not draw.chance(0.15):
         inner = glaze
         if draw.chance(0.5, canonical=True):
             inner = solid(draw.sample_color("efe6d4", "f3f1ec", wild=0.3))
     raw_clay = solid("a98663")
+    # the foot may be left without a glaze
     outside = outer
     if draw.chance(0.4, canonical=True):
         outside = over(outer, between(-1.0, 0.35, soft=0.1), raw_clay)
@@ -324,9 +334,15 @@ def bowl(draw: ParameterSampler) -> Instance:
 
 
 def _bowl_body(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
-    """Create the surface of a bowl."""
+    """Create the surface of a bowl on a foot ring.
+
+    Args:
+        draw: samples its proportions.
+        radius: of the rim before it flares.
+        height: of the rim.
+    """
     foot = radius * draw(0.42, low=0.34, high=0.55)
-    ring = draw(0.7, low=0.15, high=1.1)
+    ring = draw(0.7, low=0.15, high=1.1)  # height of the foot ring
     # how far out the wall is at half height, in units of the radius
     full = draw(0.86, low=0.72, high=0.97)
     flare = draw(0.0, low=-0.03, high=0.1) * radius
@@ -360,9 +376,17 @@ def bottle(draw: ParameterSampler) -> Instance:
 
 
 def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Patch]]:
-    """Create the surface of a bottle; also return the height of its shoulder."""
+    """Create the surface of a bottle, perhaps with a cap.
+
+    Args:
+        draw: samples its proportions.
+        height: of the neck's end.
+
+    Returns:
+        The height of its shoulder, where the body begins to narrow; and its patches.
+    """
     radius = draw(3.75, low=3.0, high=4.8)
-    neck = draw(1.35, low=1.0, high=1.7)
+    neck_radius = draw(1.35, low=1.0, high=1.7)
     shoulder = height * draw(0.62, low=0.45, high=0.68)
     rise = height * draw(0.15, low=0.08, high=0.22)
     slope = draw(0.35, low=0.1, high=0.8)  # 0: square shoulder, 1: sloping
@@ -372,21 +396,22 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
         (radius * taper, 0.02 * height),
         (radius, shoulder),
         (
-            neck + (radius - neck) * (0.55 - 0.35 * slope),
+            neck_radius + (radius - neck_radius) * (0.55 - 0.35 * slope),
             shoulder + rise * (0.6 - 0.25 * slope),
         ),
-        (neck * 1.03, shoulder + rise),
-        (neck * 0.95, height - 1.6),
+        (neck_radius * 1.03, shoulder + rise),
+        (neck_radius * 0.95, height - 1.6),
     ]
     curve = shapes.round_corners(
         corners, radius=[0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], steps=7
     )
-    wide = neck * 0.95 + draw(0.28, low=0.1, high=0.4)
+    # the thicker ring around the mouth
+    ring_radius = neck_radius * 0.95 + draw(0.28, low=0.1, high=0.4)
     ring = [
-        (wide, height - 1.5),
-        (wide, height - 0.6),
-        (neck * 0.97, height - 0.5),
-        (neck * 0.93, height),
+        (ring_radius, height - 1.5),
+        (ring_radius, height - 0.6),
+        (neck_radius * 0.97, height - 0.5),
+        (neck_radius * 0.93, height),
     ]
     capped = draw.chance(0.4)
     outside = np.concatenate([shapes.subdivide(curve, longest=1.6), ring])
@@ -394,14 +419,20 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
         outside, wall=draw(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
     )
     if capped:
-        patches += _cap(draw, wide + 0.12, height)
+        patches += _cap(draw, ring_radius + 0.12, height)
     return shoulder, patches
 
 
 def _bottle_paints(
     draw: ParameterSampler, height: float, shoulder: float
 ) -> dict[str, Paint]:
-    """Sample the paints of a bottle."""
+    """Sample the paints of a bottle: glass, a label, and often foil around its neck.
+
+    Args:
+        draw: samples the paints.
+        height: of the bottle.
+        shoulder: height at which the body begins to narrow; the label ends below.
+    """
     offset = draw.offset()
     glass = draw.sample_color(
         "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
@@ -434,7 +465,13 @@ def _bottle_paints(
 
 
 def _cap(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
-    """Create the cap of a bottle."""
+    """Create the cap of a bottle: a cylinder around the end of its neck.
+
+    Args:
+        draw: samples how far down it reaches.
+        radius: of the cap.
+        height: of the bottle without it.
+    """
     low = height - draw(1.5, low=0.9, high=2.2)
     top = height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
@@ -459,17 +496,20 @@ def _labelled(
     low: float,
     high: float,
 ) -> Paint:
-    """Paint a paper label opposite the texture's seam.
+    """Paint a paper label around part of a bottle, centered opposite the texture's
+    seam.
 
-    It has a frame, a title bar, lines of text and a round seal.
+    It has a bar near its upper and its lower edge, a title, three lines of text and a
+    round seal.
 
     Args:
         draw: samples its width.
-        surface: of the bottle.
+        surface: paint of the bottle.
         paper, ink: colors.
         low, high: heights of its edges.
     """
     azimuth = 180.0
+    # degrees from the middle of the label to its sides
     half_angle = draw(95.0, low=60.0, high=180.0)
     span = high - low
     label = over(
@@ -524,6 +564,7 @@ def _labelled(
     def seal(texels: Texels) -> Array:
         """Return the mask of a disc at the lower end of the label."""
         xyz = texels.xyz
+        # from the middle of the label, wrapped to [-180, 180) degrees
         angle = np.radians(
             (np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) - azimuth + 180.0) % 360.0
             - 180.0
@@ -562,8 +603,15 @@ def vase(draw: ParameterSampler) -> Instance:
 def _vase_body(
     draw: ParameterSampler, height: float
 ) -> tuple[float, float, Array, list[Patch]]:
-    """Create a vase without handles; also return the heights of belly and neck, and its
-    profile.
+    """Create a vase without handles.
+
+    Args:
+        draw: samples its proportions.
+        height: of the lip.
+
+    Returns:
+        The heights of the belly (its widest place) and of the neck (the narrowest
+        above); its outer profile (34, 2) of points (r, z); and its patches.
     """
     foot = draw(3.6, low=2.6, high=4.4)
     belly = draw(7.2, low=5.2, high=8.6)
@@ -590,7 +638,13 @@ def _vase_body(
 def _vase_handles(
     draw: ParameterSampler, belly_at: float, neck_at: float, profile: Array
 ) -> list[Patch]:
-    """Create two handles of a vase, or none."""
+    """Create two handles on opposite sides of a vase, or none.
+
+    Args:
+        draw: chooses, and samples their shape.
+        belly_at, neck_at: heights between which they are.
+        profile: of the vase (K, 2).
+    """
     patches = list[Patch]()
     if draw.chance(0.25):
         low = belly_at + 0.15 * (neck_at - belly_at)
@@ -614,7 +668,15 @@ def _vase_handles(
 def _vase_paint(
     draw: ParameterSampler, glaze: Paint, height: float, offset: Array
 ) -> Paint:
-    """Paint blue brushwork on the canonical vase; glazes, bands and drips on others."""
+    """Paint a vase: blue brushwork on the canonical one; on others that or a
+        decoration.
+
+    Args:
+        draw: chooses, and samples the ink.
+        glaze: the ground.
+        height: of the vase.
+        offset: (3,) into the noise.
+    """
     ink = draw.sample_color("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
     if draw.rng is not None and draw.chance(0.6):
         return _ceramic(
@@ -639,6 +701,7 @@ def _vase_paint(
         return between(0.09 * height, 0.17 * height, soft=0.1)(texels) * teeth
 
     paint = over(glaze, scroll, solid(ink))
+    # rings of ink, as fractions of the height
     for low, high in (
         (0.05, 0.08),
         (0.18, 0.2),
@@ -680,8 +743,16 @@ def wine_glass(draw: ParameterSampler) -> Instance:
 def _glass_bowl(
     draw: ParameterSampler, stem: float, stem_top: float
 ) -> tuple[float, float, Array]:
-    """Return the depth of a glass's bowl, the thickness of its wall, and its outer
-    profile.
+    """Sample the bowl of a wine glass, with the upper part of its stem.
+
+    Args:
+        draw: samples its proportions.
+        stem: radius of the stem.
+        stem_top: height at which the bowl begins.
+
+    Returns:
+        The depth of the bowl; the thickness of its wall; and its outer profile (36, 2),
+        points (r, z) from the stem up to the mouth.
     """
     bowl = draw(4.1, low=3.2, high=5.0)
     depth = draw(9.8, low=6.5, high=11.5)
@@ -707,16 +778,31 @@ def _glass_bowl(
 def _glass_lip(
     outer: Array, wall: float, stem_top: float, depth: float
 ) -> tuple[Array, Array]:
-    """Return the profile of the inside of a glass, and of its lip."""
+    """Return the profile of the inside of a wine glass, and that of its rounded lip.
+
+    Args:
+        outer: (K, 2) points (r, z) from the stem up to the mouth.
+        wall: thickness of the wall.
+        stem_top: height at which the bowl begins.
+        depth: of the bowl.
+
+    Returns:
+        The inside (n, 2) from the mouth downwards, without its floor; and three points
+        (3, 2) of the half circle that joins the outside to it.
+    """
+    # the tangent (dr, dz), then turned to the right, which is outwards
     normal = np.gradient(outer, axis=0)
     normal = np.stack([normal[:, 1], -normal[:, 0]], axis=1) / np.linalg.norm(
         normal, axis=1, keepdims=True
     )
     inner = (outer - wall * normal)[::-1]
+    # what is lower belongs to the floor
     inner = inner[inner[:, 1] > stem_top + 0.11 * depth]
     angle = np.pi * np.arange(1, 4) / 4
+    # on along the profile, beyond the mouth
     side = np.array([-normal[-1, 1], normal[-1, 0]])
     curl = np.cos(angle)[:, None] * normal[-1] + np.sin(angle)[:, None] * side
+    # around the middle of the wall's end
     lip = outer[-1] - wall / 2 * normal[-1] + wall / 2 * curl
     return inner, lip
 
@@ -730,7 +816,10 @@ def _glass_profile(
     outer: Array,
     lip: Array,
 ) -> list[tuple[str, Array]]:
-    """Return the tags and profiles of the parts of a wine glass.
+    """Return the tags and profiles of the parts of a wine glass, in order.
+
+    They go from the axis along the foot's lower side, up the outside, over the lip, and
+    down the inside to the axis.
 
     Args:
         stem_top: height of the top of the stem.
@@ -760,7 +849,15 @@ def _glass_profile(
 def _glass_paints(
     draw: ParameterSampler, stem_top: float, depth: float
 ) -> dict[str, Paint]:
-    """Sample the paints of a glass with a stem of a height and a bowl of a depth."""
+    """Sample the paints of a wine glass, which often has wine in it.
+
+    The glass is opaque: wine is a color of its outside and its inside up to a level.
+
+    Args:
+        draw: samples the paints.
+        stem_top: height at which the bowl begins.
+        depth: of the bowl.
+    """
     height = stem_top + depth
     tint = draw.sample_color(
         "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3
