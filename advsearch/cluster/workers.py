@@ -60,6 +60,14 @@ class PoolWorkers:
         tell: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Make workers for a task.
+
+        Args:
+            executor: runs calls on its workers.
+            task: what the workers do.
+            tell: takes messages for the user.
+            clock: returns seconds; another one in tests.
+        """
         self.stats: WorkerStats = executor.stats
         self._executor = executor
         self._task = task
@@ -69,7 +77,11 @@ class PoolWorkers:
         self._dead_starts = 0
 
     def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
-        """See `Workers.results`."""
+        """See `Workers.compute`.
+
+        A batch whose workers die is split into its items, and a single item whose
+        workers die gives a result without a value.
+        """
         source = iter(batches)
         waiting = deque[Sequence[Any]]()
         running = dict[Future[Reply], Sequence[Any]]()
@@ -104,6 +116,7 @@ class PoolWorkers:
                     reply = ended_future.result()
                     item_seconds.append(reply.seconds / max(1, len(items)))
                     yield self._read_reply(items, reply)
+                # the executor was lost, not the batch: do it again
                 elif isinstance(error, BrokenExecutor):
                     self.stats.retried += 1
                     waiting.appendleft(items)
@@ -136,8 +149,13 @@ class PoolWorkers:
         return bool(waiting)
 
     def _deadline(self, n_items: int, item_seconds: Sequence[float]) -> float:
-        """Return the seconds after which a worker counts as hanging, and ends
-        itself.
+        """Return after how many seconds a batch counts as hanging, so that its worker
+        ends itself.
+
+        Args:
+            n_items: of the batch.
+            item_seconds: seconds per item of the last batches; a few are needed for an
+                estimate.
         """
         if len(item_seconds) < MIN_BATCHES:
             deadline = LOAD_DEADLINE
@@ -149,11 +167,12 @@ class PoolWorkers:
         return max(deadline, self._task.seconds or 0.0)
 
     def _read_reply(self, items: Sequence[Any], reply: Reply) -> BatchResult:
-        """Return the result in a worker's reply, and count it.
+        """Return the result in a worker's reply; add its times and its machine to the
+        counts.
 
         Raises:
-            RuntimeError: if the worker's code raised an unexpected error.
-            ClusterError: for any other failure.
+            RuntimeError: the worker's code raised an unexpected error.
+            ClusterError: any other failure.
         """
         if reply.failure is Failure.BUG:
             raise RuntimeError(f"on {reply.worker}:\n{reply.error}")
@@ -162,6 +181,7 @@ class PoolWorkers:
         self.stats.batches += 1
         self.stats.busy += reply.seconds
         self.stats.loading += reply.loading
+        # alive counts without loading
         self.stats.alive -= reply.loading
         machine: str | None = digest_machine(reply.machine)
         if machine == self._this_machine:
@@ -178,10 +198,11 @@ class PoolWorkers:
         return BatchResult(items, reply.value, reply.worker, machine)
 
     def _count_dead_start(self) -> None:
-        """Count a worker that died before any batch was finished.
+        """Count a death of a worker, and give up if all die from the beginning, for
+        example while loading.
 
         Raises:
-            ClusterError: if as many died, for example while loading, that all will.
+            ClusterError: `MAX_DEAD_STARTS` died, and no batch was ever finished.
         """
         self._dead_starts += 1
         if self._dead_starts >= MAX_DEAD_STARTS and not self.stats.batches:

@@ -72,9 +72,15 @@ _LISTED: dict[tuple[str, bool], tuple[object, ListedRun]] = {}
 
 
 def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
-    """Return the run in a folder; what cannot be read is shown as far as it can, and
-    `fault` says why. To count rows takes a second for a million. A run is read again
-    where its files have changed, or a process works on it.
+    """Return what the list of runs says of the run in a folder.
+
+    What cannot be read is left out, and `fault` says why. The result is kept until the
+    files of the run change; a run that a process works on is read again where rows are
+    counted.
+
+    Args:
+        path: of the run.
+        counts: also count its rows, which takes a second for a million.
     """
     running = is_held(path)
     read = [
