@@ -59,7 +59,7 @@ class _MaiteNetwork(nn.Module):
 
 
 def _to_detections(target: Any) -> dict[str, Tensor]:
-    """Convert an `ObjectDetectionTarget` to boxes, labels and scores."""
+    """Convert an `ObjectDetectionTarget` to boxes (n, 4), labels (n,) and scores (n,)."""
     scores = torch.as_tensor(target.scores).float()
     if scores.ndim == 2:  # of every class; `labels` has the likeliest
         n_classes = scores.shape[1]
@@ -213,7 +213,11 @@ class Scenes:
         return image.permute(2, 0, 1).contiguous(), self._make_target(u), metadata
 
     def _make_target(self, u: Tensor) -> Tensor | Detections:
-        """Return the target of a configuration (d,)."""
+        """Return the target of a configuration (d,): a one-hot vector of the right
+        class, or the boxes and classes of the visible things.
+
+        Things whose names are no labels are left out.
+        """
         right_class = self.right.indices[0]
         if self.task == "classification":
             one_hot = nn.functional.one_hot(torch.tensor(right_class), len(self.labels))

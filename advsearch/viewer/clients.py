@@ -84,8 +84,8 @@ class ConnectionPool:
     """Serve the connections that a socket accepts until `close`.
 
     Args:
-        listening: the socket that listens.
-        answer: serves a connection in a worker's thread; calls `report_waiting` when it
+        listening_socket: the socket that listens.
+        handle: serves a connection in a worker's thread; calls `report_waiting` when it
             begins or ends to wait for the client.
         context: for HTTPS; without it, HTTP.
     """

@@ -338,7 +338,7 @@ class PhotographServer(Protocol):
         """Return media type and data of a "rendering" or a "photo" of a run.
 
         Raises:
-            Refused: if there is none.
+            RequestRejected: there is none.
         """
 
     def store_photograph(
