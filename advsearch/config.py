@@ -771,6 +771,11 @@ class DerivativeConfig(SceneConfig):
 
 
 def _parse_positive(value: Any) -> float:
+    """Return a positive number in range, given as a number or a text.
+
+    Raises:
+        ValueError: it is none.
+    """
     try:
         number = float("nan") if isinstance(value, bool) else float(value)
     except (TypeError, OverflowError):

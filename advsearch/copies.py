@@ -91,6 +91,10 @@ def hand_copies(kind: type, **argument_slices: slice) -> None:
 
 
 def _wrap_with_copies(method: Callable[..., Any], which: slice) -> Callable[..., Any]:
+    """Return a method that is called with copies: of the positional arguments `which`,
+    after `self`, and of all keyword arguments.
+    """
+
     @wraps(method)
     def handed(self: Any, *args: Any, **named: Any) -> Any:
         copied_args = [*args]

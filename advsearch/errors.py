@@ -42,6 +42,15 @@ class UnknownNameError(InputError):
     def __init__(
         self, kind: str, name: str, known: Iterable[str], hint: str = ""
     ) -> None:
+        """Make the error that a name is unknown; it lists the known names, and first
+        those like it.
+
+        Args:
+            kind: what is named, such as "policy".
+            name: that was given.
+            known: the names that there are.
+            hint: the last sentence of the message.
+        """
         names = sorted(known)
         near = find_similar_names(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""

@@ -84,6 +84,13 @@ class RunContext(ExitStack, Generic[Settings]):
         progress: Progress | None = None,
         resumed: Path | None = None,
     ) -> None:
+        """Begin to measure the time; the run itself is made when it is asked for first.
+
+        Args:
+            config: the settings of the experiment.
+            progress: is told how far it is; None for nobody.
+            resumed: folder of the run to go on with; None for a new run.
+        """
         super().__init__()
         self.config = config
         self.progress = progress or NullProgress()

@@ -109,12 +109,20 @@ def end_at_the_second() -> None:
 
 
 def _hear(ours: socket.socket, theirs: socket.socket) -> None:
+    """End the process at the second Ctrl-C; the body of a thread that waits for
+    signals.
+
+    Args:
+        ours: from which the numbers of signals are read.
+        theirs: the other end, to which they are written; it is only kept open here.
+    """
     first: float | None = None
     while True:
         if signal.SIGINT not in ours.recv(64):
             continue
         now = time.monotonic()
         if (
+            # one Ctrl-C may come as two signals in a short time
             first is not None
             and now - first >= DUPLICATE_SECONDS
             and not INTERRUPTS.ended

@@ -47,6 +47,9 @@ class _MaiteNetwork(nn.Module):
             model.eval()
 
     def forward(self, images: Tensor) -> Any:
+        """Return what the model says of images (N, 3, H, W): scores (N, classes), or
+        for detection a mapping of tensors for each image.
+        """
         targets = list(self.model(list(images)))
         if len(targets) != len(images):
             raise InputError(
@@ -167,6 +170,12 @@ class Scenes:
         spp: int = 64,
         seed: int = 0,
     ) -> None:
+        """Draw `count` configurations of the controls; arguments are those of the
+        class.
+
+        Raises:
+            InputError: there is no such task, or no image is asked for.
+        """
         if task not in ("classification", "detection"):
             raise InputError(
                 "task: expected classification or detection, which MAITE "
@@ -200,7 +209,14 @@ class Scenes:
     def __getitem__(
         self, number: int
     ) -> tuple[Tensor, Tensor | Detections, dict[str, Any]]:
-        # Raises IndexError, which ends a loop.
+        """Render the image of a configuration by its number, as MAITE's data sets
+        return it.
+
+        Returns:
+            The image (3, H, W) in [0, 1], its target, and its id with the values of the
+                parameters.
+        """
+        # a range raises IndexError, which ends a loop over the images
         index = range(len(self))[number]
         u = self.configurations[index]
         with torch.no_grad():

@@ -150,11 +150,13 @@ def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
         steps: npt.NDArray[np.uint8] = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(
             np.uint8
         )
+        # grey as three equal channels
         steps = steps[:, :, None].repeat(3, axis=2)
     else:
         steps = np.asarray(
             image.convert("RGBA" if alpha or "transparency" in image.info else "RGB")
         )
+    # opaque
     if alpha and steps.shape[2] == 3:
         steps = np.concatenate([steps, np.full_like(steps[:, :, :1], 255)], axis=2)
     return steps if alpha else steps[:, :, :3]

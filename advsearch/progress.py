@@ -275,6 +275,8 @@ class LineProgress:
         print(f"advsearch: {text}", file=self._stream, flush=True)
 
     def __enter__(self) -> LineProgress:
+        """Start the thread that prints lines from time to time."""
+
         def call() -> None:
             while not self._ended.wait(1.0):
                 self.tick()
@@ -321,6 +323,9 @@ class BarProgress:
     """
 
     def __init__(self, terminal: IO[str], written: Callable[[str], str] = str) -> None:
+        """Show bars in a terminal; `written` turns settings that texts name into how
+        the reader writes them.
+        """
         # late, so that --help answers at once
         from rich import progress as bars
         from rich.console import Console

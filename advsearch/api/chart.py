@@ -169,8 +169,8 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
     if len(squares) < 4:
         raise not_found
     x, y, area = np.array(squares).T
-    # nearest to each corner of the picture, upper left first; signs of 1 are left and
-    # top
+    # nearest to each corner of the picture: upper left first (smallest x + y), then
+    # upper right, lower left, lower right
     outermost = [
         int(np.argmin(x_sign * x + y_sign * y))
         for y_sign, x_sign in itertools.product((1, -1), repeat=2)

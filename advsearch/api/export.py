@@ -379,7 +379,8 @@ def _make_piece(
     """
     subdivisions = 1
     if max(pixel_size) > MAX_PIXEL_SIZE:
-        # rounded up to an odd number, so that a pixel has a middle
+        # rounded up to an odd number, so that the centre of a texel keeps its own
+        # colour
         odd = 2 * math.ceil((max(pixel_size) / MAX_PIXEL_SIZE - 1.0) / 2.0) + 1
         subdivisions = min(MAX_SUBDIVISIONS, odd)
     if subdivisions > 1:

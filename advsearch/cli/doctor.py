@@ -143,7 +143,7 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
             whether the process itself ended well, with how it ended.
     """
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             command,
             capture_output=True,
             text=True,
@@ -151,23 +151,23 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
             check=False,
             cwd=SUBPROCESS_DIRECTORY,
         )
-        printed = done.stdout
-        status = done.returncode
-        good = done.returncode == 0
-        telling = [
+        printed = process.stdout
+        status = process.returncode
+        good = process.returncode == 0
+        error_lines = [
             line.strip()
-            for line in done.stderr.splitlines()
+            for line in process.stderr.splitlines()
             if "ERROR" in line or "Error" in line
         ]
-        how = (
+        status_text = (
             f"signal {signal.Signals(-status).name}"
             # minus the number of the signal that ended it
             if status < 0
             else f"status {status}"
         )
         ending = (
-            f"the trial ended with {how}"
-            + (f" ({telling[0][:120]})" if telling else "")
+            f"the trial ended with {status_text}"
+            + (f" ({error_lines[0][:120]})" if error_lines else "")
             if status
             else ""
         )

@@ -298,10 +298,10 @@ def format_result(result: Result) -> str:
     from advsearch.report.views import collect_facts, get_view, list_remarks
     from advsearch.runs.directory import REPORT
 
-    content = get_view(result)
+    view = get_view(result)
     run = getattr(result, "run", None)
-    parts = [content.statement]
-    for part in content.sections:
+    parts = [view.statement]
+    for part in view.sections:
         if part.only not in ("", "text") or part.is_empty:
             continue
         table = align_columns([part.heads, *part.rows] if part.heads else part.rows)
@@ -310,26 +310,21 @@ def format_result(result: Result) -> str:
             for group in part.pictures
             for picture in group
         ]
-        inside = [
+        part_texts = [
             *map(format_as_flags, part.text),
             "\n".join(filter(None, [table, align_columns(pictures)])),
         ]
         parts.append(
-            "\n".join(filter(None, [part.title, "\n\n".join(filter(None, inside))]))
+            "\n".join(filter(None, [part.title, "\n\n".join(filter(None, part_texts))]))
         )
-    facts = [
-        [name.lower(), text] for name, text in collect_facts(result, content).items()
-    ]
+    facts = [[name.lower(), text] for name, text in collect_facts(result, view).items()]
     parts.append(
         align_columns([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])])
     )
     return "\n\n".join(
         [
             *filter(None, parts),
-            *(
-                f"Note: {format_as_flags(text)}"
-                for text in list_remarks(result, content)
-            ),
+            *(f"Note: {format_as_flags(text)}" for text in list_remarks(result, view)),
         ]
     )
 
@@ -338,7 +333,7 @@ def align_columns(rows: Sequence[Sequence[str]]) -> str:
     """Return lines with the cells of `rows` in aligned columns; rows may have fewer
     cells than others.
     """
-    wide = [
+    widths = [
         max(len(row[i]) for row in rows if i < len(row))
         for i in range(max(map(len, rows), default=0))
     ]
@@ -346,7 +341,7 @@ def align_columns(rows: Sequence[Sequence[str]]) -> str:
         (
             "  "
             + "   ".join(
-                cell.ljust(width) for cell, width in zip(row, wide, strict=False)
+                cell.ljust(width) for cell, width in zip(row, widths, strict=False)
             )
         ).rstrip()
         for row in rows

@@ -198,10 +198,15 @@ class DaskExecutor(WorkerExecutor):
                     )
                     if self._site.count is not None:
                         self._cluster.scale(self._site.count)
-                left = max(1.0, min(CONNECT_SECONDS, deadline - time.monotonic()))
-                where = self._cluster or self._site.address
+                seconds_left = max(
+                    1.0, min(CONNECT_SECONDS, deadline - time.monotonic())
+                )
+                target = self._cluster or self._site.address
                 self._client = untyped.Client(
-                    where, security=security, timeout=left, set_as_default=False
+                    target,
+                    security=security,
+                    timeout=seconds_left,
+                    set_as_default=False,
                 )
                 break
             except (
@@ -251,8 +256,8 @@ class DaskExecutor(WorkerExecutor):
             with suppress(OSError, TimeoutError, asyncio.TimeoutError):
                 self._look()
             self._looked_at = time.monotonic()
-        # the time alone counts from now on if there are workers; also if nobody has
-        # asked for a while, when nobody looked for them
+        # the time without workers begins anew if there are some, or if nobody has asked
+        # for so long that nobody looked for them
         if self._fit or now - self._counted_at > LESS_PATIENCE:
             self._alone_since = now
         self._check_hope(now)
@@ -460,7 +465,7 @@ class DaskExecutor(WorkerExecutor):
             with suppress(Exception):
                 await asyncio.shield(self._sending)
             return True
-        # it lacks files although they were sent
+        # unfit, or without files although they were sent
         if failure in (Failure.UNFIT, Failure.MISSING_FILES):
             self._refuse(address, value.error)
             return True

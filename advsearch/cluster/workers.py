@@ -83,9 +83,11 @@ class PoolWorkers:
         workers die gives a result without a value.
         """
         source = iter(batches)
+        # batches that are taken from `batches`, but not given out
         waiting = deque[Sequence[Any]]()
         running = dict[Future[Reply], Sequence[Any]]()
         ended: queue.SimpleQueue[Future[Reply]] = queue.SimpleQueue()
+        # of the last batches, for the deadline of the next
         item_seconds = deque[float](maxlen=MEDIAN_WINDOW)
         counted_at = self._clock()
         try:

@@ -157,7 +157,7 @@ def draw_searches(
         objectives.items(), styles, strict=False
     ):
         objective = np.array(values, dtype=float)  # None is NaN
-        # fmax skips NaN, and fails for an empty array
+        # fmax skips NaN
         best = np.fmax.accumulate(objective) if len(objective) else objective
         # of a long search only some points are drawn
         indices = _select_points(len(objective))
@@ -375,6 +375,7 @@ def _make_map_panels(
     """
     maps = sorted(
         (shape for shape in shapes if shape.map is not None),
+        # false comes before true
         key=lambda shape: not shape.true,
     )
     if not maps:
@@ -384,6 +385,7 @@ def _make_map_panels(
     panels = []
     for shape in maps:
         values = np.asarray(shape.map, dtype=np.float64)
+        # the small number is for a map of one value
         greys = np.clip((values - lower) / max(upper - lower, 1e-12), 0.0, 1.0)
         levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
         grey_image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
@@ -489,6 +491,7 @@ def make_contact_sheet(
     cell = width + GAP, height + LINE * max(map(len, captions)) + GAP
     n_columns = choose_column_count(len(pictures))
     n_rows = math.ceil(len(pictures) / n_columns)
+    # each cell has its gap at the right and below, so one more is at the left and above
     sheet_size = GAP + n_columns * cell[0], GAP + n_rows * cell[1]
     sheet = Image.new("RGB", sheet_size, "white")
     for index, picture in enumerate(pictures):

@@ -337,12 +337,15 @@ def _make_cover(
 
 
 def _draw_ruler(axes: Axes, paper: tuple[float, float]) -> None:
-    """Draw a ruler at the foot of a page, with a mark at each centimetre."""
+    """Draw a ruler at the foot of a page, with a mark at each centimetre, so that the
+    scale of the print can be checked.
+    """
     x = MARGIN
     y = paper[1] - MARGIN
     _draw_line(axes, [x, x + RULER], [y, y])
     for centimetre in range(int(RULER) // 10 + 1):
         mark_x = x + 10.0 * centimetre
+        # each fifth mark is longer
         mark_length = 4.0 if centimetre % 5 == 0 else 2.5
         _draw_line(axes, [mark_x, mark_x], [y, y - mark_length])
     axes.text(x + RULER + 3.0, y, f"{RULER:g} mm", fontsize=7, va="bottom")
@@ -358,6 +361,7 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
     x0, x1, y0, y1 = part.trim
     bleed_x, bleed_y = piece.bleed
     pixel_width, pixel_height = piece.pixel
+    # the part with the bleed around it
     picture = piece.picture[y0 - bleed_y : y1 + bleed_y, x0 - bleed_x : x1 + bleed_x]
     if convert is not None:
         picture = np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
@@ -369,6 +373,7 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
     outer_y = trim_y[0] - bleed_y * pixel_height, trim_y[1] + bleed_y * pixel_height
     axes.imshow(
         picture,
+        # left, right, bottom, top: y grows downwards on the page
         extent=(outer_x[0], outer_x[1], outer_y[1], outer_y[0]),
         interpolation="none",
         aspect="auto",

@@ -83,11 +83,11 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
         counts: also count its rows, which takes a second for a million.
     """
     running = is_held(path)
-    read = [
+    read_paths = [
         path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
     ]
     key = (os.path.abspath(path), counts)
-    state = (str(path), running, *map(_state, read))
+    state = (str(path), running, *map(_state, read_paths))
     if key not in _LISTED or _LISTED[key][0] != state or (running and counts):
         faults: list[str] = []
         try:
@@ -132,6 +132,7 @@ def _make_listed_run(
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
+    # what fails in such a block is added to the faults
     with _collect_faults(faults, path / CONFIG):
         config = read_yaml(path / CONFIG)
     with _collect_faults(faults, path / summary.NAME):

@@ -288,10 +288,13 @@ def find_changed_file(
         before: digests by path.
         settings: name the files now.
     """
-    again = {
+    settings_read_again = {
         name: value for name, value in settings.items() if name not in NOT_READ_AGAIN
     }
-    return next(iter(find_changed_facts(before, compute_file_digests(again))), None)
+    return next(
+        iter(find_changed_facts(before, compute_file_digests(settings_read_again))),
+        None,
+    )
 
 
 def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:

@@ -212,6 +212,7 @@ def _describe_expected(info: FieldInfo) -> str:
         return "true or false"
     if get_origin(info.annotation) is Literal:
         return _join_choices(types)
+    # a Literal or None
     if get_origin(types[0]) is Literal:
         return _join_choices(get_args(types[0]))
     limits = {
@@ -222,6 +223,7 @@ def _describe_expected(info: FieldInfo) -> str:
     }
     is_integer = types == [int]
     number = "a whole number" if is_integer else "a number"
+    # 1e6 instead of 1e+06
     upper = limits["le"] if is_integer else f"{limits['le']:g}".replace("e+0", "e")
     if "gt" in limits:
         return f"{number} greater than {limits['gt']:g} and at most {upper}"
@@ -322,6 +324,9 @@ class Config(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
+        """Refuse true and false where a setting is no switch; pydantic would take them
+        for 1 and 0.
+        """
         # YAML's `epsilon: yes` is a slip, not 1
         if (
             isinstance(value, bool)
@@ -662,6 +667,7 @@ def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> Advsear
             if error["type"] == "missing"
             else written.format_value(error["input"])
         )
+        # an entry of the mapping is wrong, not all of it
         if setting.is_mapping and len(error["loc"]) > 1:
             # the entry of the mapping that is wrong
             got = f"{error['loc'][1]}={got}"

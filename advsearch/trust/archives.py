@@ -222,7 +222,7 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
     tensors = [
         name for name in archive.members if name.partition("/")[0] in PICKLES.values()
     ]
-    # newer versions of torch write it into another folder
+    # torch writes it under one of two names
     name = "version" if "version" in archive else ".data/version"
     version = archive.read(name, 100).decode("ascii", "replace").strip()
     if not re.fullmatch("[0-9]{1,3}", version):
@@ -387,7 +387,7 @@ def without_unpickling() -> Iterator[None]:
     It sets an environment variable of torch, and restores the old value afterwards.
     """
     switches = ("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
-    # the second switch would win over the first
+    # torch refuses to load where both are set
     before = {key: os.environ.pop(key) for key in switches if key in os.environ}
     os.environ[switches[0]] = "1"
     try:

@@ -72,7 +72,7 @@ def allow_named(settings: Mapping[str, Any]) -> None:
     names: list[object] = []
     for key in ("model", "compared", "than"):
         texts = [text for text in _to_list(settings.get(key)) if isinstance(text, str)]
-        # MODEL@WEIGHTS,MODEL@WEIGHTS
+        # several models have commas between them, and each may have @WEIGHTS
         names += [part.partition("@")[0] for text in texts for part in text.split(",")]
     for key in ("controls", "over"):
         value = settings.get(key)

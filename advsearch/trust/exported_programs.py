@@ -125,25 +125,28 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
                 if len(arguments) == 1 and isinstance(arguments[0], ast.Constant)
                 else None
             )
-            keys = {word.arg for word in words}
-            values = [
+            keyword_names = {word.arg for word in words}
+            keyword_values = [
                 word.value.value if isinstance(word.value, ast.Constant) else None
                 for word in words
             ]  # repeated keys too
             if name == "Symbol":  # Symbol('s0', positive=True, integer=True)
-                assumed = None not in keys and all(
-                    isinstance(value, bool) for value in values
+                has_plain_assumptions = None not in keyword_names and all(
+                    isinstance(value, bool) for value in keyword_values
                 )
-                if not (isinstance(text, str) and is_symbol(text) and assumed):
+                if not (
+                    isinstance(text, str) and is_symbol(text) and has_plain_assumptions
+                ):
                     raise ValueError("a symbol of another form")
             elif not (
                 isinstance(text, str) and _DECIMAL.fullmatch(text)
             ):  # Float('0.5', precision=53)
                 raise ValueError("a number of another form")
-            elif not keys <= {"precision", "prec", "dps"} or not all(
-                isinstance(value, int) and 0 < value <= 200 for value in values
+            elif not keyword_names <= {"precision", "prec", "dps"} or not all(
+                isinstance(value, int) and 0 < value <= 200 for value in keyword_values
             ):
                 raise ValueError("a number of another precision")
+        # any other call has no keywords
         case ast.Call(keywords=[_, *_]):
             raise ValueError("keywords")
         case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
@@ -356,8 +359,8 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
     copied: set[str] = set()
     for name, entry in table.items():
         record = entry.get("path_name") if isinstance(entry, dict) else None
-        plain = isinstance(record, str) and _RECORD.fullmatch(record)
-        if not isinstance(entry, dict) or entry.get("use_pickle") or not plain:
+        is_plain = isinstance(record, str) and _RECORD.fullmatch(record)
+        if not isinstance(entry, dict) or entry.get("use_pickle") or not is_plain:
             raise make_archive_error(
                 archive.path,
                 f"{name[:80]!r} is a pickled object or "
@@ -449,13 +452,13 @@ def _plain_problem(text: str) -> str:
 
 def _identifier_problem(text: str) -> str:
     """Return what speaks against a name that torch writes into code, "" if nothing does."""
-    proper = text == "" or (
+    is_proper = text == "" or (
         text.isascii()
         and text.isidentifier()
         and not keyword.iskeyword(text)
         and len(text) < 1000
     )
-    return "" if proper else f"expected a name of a value, got {text[:60]!r}"
+    return "" if is_proper else f"expected a name of a value, got {text[:60]!r}"
 
 
 # that an operator is called with, such as 'same' or 'bilinear'
@@ -496,12 +499,12 @@ def _tree_problem(text: str) -> str:
             context = "[]" if node["context"] in (None, "null") else node["context"]
             # the keys of a dict; a tuple or list has none
             names: Any = parse_json(context) if isinstance(context, str) else None
-            plain = isinstance(names, list) and all(
+            is_plain = isinstance(names, list) and all(
                 isinstance(name, (str, int)) for name in names
             )
             if (
                 node["type"] not in _CONTAINERS
-                or not plain
+                or not is_plain
                 or any(_plain_problem(str(name)) for name in names)
             ):
                 return (
@@ -565,8 +568,10 @@ def _check_pickle(archive: Archive, name: str) -> None:
     except (ValueError, IndexError, UnicodeDecodeError):
         raise make_archive_error(archive.path, what) from None
     for step, argument, _ in steps:
-        foreign = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
-        if foreign or step.name in (
+        names_other_class = step.name == "GLOBAL" and not _GLOBALS.fullmatch(
+            str(argument)
+        )
+        if names_other_class or step.name in (
             # other ways to name a class; torch.save uses none of them
             "STACK_GLOBAL",
             "INST",

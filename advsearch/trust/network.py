@@ -55,15 +55,15 @@ def check_address(spec: str) -> SplitResult:
         ) from None
     if not host or not spec.isascii() or not spec.isprintable() or " " in spec:
         raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH")
-    secret = [
+    secret_names = [
         name
         for name, _ in parse_qsl(address.query)
         if re.search("key|token|secret|passw|sig|auth", name, re.I)
     ]
-    if "@" in address.netloc or secret:
+    if "@" in address.netloc or secret_names:
         where = (
-            f"`{secret[0]}` in the address"
-            if secret
+            f"`{secret_names[0]}` in the address"
+            if secret_names
             else "the user and password in the address"
         )
         raise InputError(

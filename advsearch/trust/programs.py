@@ -98,8 +98,8 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     if program is None and importlib.util.find_spec("bpy") is not None:
         # Blender as a package of this Python
         program = sys.executable
-    runs = shutil.which(program or "")
-    if runs is None:
+    executable = shutil.which(program or "")
+    if executable is None:
         missing = (
             "none is installed"
             if program is None
@@ -111,7 +111,7 @@ def find_blender(who: str, otherwise: str) -> list[str]:
             "`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
             f"{BLENDER}=bpy/bin/python; or {otherwise}"
         )
-    program = os.path.abspath(runs)
+    program = os.path.abspath(executable)
     if Path(program).name.startswith("python"):
         # a Python with the package bpy, without the user's own modules
         return [program, "-I"]

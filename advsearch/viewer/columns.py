@@ -233,6 +233,7 @@ def _prediction_columns(
     probability = np.where(
         np.isnan(probability), NO_PROBABILITY, probability.round()
     ).astype(np.uint16)
+    # out of view nothing was predicted, so nothing was judged
     is_right = rows["correct"].where(rows["label"] != OUT_OF_VIEW).fillna(UNKNOWN)
     columns = {
         "step": rows["step"].to_numpy(np.uint32),

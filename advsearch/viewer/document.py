@@ -256,6 +256,7 @@ def make_table(
                 make_element("td", _interval_bar(bars[index]), class_="hide-small")
             )
         lines.append(make_element("tr", *cells))
+    # the column of bars has no head
     bar_head = make_element("td", class_="hide-small") if bars else None
     column_heads = (make_element("th", text, scope="col") for text in heads)
     head = make_element("tr", *column_heads, bar_head)

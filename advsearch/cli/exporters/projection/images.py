@@ -145,6 +145,8 @@ def describe_marks(
     half_width = math.tan(math.radians(control.part.fov) / 2.0)
     lines = []
     for index, (row, column, x, y) in enumerate(marked_texels, 1):
+        # x and y are 0 to 1 from the upper left; -1 to 1 from the middle times half the
+        # width is the tangent
         right = math.degrees(math.atan((2 * x - 1) * half_width))
         up = math.degrees(math.atan((1 - 2 * y) * half_width / control.part.aspect))
         lines.append(
@@ -185,6 +187,7 @@ def make_marks(
     line = max(2, height // 200)
     draw.rectangle((0, 0, width - 1, height - 1), outline=255, width=2 * line)
     marked_texels = []
+    # three rows and three columns of crosses
     for down, across in itertools.product(SHARES, SHARES):
         row = int(down * n_rows)
         column = int(across * n_columns)
