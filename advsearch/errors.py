@@ -142,7 +142,7 @@ def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] |
 
     Returns:
         The kind of likeness (0 is best), how many words it has more, and whether its
-            last word is another one.
+        last word is another one.
     """
     if not query or not words:
         return None

@@ -214,7 +214,7 @@ class Scenes:
 
         Returns:
             The image (3, H, W) in [0, 1], its target, and its id with the values of the
-                parameters.
+            parameters.
         """
         # a range raises IndexError, which ends a loop over the images
         index = range(len(self))[number]

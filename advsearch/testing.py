@@ -228,7 +228,7 @@ def _name_objects(
 
     Returns:
         The settings; and the scene and controls by (role, name), as
-            `Config.with_python_objects` takes them.
+        `Config.with_python_objects` takes them.
     """
     # heavy, and pytest imports this module before it collects
     from advsearch.extend import workbench

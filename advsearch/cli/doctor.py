@@ -139,8 +139,8 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
 
     Returns:
         By name, whether the part worked, with a detail or the error. The part that
-            ended the process and those after it are missing. Under the name "" stands
-            whether the process itself ended well, with how it ended.
+        ended the process and those after it are missing. Under the name "" stands
+        whether the process itself ended well, with how it ended.
     """
     try:
         process = subprocess.run(
@@ -161,7 +161,7 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
         ]
         status_text = (
             f"signal {signal.Signals(-status).name}"
-            # minus the number of the signal that ended it
+            # a negative status is minus the number of a signal
             if status < 0
             else f"status {status}"
         )

@@ -138,7 +138,7 @@ def _format_inside(scene: str) -> str:
     Raises:
         InputError: there is none.
     """
-    # late: another thing has this name here
+    # late, so that --help answers at once
     from advsearch.scene.importing.files import format_name
 
     # late, so that --help answers at once

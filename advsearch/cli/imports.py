@@ -51,7 +51,7 @@ def file(args: argparse.Namespace) -> int:
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with open_command_progress(as_json=True, quiet=False):
-        # late: another thing has this name here
+        # late, so that --help answers at once
         from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_contents
 
         if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
@@ -206,7 +206,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     Raises:
         InputError: an image is requested, but no shape can be the object.
     """
-    # late: another thing has this name here
+    # late, so that --help answers at once
     from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
     inside = read_contents(Path(file))

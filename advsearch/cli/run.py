@@ -136,14 +136,14 @@ def resume(args: argparse.Namespace) -> int:
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
     command = read_command(path / CONFIG)
-    # the map of a sweep's surface, or a recipe's figures anew, with the photographs
-    # that were taken since
+    # these add to a run that is done: the map of a sweep's surface, or a recipe's
+    # figures anew, with the photographs that were taken since
     adds = command == "recipe" or (
         changes.get("surface") is True and command == "sweep"
     )
     if is_finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
-        # the disk was full as it was written, or it was removed
+        # missing: the disk was full as it was written, or somebody removed it
         if not (path / REPORT).is_file():
             write_page(path)
         return show_run(str(path), args.json)

@@ -248,7 +248,7 @@ def open_workers(
 
     Yields:
         The workers, None if `workers` and `cluster` are None: then this process does
-            all.
+        all.
     """
     if workers is None and cluster is None:
         yield None

@@ -151,7 +151,7 @@ def _open_tracker(
 
     Returns:
         A function that sends numbers by name with their step, and one that ends the
-            run.
+        run.
     """
     package = _import_package(name)
     if name == "mlflow":

@@ -196,7 +196,7 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
 
     Returns:
         The new archive, and whether torch would run a part of its code while it loads
-            it.
+        it.
 
     Raises:
         FileFormatError: the code calls what a network has no use for, or the pickles

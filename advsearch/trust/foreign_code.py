@@ -111,7 +111,7 @@ def try_torchscript(archive: io.BytesIO) -> str:
         return str(TimedOut())
     return (
         f"torch crashed while loading it (signal {-done.returncode})"
-        # minus the number of the signal that ended it
+        # a negative status is minus the number of a signal
         if done.returncode < 0
         else ""
     )

@@ -120,7 +120,7 @@ def make_https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
 
     Returns:
         The TLS context of a server that uses it, and the certificate's SHA-256
-            fingerprint, pairs of hexadecimal digits between colons.
+        fingerprint, pairs of hexadecimal digits between colons.
 
     Raises:
         InputError: there is no program `openssl`, or it makes none.

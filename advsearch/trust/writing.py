@@ -55,6 +55,7 @@ def storage_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
+        # raises where the folder was moved, which explains any of these errors
         check_not_moved(path)
         if isinstance(error, OSError):
             known = _ADVICE.get(error.errno or 0)
@@ -65,6 +66,7 @@ def storage_errors(path: Path) -> Iterator[None]:
                 None,
             )
             text = str(error)
+        # what to do about a known error, else the error itself
         advice = known or f"{text}; choose another place with `run`"
         raise StorageError(f"cannot write {path}: {advice}") from error
 

@@ -221,6 +221,8 @@ class ConnectionPool:
         try:
             connection.setblocking(True)
             if self._context is not None:
+                # the handshake waits for the client, so it is done below, when the time
+                # counts
                 connection = self._context.wrap_socket(
                     connection, server_side=True, do_handshake_on_connect=False
                 )
@@ -234,6 +236,7 @@ class ConnectionPool:
         finally:
             self._connections.pop(thread, None)
             with suppress(OSError):
+                # the plain method: that of an SSL socket would forget that it is one
                 socket.socket.shutdown(connection, socket.SHUT_WR)
             connection.close()
 

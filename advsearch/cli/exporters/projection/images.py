@@ -176,8 +176,8 @@ def make_marks(
 
     Returns:
         The picture, white on black, (h, w, 3) linear in [0, 1]; and for each cross row
-            and column of its texel, and x and y of the texel's center as fractions of
-            width and height.
+        and column of its texel, and x and y of the texel's center as fractions of
+        width and height.
     """
     n_rows, n_columns = shape
     width = n_columns * factor

@@ -29,7 +29,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
 
     Returns:
         Sentences about how a rendering of it becomes the picture of the run, and what
-            is missing in it.
+        is missing in it.
 
     Raises:
         InputError: such files are there, or stock Mitsuba has no such scene; other
