@@ -164,7 +164,9 @@ def _has_type(kind: str, value: object) -> bool:
 
 
 def with_checked_arguments(function: Function) -> Function:
-    """Make a function reject unknown keywords and values of wrong types, see above."""
+    """Make a function reject unknown keywords (`make_unexpected_error`) and values of
+    wrong types (`check_types`).
+    """
     signature = inspect.signature(function)
     parameters = signature.parameters
 

@@ -754,7 +754,9 @@ class DerivativeConfig(SceneConfig):
         elif isinstance(value, (list, tuple)):
             values = list(value)
         else:
+            # None passes, as 1.0 would
             values = [1.0 if value is None else value]
+        # for the checks alone: pydantic itself turns the value into numbers
         numbers = [_parse_positive(number) for number in values]
         if isinstance(value, (list, tuple)):
             written.check_no_duplicates(

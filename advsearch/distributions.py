@@ -94,10 +94,10 @@ def distribution_to_setting(value: object) -> object:
         weights = [
             w.item() if getattr(w, "ndim", 1) == 0 else w for w in value.values()
         ]
-        numbers = all(
+        are_numbers = all(
             isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights
         )
-        if value and numbers and not value.keys() & {DISTRIBUTION, CHOICES}:
+        if value and are_numbers and not value.keys() & {DISTRIBUTION, CHOICES}:
             # an integer too large for a float is left: whoever reads the setting says
             # what it takes
             with suppress(OverflowError):

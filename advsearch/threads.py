@@ -126,6 +126,7 @@ def restore_threads() -> Iterator[None]:
     finally:
         _chosen = chosen
         if "torch" in sys.modules:
+            # the default if it was imported inside the block
             sys.modules["torch"].set_num_threads(for_torch or _get_default())
         if drjit is not None and drjit.thread_count() != for_drjit:
             drjit.set_thread_count(for_drjit)

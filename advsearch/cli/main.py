@@ -343,7 +343,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         open_descriptors()
     with escape_output(), restrict_allowed_code():
         status = _interruptible(sys.argv[1:]) if argv is None else _status(list(argv))
-        if argv is None:  # native code knows no handler of ours
+        if argv is None:  # too late to interrupt: native code knows no handler of ours
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         end_output()
     return status

@@ -217,6 +217,7 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
             (row.step, {name: value["value"] for name, value in row.values.items()})
             for row in store.rows("sweep")
         ]
+    # line 1 has the heads
     for line, pose in enumerate(
         csv.DictReader(
             stored_files.read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()

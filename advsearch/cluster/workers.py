@@ -238,17 +238,18 @@ def open_workers(
     cluster: str | None,
     tell: Callable[[str], None],
 ) -> Iterator[Workers | None]:
-    """Open workers for a task.
+    """Open workers for a task, and end them after the block.
 
     Args:
         task: what the workers do.
-        workers: number of processes on this machine, by default one a core.
-        cluster: the address of a scheduler, or a YAML file.
+        workers: number of processes; None for the default, on this machine one a core.
+        cluster: the address of a scheduler, a YAML file, or "local" or None for this
+            machine.
         tell: takes messages for the user.
 
     Yields:
-        The workers, None if `workers` and `cluster` are None: then this process does
-        all.
+        The workers; None if `workers` and `cluster` are both None: then this process
+        does all.
     """
     if workers is None and cluster is None:
         yield None

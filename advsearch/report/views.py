@@ -149,13 +149,14 @@ class ResultPart:
 
         Args:
             rows: the values.
-            columns: by the head of each column, what makes its cell from a value.
+            columns: by the head of each column, what makes its cell from a value: a
+                function, or a text for `str.format`.
             more: other attributes of the part.
         """
         cells = [
             [
-                cells(row) if callable(cells) else cells.format(row)
-                for cells in columns.values()
+                column(row) if callable(column) else column.format(row)
+                for column in columns.values()
             ]
             for row in rows
         ]

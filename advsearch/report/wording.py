@@ -295,7 +295,11 @@ def _similarity_text(probability: float, payload: Any) -> str:
 
 
 def _detection_cells(label: str, score: float, payload: Any) -> list[str]:
-    """Return what a detector finds, and its score and overlap."""
+    """Return the two cells of a detector's prediction: what it finds, and with which
+    score and overlap.
+
+    Where it missed a cup, `label` is "no cup", and `score` the best one of any cup.
+    """
     outcome = get_outcome(payload)
     stated = payload if isinstance(payload, dict) else {}
     if outcome is Outcome.MISSED:

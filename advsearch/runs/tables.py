@@ -116,9 +116,9 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
         units = TypeAdapter(Units).validate_python(noted)
         if not is_sampled and units.noise == 1:
             units = replace(units, samples=1, noise=units.samples)
-        has_frames = units.frames is None or units.frames < len(units.sizes)
+        is_frame_axis_valid = units.frames is None or units.frames < len(units.sizes)
         if (
-            has_frames
+            is_frame_axis_valid
             and prod(units.sizes) * units.samples * units.noise * units.models
             <= MAX_ROWS
         ):

@@ -669,7 +669,6 @@ def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> Advsear
         )
         # an entry of the mapping is wrong, not all of it
         if setting.is_mapping and len(error["loc"]) > 1:
-            # the entry of the mapping that is wrong
             got = f"{error['loc'][1]}={got}"
         problems.setdefault(setting.name, f"expected {setting.expects}, got {got}")
     return SettingsError(tuple(problems.items()))

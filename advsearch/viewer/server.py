@@ -351,8 +351,15 @@ class PhotographServer(Protocol):
     ) -> tuple[str, bytes]:
         """Store a photograph, and return media type and data of the response.
 
+        Args:
+            run: directory of the run.
+            name: of the rendering that it shows.
+            headers: of the request.
+            key: that the page has and the request needs.
+            read_data: reads the photograph's file from the request.
+
         Raises:
-            RequestRejected: it is no photograph, or the request lacks the page's key.
+            RequestRejected: it is no photograph, or the request lacks the key.
         """
 
 
