@@ -12,12 +12,12 @@ def start() -> int:
     # Ctrl-C ends the process, without a traceback, until `main` begins
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-    # first the handling of signals above
+    # imported only now, with signals handled as above
     from advsearch.cli.main import main
     from advsearch.cli.output import INTERRUPTED
 
     status = main()
-    # one that struck inside Dr.Jit has left it so that the interpreter aborts at its
+    # an interrupt inside Dr.Jit leaves it so that the interpreter would abort at its
     # end
     if status == INTERRUPTED:
         sys.stderr.flush()

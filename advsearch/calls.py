@@ -54,8 +54,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def make_unexpected_error(
     function: str, keywords: Mapping[str, object], known: Sequence[str]
 ) -> TypeError | None:
-    """Return the error for the first keyword that a function does not have, with the
-    keyword that is probably meant; None if there is no such keyword.
+    """Return the error for the first keyword that a function does not have; None if it
+    has all.
+
+    The message suggests what is probably meant.
+
+    Args:
+        function: its name.
+        keywords: of the call.
+        known: the names of its parameters.
     """
     for name in keywords:
         if name in known:
@@ -87,8 +94,10 @@ def suggest_keyword(name: str, known: Sequence[str]) -> tuple[list[str], str]:
 def check_types(
     parameters: Mapping[str, inspect.Parameter], values: Mapping[str, object]
 ) -> None:
-    """Check values against the annotations of parameters, as far as these name types
-    and classes.
+    """Check values against the annotations of parameters, as far as these are types and
+    classes.
+
+    Arrays and tensors pass, since they may stand for numbers and lists.
 
     Raises:
         InputError: a value has none of the types.
@@ -116,8 +125,11 @@ def check_types(
 
 
 def _parse_annotation(annotation: str) -> list[str]:
-    """Return the names of the types in an annotation; empty if it allows others."""
+    """Return the names of the types that an annotation allows, such as ``["str",
+    "None"]``; empty if it allows what cannot be checked.
+    """
     without_parameters = annotation
+    # remove [...], whatever a Sequence or Mapping is of
     n_replaced = 1
     while n_replaced:  # from the innermost brackets outwards
         without_parameters, n_replaced = re.subn(r"\[[^][]*\]", "", without_parameters)
@@ -131,7 +143,9 @@ def _parse_annotation(annotation: str) -> list[str]:
 
 
 def _has_type(kind: str, value: object) -> bool:
-    """Whether a value has the type of a name."""
+    """Return whether a value is of the type or class with a name; an int is a float,
+    and 2.0 an int.
+    """
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     is_text = isinstance(value, (str, bytes))
     fits = {
@@ -150,7 +164,9 @@ def _has_type(kind: str, value: object) -> bool:
 
 
 def with_checked_arguments(function: Function) -> Function:
-    """Make a function reject unknown keywords and values of wrong types, see above."""
+    """Make a function reject unknown keywords (`make_unexpected_error`) and values of
+    wrong types (`check_types`).
+    """
     signature = inspect.signature(function)
     parameters = signature.parameters
 

@@ -529,8 +529,8 @@ BUILT_INS = (
 
 
 def is_present(module: str) -> bool:
-    """Return whether there is such a module. Neither it nor a package that it is in is
-    imported.
+    """Return whether there is a module, without importing it or a package that it is
+    in.
     """
     names = module.split(".")
     path: Sequence[str] | None = None
@@ -538,6 +538,7 @@ def is_present(module: str) -> bool:
         spec = _find_spec(".".join(names[:depth]), path)
         if spec is None:
             return False
+        # where the next part of the name is looked for; none in a plain module
         path = spec.submodule_search_locations or ()
     return True
 

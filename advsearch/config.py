@@ -31,16 +31,22 @@ may be resumed anywhere.
 
 
 def read_named(value: Any, setting: str, default_name: str) -> Any:
-    """Read a name, or a mapping with a `name` and options.
+    """Read a setting that is a name, or a name with options.
+
+    ``NAME={OPTION: VALUE}`` becomes ``{"name": NAME, OPTION: VALUE}``, and a mapping
+    with nothing but a name becomes the name. Options that are paths become absolute.
 
     Args:
-        value: ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping.
+        value: ``NAME``, ``NAME={OPTION: VALUE}`` or a mapping; anything else is
+            returned as it is.
         setting: its name, for messages.
         default_name: the name of a mapping without one.
     """
     if isinstance(value, str) and "=" in value:
         name, options = written.parse_assignment(value, setting)
         if not isinstance(options, Mapping):
+            # no mapping: kept under a name that nothing has, so that it is refused
+            # later
             options = {"": options}
         value = {"name": name, **options}
     if not isinstance(value, Mapping):
@@ -61,6 +67,7 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
     Several become their names with + between them, and under each name its options:
     ``{"name": "detection+depth", "detection": {"iou": 0.7}}``.
     """
+    # at each + that is not in braces
     entries = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
     if not isinstance(entries, (list, tuple)) or len(entries) < 2:
         return read_named(value, setting, default_name)
@@ -407,7 +414,9 @@ class SceneConfig(Config):
 
     @model_validator(mode="after")
     def _check_counts(self) -> SceneConfig:
-        """Check that settings with one name have no several."""
+        """Check that settings for one name do not have several; of several tasks each
+        needs a model.
+        """
         tasks = self.task_name.split(TASK_SEPARATOR)
         for setting_name in ("object", "environment", "model"):
             names = written.split_names(getattr(self, setting_name) or "")
@@ -642,7 +651,11 @@ class RenderConfig(SceneConfig):
     @field_validator("out", mode="before")
     @classmethod
     def _picture_file(cls, value: Any) -> Any:
-        """Check that a path has the suffix of an image and no NUL character."""
+        """Return the path of an image as a text.
+
+        Raises:
+            ValueError: it has not the suffix of an image, or a zero byte in it.
+        """
         text = str(value) if isinstance(value, Path) else value
         if (
             not isinstance(text, str)
@@ -718,8 +731,11 @@ class DerivativeConfig(SceneConfig):
     @field_validator("epsilon", mode="before")
     @classmethod
     def _epsilon_from_text(cls, value: Any) -> Any:
-        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; numbers in
-        range, without duplicates.
+        """Read ``0.05``, ``0.01,0.02`` or ``texture=0.05,geometry=0.01``, and check
+        that the numbers are in range and none comes twice.
+
+        The result is a single value, a tuple to be tried one after the other, or a
+        mapping by control.
         """
         if isinstance(value, str):
             entries = [entry.strip() for entry in value.split(",")]
@@ -738,7 +754,9 @@ class DerivativeConfig(SceneConfig):
         elif isinstance(value, (list, tuple)):
             values = list(value)
         else:
+            # None passes, as 1.0 would
             values = [1.0 if value is None else value]
+        # for the checks alone: pydantic itself turns the value into numbers
         numbers = [_parse_positive(number) for number in values]
         if isinstance(value, (list, tuple)):
             written.check_no_duplicates(
@@ -755,6 +773,11 @@ class DerivativeConfig(SceneConfig):
 
 
 def _parse_positive(value: Any) -> float:
+    """Return a positive number in range, given as a number or a text.
+
+    Raises:
+        ValueError: it is none.
+    """
     try:
         number = float("nan") if isinstance(value, bool) else float(value)
     except (TypeError, OverflowError):

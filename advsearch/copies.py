@@ -17,10 +17,12 @@ Value = TypeVar("Value")
 
 
 def copy_value(value: Value) -> Value:
-    """Return a copy of all tensors, with their graphs, and arrays in a value, and of
-    the lists, mappings and dataclasses that hold them. Anything else is as it is, and
-    so is a dataclass that `gives_copies` of what it holds (`Facts`) and a mapping that
-    nobody can write into and that makes its values on demand.
+    """Return a value in which tensors (with their graphs) and arrays are copies, and so
+    are the lists, mappings and dataclasses that hold them.
+
+    Anything else stays as it is. So does a dataclass that `gives_copies` of what it
+    holds (`Facts`), and a mapping that nobody can write into and that makes its values
+    on demand.
     """
     original: Any = value
     copy_of_value: Any = original
@@ -44,6 +46,7 @@ def copy_value(value: Value) -> Value:
         copied_items = map(copy_value, original)
         copy_of_value = (
             type(original)(*copied_items)
+            # a named tuple takes its items one by one
             if hasattr(original, "_fields")
             else type(original)(copied_items)
         )
@@ -56,6 +59,7 @@ def copy_value(value: Value) -> Value:
     ):
         copy_of_value = copy.copy(original)
         for field in fields(original):
+            # also in a frozen dataclass
             object.__setattr__(
                 copy_of_value, field.name, copy_value(getattr(original, field.name))
             )
@@ -68,8 +72,15 @@ def is_ours(kind: type) -> bool:
 
 
 def hand_copies(kind: type, **argument_slices: slice) -> None:
-    """Have methods that a class outside of this package defines called with copies of
-    their arguments: by name, of which after `self`, and of all by keyword.
+    """Replace methods of a class from outside of this package by ones that are called
+    with copies of their arguments.
+
+    So code of others can change what it is given without harm.
+
+    Args:
+        kind: the class; one of this package is left as it is.
+        argument_slices: by the name of the method, which of its positional arguments
+            after `self` are copied. All keyword arguments are.
     """
     if is_ours(kind):
         return
@@ -80,6 +91,10 @@ def hand_copies(kind: type, **argument_slices: slice) -> None:
 
 
 def _wrap_with_copies(method: Callable[..., Any], which: slice) -> Callable[..., Any]:
+    """Return a method that is called with copies: of the positional arguments `which`,
+    after `self`, and of all keyword arguments.
+    """
+
     @wraps(method)
     def handed(self: Any, *args: Any, **named: Any) -> Any:
         copied_args = [*args]

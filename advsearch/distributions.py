@@ -29,6 +29,12 @@ class PythonQuantiles(dict[str, object]):
     """
 
     def __init__(self, name: str, function: Callable[[float], float]) -> None:
+        """Evaluate an inverse CDF at `QUANTILES`; values are rounded to six digits, as
+        a file has them.
+
+        Raises:
+            InputError: the function fails.
+        """
         try:
             quantiles = [float(f"{float(function(p)):.6g}") for p in QUANTILES]
         except Exception as error:  # the user's code may raise anything
@@ -84,15 +90,16 @@ def distribution_to_setting(value: object) -> object:
             inverse CDF.
     """
     if isinstance(value, Mapping):
-        # numpy's, torch's
+        # weights may be numbers of numpy or torch
         weights = [
             w.item() if getattr(w, "ndim", 1) == 0 else w for w in value.values()
         ]
-        numbers = all(
+        are_numbers = all(
             isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights
         )
-        if value and numbers and not value.keys() & {DISTRIBUTION, CHOICES}:
-            # of no float: whoever reads the setting says what it takes
+        if value and are_numbers and not value.keys() & {DISTRIBUTION, CHOICES}:
+            # an integer too large for a float is left: whoever reads the setting says
+            # what it takes
             with suppress(OverflowError):
                 return {CHOICES: list(value), WEIGHTS: list(map(float, weights))}
         return value
@@ -103,6 +110,7 @@ def distribution_to_setting(value: object) -> object:
     ):
         name, parameters = TORCH_DISTRIBUTIONS[kind.__name__]
         return _named(name, parameters(value))
+    # a frozen distribution of scipy has its family there
     family = getattr(value, "dist", value)
     if hasattr(family, "pmf") and hasattr(family, "ppf"):
         raise InputError(
@@ -110,12 +118,13 @@ def distribution_to_setting(value: object) -> object:
             "real numbers, got one of whole "
             "ones; give its values as {choices: [...], weights: [...]}"
         )
-    # one's own may have the name of scipy's, too
+    # a family of the user may have the name of one of scipy's, but is of another class
     of_scipy = getattr(
         sys.modules.get("scipy.stats"), str(getattr(family, "name", "")), NotImplemented
     )
     if family is not value and type(family) is type(of_scipy):
         frozen: Any = value
+        # parameters by position or name, in scipy's own order
         shapes, loc, scale = frozen.dist._parse_args(*frozen.args, **frozen.kwds)
         names = [
             name.strip()

@@ -42,6 +42,15 @@ class UnknownNameError(InputError):
     def __init__(
         self, kind: str, name: str, known: Iterable[str], hint: str = ""
     ) -> None:
+        """Make the error that a name is unknown; it lists the known names, and first
+        those like it.
+
+        Args:
+            kind: what is named, such as "policy".
+            name: that was given.
+            known: the names that there are.
+            hint: the last sentence of the message.
+        """
         names = sorted(known)
         near = find_similar_names(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
@@ -90,11 +99,14 @@ class ClusterError(AdvsearchError):
 
 
 def find_similar_names(name: str, known: Iterable[str]) -> list[str]:
-    """Return the known names that are like `name`, whatever their case, best first.
-    First those with all of its words ("coffee mug" for "mug"; a plural s is no
-    difference), then those with words that begin like them, then those that contain it;
-    of equals, those with fewer other words, and with its last word last. Where there is
-    none, those of nearly the same spelling, as a whole or in one word.
+    """Return the known names that are like `name`, best first; upper and lower case are
+    the same.
+
+    First come names with all of its words ("coffee mug" for "mug"; a plural s is no
+    difference), then those with words that begin like its words, then those that
+    contain it. Among equals, fewer other words are better, then the same last word.
+    Only where there are none, names of nearly the same spelling follow, as a whole or
+    in one word.
     """
     query_words = _split_words(name)
     names = list(dict.fromkeys(known))
@@ -121,8 +133,16 @@ def _split_words(name: str) -> list[str]:
 
 
 def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] | None:
-    """Where a name with these words stands among those that are like what was asked
-    for; None if it isn't.
+    """Return how well a name fits to what was asked for; smaller is better, None is not
+    at all.
+
+    Args:
+        query: the words that were asked for.
+        words: those of the name.
+
+    Returns:
+        The kind of likeness (0 is best), how many words it has more, and whether its
+        last word is another one.
     """
     if not query or not words:
         return None
@@ -135,8 +155,12 @@ def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] |
 
 
 def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> float:
-    """How near a name's spelling is to what was asked for, as a whole or in one word; 0
-    where it is not.
+    """Return how near the spelling of a name is to what was asked for, as a whole or in
+    one word, in [0, 1]; 0 where it is not near enough.
+
+    Args:
+        matcher: has what was asked for as its second sequence.
+        name: to compare.
     """
     best_ratio = 0.0
     for text, threshold in [
@@ -145,6 +169,7 @@ def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> flo
     ]:
         matcher.set_seq1(text)
         if (
+            # upper bounds that take less time
             matcher.real_quick_ratio() >= threshold
             and matcher.quick_ratio() >= threshold
             and matcher.ratio() >= threshold

@@ -84,6 +84,13 @@ class RunContext(ExitStack, Generic[Settings]):
         progress: Progress | None = None,
         resumed: Path | None = None,
     ) -> None:
+        """Begin to measure the time; the run itself is made when it is asked for first.
+
+        Args:
+            config: the settings of the experiment.
+            progress: is told how far it is; None for nobody.
+            resumed: folder of the run to go on with; None for a new run.
+        """
         super().__init__()
         self.config = config
         self.progress = progress or NullProgress()
@@ -110,8 +117,8 @@ class RunContext(ExitStack, Generic[Settings]):
 
     @contextmanager
     def until_interrupted(self) -> Iterator[None]:
-        """Run a block that Ctrl-C ends; the experiment continues behind it with
-        `ending` "interrupted".
+        """Run a block that Ctrl-C ends; the experiment goes on after it with `ending`
+        set to `INTERRUPTED`.
         """
         try:
             with interruptible():
@@ -145,8 +152,8 @@ class RunContext(ExitStack, Generic[Settings]):
         """Return a result with the given fields and those that every result has.
 
         These are what the settings state (`SHARED_RESULT_FIELDS`), the run, how it
-        ended, the command line and the total seconds, which are added to the `seconds`
-        that are given.
+        ended, the command line, and the total seconds, which join the `seconds` that
+        are given.
         """
         settings = self.config
         shared = {
@@ -174,11 +181,11 @@ class RunContext(ExitStack, Generic[Settings]):
 def run_and_save(
     function: Callable[[RunContext[Settings]], AnyResult], context: RunContext[Settings]
 ) -> AnyResult:
-    """Call the function of an experiment, and save its result, page and figure in its
-    run directory.
+    """Call the function of an experiment, and save its result, page and figure in the
+    directory of its run.
 
-    Nothing is saved where the function made no run through the context: then it has
-    saved its result itself.
+    Where the function made no run through the context, it has saved its result itself,
+    and nothing is saved here.
     """
     with context:
         result = function(context)
@@ -231,18 +238,19 @@ def run_part(
     progress: Progress,
     run: Callable[..., Result] | None = None,
 ) -> Result:
-    """Run an experiment in a folder, continue it there, or read its result if it has
-    ended.
+    """Return the result of a run that is a part of another one: start it in a folder,
+    continue it, or read its result if it has ended.
 
     Args:
-        folder: of the run; a run that has begun there keeps its own settings.
-        config: settings of a run that has not begun.
+        folder: of the part; if it has begun, it goes on with its own settings.
+        config: settings for a part that has not begun.
         progress: is told how far it is.
         run: runs the experiment with settings; None for `run_experiment`.
     """
     run = run or run_experiment
     if not is_run(folder) or not (folder / CONFIG).is_file():
         return run(
+            # what lies there was left before the run began
             config.model_copy(update={"run": str(folder), "overwrite": True}),
             progress=progress,
         )
@@ -361,7 +369,9 @@ class Experiment(Generic[AnyResult]):
         return self._make_python_function()
 
     def _make_python_function(self) -> Callable[..., Any]:
-        """Create the function for Python callers from the settings."""
+        """Return the function of the experiment for Python callers, whose keywords are
+        the settings.
+        """
         # only Python callers need it
         from advsearch.api.keywords import (
             make_config,
@@ -375,6 +385,7 @@ class Experiment(Generic[AnyResult]):
         ) -> AnyResult:
             positional = dict(zip(self.positional_args, args, strict=False))
             values = {**positional, **settings}
+            # objects that settings cannot have go to the experiment's function directly
             arguments = {name: values[name] for name in own_arguments if name in values}
             config_values = {
                 name: value
@@ -398,7 +409,9 @@ class Experiment(Generic[AnyResult]):
     def _make_signature(
         self, own_arguments: Mapping[str, inspect.Parameter]
     ) -> inspect.Signature:
-        """Return the signature of the function for Python callers, without settings."""
+        """Return the signature of the function for Python callers, with `**settings`
+        for the settings.
+        """
         make = inspect.Parameter
         parameters = [
             self._make_positional_parameter(name) for name in self.positional_args
@@ -421,8 +434,8 @@ class Experiment(Generic[AnyResult]):
         return inspect.Signature(parameters, return_annotation=self.result.__name__)
 
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
-        """Return the parameters by name that Python callers may pass next to
-        settings.
+        """Return the parameters, by name, that Python callers may pass beside settings;
+        they are objects, not texts.
         """
         if not self.python_arguments:
             return {}
@@ -464,8 +477,10 @@ def experiment(
     def decorate(function: Callable[..., AnyResult]) -> Experiment[AnyResult]:
         hints = get_type_hints(function)
         first_parameter = next(iter(inspect.signature(function).parameters))
+        # RunContext[NameConfig] has the class of the settings in brackets
         (settings,) = get_args(hints[first_parameter])
         returned = hints["return"]
+        # the first of a union, or the type itself
         result = (*get_args(returned), returned)[0]
         return Experiment(function, settings, result, examples, **attributes)
 

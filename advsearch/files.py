@@ -33,9 +33,11 @@ PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
 
 
 def split_paths(name: str) -> list[str]:
-    """Return both parts of ``camera.csv+object.csv``, ``approach+object.csv`` or
-    ``camera.csv+orbit``, the path of the camera and that of the object; any other name
-    as it is.
+    """Return the two parts of the name of a pair of paths, that of the camera and that
+    of the object; any other name as one part.
+
+    Pairs are ``camera.csv+object.csv``, ``approach+object.csv`` and
+    ``camera.csv+orbit``.
     """
     first, _, second = name.partition("+")
     is_camera_path, is_object_path = (

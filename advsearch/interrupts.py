@@ -32,6 +32,9 @@ class Interrupts:
         self._last = -DUPLICATE_SECONDS
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal: count it, and raise KeyboardInterrupt unless all is over. A
+        duplicate of the signal before is ignored.
+        """
         before = self._last
         self._last = time.monotonic()
         if self._last - before < DUPLICATE_SECONDS:
@@ -58,13 +61,16 @@ INTERRUPTS = Interrupts()  # those of this process
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise an interrupt that comes inside the block, whatever was made of it, once:
-    what follows the block handles it. Raises KeyboardInterrupt where one waits at the
-    end of the block, and in place of any error inside it.
+    """Inside the block, make sure that an interrupt ends it, even if some code has
+    swallowed it; the caller handles it.
+
+    Raises:
+        KeyboardInterrupt: one came inside the block, or waits at its end. It replaces
+            any error, which may have come of it.
     """
     handler = signal.getsignal(signal.SIGINT)
     in_main = threading.current_thread() is threading.main_thread()
-    # where Python's own would raise them: in a notebook
+    # in a notebook Python's own handler is in place: ours takes over, to count
     counted = in_main and handler is signal.default_int_handler
     if counted:
         INTERRUPTS.handled = INTERRUPTS.count
@@ -86,12 +92,15 @@ def interruptible() -> Iterator[None]:
 
 
 def end_at_the_second() -> None:
-    """Let a second Ctrl-C end this process at once, wherever it is: a thread hears of
-    it, also while native code runs. What is stored is kept, as with a kill. Call it in
-    the main thread, once.
+    """Let a second Ctrl-C end this process at once, wherever it is, also in native
+    code.
+
+    A thread hears of the signals. What is stored is kept, as when the process is
+    killed. Call it in the main thread, once.
     """
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
+    # Python's signal handler in C writes the number of each signal there at once
     signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     # `theirs` must live as long as the thread
     threading.Thread(
@@ -100,12 +109,20 @@ def end_at_the_second() -> None:
 
 
 def _hear(ours: socket.socket, theirs: socket.socket) -> None:
+    """End the process at the second Ctrl-C; the body of a thread that waits for
+    signals.
+
+    Args:
+        ours: from which the numbers of signals are read.
+        theirs: the other end, to which they are written; it is only kept open here.
+    """
     first: float | None = None
     while True:
         if signal.SIGINT not in ours.recv(64):
             continue
         now = time.monotonic()
         if (
+            # one Ctrl-C may come as two signals in a short time
             first is not None
             and now - first >= DUPLICATE_SECONDS
             and not INTERRUPTS.ended

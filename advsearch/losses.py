@@ -176,6 +176,7 @@ def check_direction(objective: object, *, targeted: bool) -> None:
             "losses.targeted_cross_entropy, or negate it: lambda logits, labels: "
             "-loss(logits, labels)"
         )
+    # each loss of this module, and its counterpart for a target
     for name in __all__:
         if f"targeted_{name}" not in __all__:
             continue
@@ -195,8 +196,10 @@ def check_direction(objective: object, *, targeted: bool) -> None:
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
-    """Return a loss (N,) of logits (N, C) and their labels, of which one may serve
-    all.
+    """Return a loss (N,) of logits (N, C) for their labels.
+
+    Labels are (N,) or (1,) int64, one for each row or for all; or the indices of a
+    label set, any of which counts, for all rows.
     """
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(

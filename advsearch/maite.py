@@ -47,6 +47,9 @@ class _MaiteNetwork(nn.Module):
             model.eval()
 
     def forward(self, images: Tensor) -> Any:
+        """Return what the model says of images (N, 3, H, W): scores (N, classes), or
+        for detection a mapping of tensors for each image.
+        """
         targets = list(self.model(list(images)))
         if len(targets) != len(images):
             raise InputError(
@@ -59,7 +62,7 @@ class _MaiteNetwork(nn.Module):
 
 
 def _to_detections(target: Any) -> dict[str, Tensor]:
-    """Convert an `ObjectDetectionTarget` to boxes, labels and scores."""
+    """Convert an `ObjectDetectionTarget` to boxes (n, 4), labels (n,) and scores (n,)."""
     scores = torch.as_tensor(target.scores).float()
     if scores.ndim == 2:  # of every class; `labels` has the likeliest
         n_classes = scores.shape[1]
@@ -167,6 +170,12 @@ class Scenes:
         spp: int = 64,
         seed: int = 0,
     ) -> None:
+        """Draw `count` configurations of the controls; arguments are those of the
+        class.
+
+        Raises:
+            InputError: there is no such task, or no image is asked for.
+        """
         if task not in ("classification", "detection"):
             raise InputError(
                 "task: expected classification or detection, which MAITE "
@@ -200,7 +209,14 @@ class Scenes:
     def __getitem__(
         self, number: int
     ) -> tuple[Tensor, Tensor | Detections, dict[str, Any]]:
-        # Raises IndexError, which ends a loop.
+        """Render the image of a configuration by its number, as MAITE's data sets
+        return it.
+
+        Returns:
+            The image (3, H, W) in [0, 1], its target, and its id with the values of the
+            parameters.
+        """
+        # a range raises IndexError, which ends a loop over the images
         index = range(len(self))[number]
         u = self.configurations[index]
         with torch.no_grad():
@@ -213,7 +229,11 @@ class Scenes:
         return image.permute(2, 0, 1).contiguous(), self._make_target(u), metadata
 
     def _make_target(self, u: Tensor) -> Tensor | Detections:
-        """Return the target of a configuration (d,)."""
+        """Return the target of a configuration (d,): a one-hot vector of the right
+        class, or the boxes and classes of the visible things.
+
+        Things whose names are no labels are left out.
+        """
         right_class = self.right.indices[0]
         if self.task == "classification":
             one_hot = nn.functional.one_hot(torch.tensor(right_class), len(self.labels))

@@ -26,10 +26,11 @@ TASK_SEPARATOR = (
 
 
 def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
-    """Group Mitsuba's keys: return controls with ``{"mitsuba:KEY": RANGE}`` as
-    ``{"mitsuba": {KEY: RANGE}}``.
+    """Return controls with all keys of Mitsuba in one: ``{"mitsuba:KEY": RANGE}``
+    becomes ``{"mitsuba": {KEY: RANGE}}``.
 
-    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``.
+    A range of a single parameter becomes one of a control: ``{"pose.yaw": RANGE}``
+    becomes ``{"pose.yaw": {"yaw": RANGE}}``.
 
     Raises:
         InputError: a key has no range, or two.
@@ -59,8 +60,8 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
 
 
 def _with_parameter(name: str, options: object) -> object:
-    """Return the options of a control; a range of "pose.yaw" is that of its parameter
-    "yaw".
+    """Return the options of a control; a range for the control "pose.yaw" becomes one
+    of the parameter "yaw".
     """
     _, dot, parameter = name.partition(".")
     if not dot or ":" in name or options is None:
@@ -133,15 +134,16 @@ def list_declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
 def check_options(
     what: str, name: str, kind: type[Any], options: Mapping[str, object]
 ) -> None:
-    """Check that a dataclass has such options, and that their values have its types.
+    """Check that a dataclass has options of these names, and that the values are of
+    their types.
 
-    The class checks ranges itself.
+    Ranges are checked by the class itself.
 
     Args:
-        what: "policy", say, for messages.
+        what: kind of what has the options, such as "policy", for messages.
         name: of the policy.
         kind: the dataclass.
-        options: by name.
+        options: values by name.
 
     Raises:
         UnknownNameError: there is no such option.
@@ -182,7 +184,7 @@ def get_option_default(option: Field[Any]) -> Any:
 
 
 def _to_json(value: object) -> JsonValue:
-    """Return a value as a JSON value; None if it, or a part of it, is none."""
+    """Return a value as a JSON value; None if it, or a part of it, has no such form."""
     if isinstance(value, Mapping):
         mapping = {
             name: _to_json(inner)
@@ -201,10 +203,10 @@ def _to_json(value: object) -> JsonValue:
 
 
 def to_setting(entry: Any) -> str | dict[str, JsonValue]:
-    """Return a policy or a task as a setting in a file: its name, with the options that
-    differ from their defaults.
+    """Return a policy or a task as a setting in a file: its name, with those options
+    that differ from their defaults.
 
-    Options that are no JSON values are left out.
+    Options that have no JSON form are left out.
     """
     name = str(entry.name)
     options = {}

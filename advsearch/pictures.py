@@ -34,8 +34,8 @@ MAX_SCANS = 64
 
 @contextlib.contextmanager
 def without_pillows_limit() -> Iterator[None]:
-    """Let Pillow open, but not decode, pictures of any size: what is decoded is up to
-    `check_pixels`.
+    """Inside the block, let Pillow open pictures of any size; before one is decoded,
+    `check_pixels` refuses what is too large.
     """
     pixel_limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
@@ -48,8 +48,16 @@ def without_pillows_limit() -> Iterator[None]:
 def check_pixels(
     path: Path | str, width: int, height: int, limit: int = MAX_PIXELS
 ) -> None:
-    """Refuse a picture with too many pixels before it is decoded. Raises
-    FileFormatError where it has more than `limit`, before `scale_limit`.
+    """Check that a picture has not too many pixels, before it is decoded.
+
+    Args:
+        path: of its file, for errors.
+        width: in pixels.
+        height: in pixels.
+        limit: how many pixels it may have, before `scale_limit`.
+
+    Raises:
+        FileFormatError: it has more.
     """
     if width * height > scale_limit(limit):
         expected = f"a picture of at most {scale_limit(limit):,} pixels"
@@ -57,8 +65,11 @@ def check_pixels(
 
 
 def check_decodable(image: Image.Image, path: Path | str) -> None:
-    """Refuse an opened picture that takes too much to decode. Raises FileFormatError
-    for too many pixels or scans, or a format that is not one of `FORMATS`.
+    """Check that an opened picture can be decoded without too much time and memory.
+
+    Raises:
+        FileFormatError: it has too many pixels or scans, or is of no format in
+            `FORMATS`.
     """
     check_pixels(path, *image.size)
     # an MPO is a JPEG with a second picture
@@ -78,8 +89,10 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
 @contextlib.contextmanager
 def open_image(path: Path, limit: int) -> Iterator[Image.Image]:
     """Open a picture file of at most `limit` bytes for the block, which may decode it.
-    Raises FileFormatError: it is missing, no ordinary file, no picture, too large or
-    damaged.
+
+    Raises:
+        FileFormatError: it is missing, no ordinary file, no picture, too large or
+            damaged; also where decoding it in the block shows this.
     """
     try:
         data = stored_files.read_bytes(path, "a picture file such as PNG", limit)
@@ -101,16 +114,24 @@ def encode_levels(levels: npt.NDArray[np.uint8]) -> bytes:
 
 
 def load_upright(path: Path, side: int) -> npt.NDArray[np.float32]:
-    """Read a picture as a viewer shows it, averaged down where it is larger than a
-    longest side: (H, W, 3) float32 display-referred values in [0, 1], row 0 on top;
-    what is transparent is as if it were not. Raises FileFormatError: as for `open_image`
-    and `check_decodable`.
+    """Read a picture as a viewer shows it, made smaller where its longest side has more
+    than `side` pixels.
+
+    Transparency is ignored.
+
+    Returns:
+        (H, W, 3) float32, display-referred in [0, 1], row 0 on top.
+
+    Raises:
+        FileFormatError: as for `open_image` and `check_decodable`.
     """
     with open_image(path, MAX_FILE_BYTES) as image:
         check_decodable(image, path)
+        # turned as the camera's note in the file says
         rotated = ImageOps.exif_transpose(image)
         reduced = Image.fromarray(to_8bit_levels(rotated, alpha=False))
         if max(reduced.size) > side:
+            # BOX averages the pixels
             reduced.thumbnail((side, side), Image.Resampling.BOX)
         values: npt.NDArray[np.float32] = np.asarray(reduced, np.float32) / np.float32(
             255.0
@@ -119,8 +140,8 @@ def load_upright(path: Path, side: int) -> npt.NDArray[np.float32]:
 
 
 def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
-    """Return the (H, W, 3) colours of a decoded picture in 8 bits; with alpha, (H, W,
-    4).
+    """Return the colours of a decoded picture in 8 bits, (H, W, 3); with alpha (H, W,
+    4), opaque where the picture has none.
     """
     if image.mode == "F" or image.mode.startswith("I"):  # grey in floats or 16 bits
         grey = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(
@@ -129,22 +150,28 @@ def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
         steps: npt.NDArray[np.uint8] = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(
             np.uint8
         )
+        # grey as three equal channels
         steps = steps[:, :, None].repeat(3, axis=2)
     else:
         steps = np.asarray(
             image.convert("RGBA" if alpha or "transparency" in image.info else "RGB")
         )
+    # opaque
     if alpha and steps.shape[2] == 3:
         steps = np.concatenate([steps, np.full_like(steps[:, :, :1], 255)], axis=2)
     return steps if alpha else steps[:, :, :3]
 
 
 def _count_scans(image: Image.Image) -> int:
+    """Return how many scans the file of a JPEG has; each may take as long as a whole
+    picture. The position in the file is kept.
+    """
     file = getattr(image, "fp", None)
     if file is None:
         return 0
     position = file.tell()
     file.seek(0)
+    # the marker with which each scan begins
     count = int(file.read().count(b"\xff\xda"))
     file.seek(position)
     return count

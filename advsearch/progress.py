@@ -76,8 +76,14 @@ class Stages:
         hint: str = "",
         at_most: bool = False,
     ) -> None:
-        """End the stage before and begin another; a `name` that comes twice adds up.
-        The rest: `Progress.stage`.
+        """End the current stage, and begin another.
+
+        Args:
+            name: under which its seconds are counted; those of one name add up.
+            title: what the user reads; this and the rest as for `Progress.stage`.
+            total: see there.
+            hint: see there.
+            at_most: see there.
         """
         self.end()
         self._name = name
@@ -128,9 +134,15 @@ so far that they are at least.
 def open_progress(
     requested: ProgressOption, written: Callable[[str], str] = str
 ) -> AbstractContextManager[Progress]:
-    """Return the progress that a call asked for, see `ProgressOption`, for a `with` block.
-    `written` writes the settings that a text names as whoever reads it does. Raises
-    InputError where something else was asked for.
+    """Return the progress that a call asked for, to be used in a `with` block.
+
+    Args:
+        requested: see `ProgressOption`.
+        written: turns a text that names settings into how the reader writes them, such
+            as flags.
+
+    Raises:
+        InputError: something else was asked for.
     """
     stream = sys.stderr
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
@@ -143,7 +155,7 @@ def open_progress(
     if requested and getattr(shell, "kernel", None) is not None:  # a notebook asks
         return NotebookProgress(written)
     if requested is not False and stream is not None and stream.isatty():
-        # behind a screen, which escapes all
+        # the stream of the terminal itself, since a `Screen` would escape the bars
         return BarProgress(getattr(stream, "stream", stream), written)
     return (
         LineProgress(stream, written)
@@ -175,7 +187,9 @@ class LineProgress:
         written: Callable[[str], str] = str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Write lines to `stream`; `written` formats names of controls in them."""
+        """Write lines to `stream`; `written` turns settings that texts name into how
+        the reader writes them.
+        """
         self._stream = stream
         self._format_names = written
         self._clock = clock
@@ -198,6 +212,7 @@ class LineProgress:
         hint: str = "",
         at_most: bool = False,
     ) -> None:
+        """See `Progress.stage`."""
         with self._lock:
             self._name = name
             self._total = total
@@ -219,7 +234,11 @@ class LineProgress:
             self._print(self._format_names(text))
 
     def tick(self) -> None:
-        """Print a line if it is time for one."""
+        """Print a line if it is time for one.
+
+        A stage is announced when it has lasted a while; later lines come the more
+        rarely the longer it lasts.
+        """
         with self._lock:
             now = self._clock()
             if self._printed is None:
@@ -256,6 +275,8 @@ class LineProgress:
         print(f"advsearch: {text}", file=self._stream, flush=True)
 
     def __enter__(self) -> LineProgress:
+        """Start the thread that prints lines from time to time."""
+
         def call() -> None:
             while not self._ended.wait(1.0):
                 self.tick()
@@ -302,6 +323,9 @@ class BarProgress:
     """
 
     def __init__(self, terminal: IO[str], written: Callable[[str], str] = str) -> None:
+        """Show bars in a terminal; `written` turns settings that texts name into how
+        the reader writes them.
+        """
         # late, so that --help answers at once
         from rich import progress as bars
         from rich.console import Console
@@ -332,6 +356,7 @@ class BarProgress:
         at_most: bool = False,
     ) -> None:
         """Begin a stage: the bar before is full now, and only the newest ones stay visible."""
+        # the last one, if there is any
         for task in self.bars.tasks[-1:]:
             self.bars.update(
                 task.id, total=max(task.completed, 1), completed=max(task.completed, 1)

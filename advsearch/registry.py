@@ -53,6 +53,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """
         if not self.names_class(name):
             if name not in self.built_ins:
+                # of another package
                 return self._load(name)
             built_in = self.built_ins[name]
             if not isinstance(built_in, BuiltIn):
@@ -73,8 +74,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return entry
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is an entry. It is imported only if its name is that of a
-        class.
+        """Return whether there is an entry. Only a class that is named by its module is
+        imported for it.
         """
         if not isinstance(name, str):
             return False
@@ -110,8 +111,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return usable
 
     def names_class(self, name: str) -> bool:
-        """Whether a name is that of a class to import, and not of an instance of a
-        registered entry ("light:Key").
+        """Return whether a name is that of a class to import ("package.module:Class"),
+        and not that of an instance of an entry ("light:Key").
         """
         module, _, attribute = name.partition(":")
         is_class_name = attribute[:1].isupper() and attribute.isidentifier()
@@ -126,8 +127,10 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return {point.name: point for point in entry_points(group=self.group)}
 
     def _load(self, name: str) -> Entry:
-        """Import what an entry point names. Raises InputError: it can't be imported, or
-        is something else.
+        """Import what an entry point of another package names.
+
+        Raises:
+            InputError: it can't be imported, or is something else than expected.
         """
         point = self._installed[name]
         where = f"entry point {name} = {point.value} of group {self.group}"
@@ -196,8 +199,8 @@ def get_experiment(name: str) -> Any:
 
 
 def get_experiment_help(name: str) -> str:
-    """Return a line about an experiment: of the catalog, or the first line of the
-    docstring of an installed one.
+    """Return a line about an experiment: that of the catalog, or for an installed one
+    the first line of its docstring.
     """
     built_in = EXPERIMENTS.built_ins.get(name)
     if isinstance(built_in, BuiltIn):

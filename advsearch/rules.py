@@ -84,12 +84,13 @@ IntArray = npt.NDArray[np.int64]
 
 
 def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
-    """Return the rows of a sweep as a table of some parameters.
+    """Return the rows of a sweep as a table: factors, whether the model was right, and
+    units.
 
     Args:
-        rows: of a sweep (`runs.tables.sweep_frame`); a prediction that was not judged
-            is not right.
-        names: of parameters; the table has those that vary and that all rows have.
+        rows: of a sweep (`runs.tables.make_sweep_frame`); a prediction that was not
+            judged counts as not right.
+        names: of parameters; those that vary, and that all rows have, become factors.
     """
     columns = dict[str, pd.Series]()
     units = dict[str, str]()
@@ -97,6 +98,7 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
         column = rows[name]
         has_names = column.dtype == "category"
         if has_names:
+            # in alphabetical order, whatever order the rows came in
             column = column.cat.set_categories(sorted(column.unique()))
         if column.nunique() > 1 and not column.isna().any():
             columns[name] = column
@@ -116,8 +118,8 @@ def is_in_view(rows: pd.DataFrame) -> Mask:
 
 
 def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
-    """Count the outcomes of the rows that are not right, by name; None where rows have
-    no outcomes.
+    """Return how often each outcome came about among rows that are not right, by name;
+    None where rows have no outcomes.
     """
     if "outcome" not in rows:
         return None
@@ -152,12 +154,12 @@ def count_per_unit(table: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
 
 
 def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table in which units with a configuration in common are one unit: it is
-    the same draw, come twice.
+    """Return a table in which units that share a configuration are one unit, since it
+    is the same draw that was made twice.
 
     This is done only where two draws are never the same by chance: where some factor is
-    a number with at least half as many values as there are rows. Values of a grid, and
-    names, come again in independent draws too.
+    a number with at least half as many values as there are rows. Values of a grid and
+    names come again in independent draws, too.
     """
     factors = list(table.attrs["units"])
     is_continuous = any(
@@ -166,6 +168,7 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
     )
     if not is_continuous:
         return table
+    # the same number for rows with the same values of all factors
     configuration = (
         table.groupby(factors, sort=False, observed=True).ngroup().to_numpy()
     )
@@ -179,13 +182,18 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def find_connected(first: IntArray, second: IntArray) -> IntArray:
-    """Return the group (n,) of each row: rows with the same number (n,) from 0 of
-    either kind are in one group.
+    """Return the group (n,) of each row, where rows are in one group if they have the
+    same `first` or the same `second` number, or are linked by other rows.
+
+    Both are (n,) with numbers from 0. The groups are numbered by the lowest number in
+    them.
     """
     group = first
     while True:
         linked = group
         for number in (second, first):
+            # the lowest group of all rows with this number; repeated until nothing
+            # changes
             lowest = np.full(int(number.max()) + 1, len(group))
             np.minimum.at(lowest, number, linked)
             linked = lowest[number]
@@ -197,8 +205,8 @@ def find_connected(first: IntArray, second: IntArray) -> IntArray:
 def split_in_halves(
     table: pd.DataFrame, seed: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return two halves of the units, drawn by a seed: one to choose on and one to
-    count on.
+    """Return two halves of a table, whose units are drawn by a seed: rules are chosen
+    on the first and counted on the second.
     """
     table = merge_repeats(table)
     units, unit_index = np.unique(table["unit"], return_inverse=True)
@@ -241,14 +249,17 @@ class RuleCondition:
             values = values % self.turn
         is_over = values > self.low
         is_at_most = values <= self.high
+        # the part goes through 0
         if self.turn and self.low > self.high:
             return np.asarray(is_over | is_at_most)
         return np.asarray(is_over & is_at_most)
 
     @property
     def arcs(self) -> tuple[tuple[float, float], ...]:
-        """Where it holds of an angle, from and to in degrees, each once in a turn of
-        360; none without a `turn`.
+        """The arcs of a full turn in which it holds, (begin, end) in degrees; none for
+        what is no angle.
+
+        With a `turn` of 180 there are two arcs, opposite each other.
         """
         if not self.turn:
             return ()
@@ -336,19 +347,22 @@ class CountedRule:
         return self.gap >= MIN_GAP and self.p_value <= SIGNIFICANCE
 
     def find_needed_factor(self) -> float | None:
-        """Return how many times as many rows, of the same shares, would show it; None
-        where no number would.
+        """Return how many times as many rows, with the same shares of right ones, would
+        show the rule; None where no number up to `MAX_NEEDED` would.
         """
         factor = 1.0
         n_rows = len(self.inside) + len(self.elsewhere)
         while self.gap >= MIN_GAP and n_rows * factor <= MAX_NEEDED:
             if self._compute_p_value(factor) <= SIGNIFICANCE:
                 return factor
+            # tried in steps of 5 %
             factor *= 1.05
         return None
 
     def _compute_p_value(self, factor: float) -> float:
-        """Return the probability with so many times as many rows."""
+        """Return the p-value of the rule if there were `factor` times as many rows with
+        the same shares.
+        """
         units = np.concatenate([self.inside["unit"], self.elsewhere["unit"]])
         is_right = np.concatenate([self.inside["correct"], self.elsewhere["correct"]])
         is_inside = np.arange(len(units)) < len(self.inside)
@@ -375,8 +389,15 @@ class FoundRules:
 
 
 def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> FoundRules:
-    """Find rules under which the model is wrong more often, chosen on some rows and
-    counted on others.
+    """Find rules under which the model is wrong more often.
+
+    Each rule is chosen on some rows and tested on others; the rows that it covers are
+    left out for the next. The search ends at the first rule that does not hold.
+
+    Args:
+        choosing: rows to choose rules on.
+        counting: rows to test rules on.
+        seed: of the trees.
 
     Raises:
         InputError: scikit-learn is missing.
@@ -392,6 +413,7 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
             return FoundRules(accepted, rule)
         accepted.append(rule)
         choosing = choosing[~find_covered(conditions, choosing)]
+        # without the rows of this rule, in both halves
         counting = rule.elsewhere
     return FoundRules(accepted, None)
 
@@ -400,10 +422,10 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
 
 
 def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
-    """Find the conditions of the largest weighted relative accuracy, and leave out what
-    adds little to it.
+    """Return the conditions with the largest weighted relative accuracy, without those
+    that add little to it.
 
-    There are none where no condition is worth anything.
+    There are none where too few rows are left, or no conditions are better than chance.
     """
     n_wrong = int((~table["correct"].to_numpy()).sum())
     min_rows = find_min_rows(table)
@@ -417,7 +439,11 @@ def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
 
 
 def find_min_rows(table: pd.DataFrame) -> int:
-    """Return how many rows a rule has to cover."""
+    """Return how many rows a rule has to cover at least.
+
+    Rows of one unit are not independent: where units have several rows, it is at least
+    what some units have on average.
+    """
     min_rows = max(MIN_COVERED_ROWS, round(MIN_COVERED_SHARE * len(table)))
     if not table["unit"].is_unique:
         min_rows = max(
@@ -458,6 +484,7 @@ def shorten_conditions(
             for index in range(len(conditions))
         ]
         shorter = max(candidates, key=scorer.score)
+        # rows that the shorter conditions cover in addition
         n_added = int(
             (find_covered(shorter, table) & ~find_covered(conditions, table)).sum()
         )
@@ -473,8 +500,8 @@ def shorten_conditions(
 def adjust_bounds(
     conditions: RuleConditions, scorer: ConditionScorer
 ) -> RuleConditions:
-    """Move the bounds of conditions to where their score is largest, one condition at a
-    time.
+    """Move the bounds of conditions to where their score is largest, one bound at a
+    time, and all of them several times over.
     """
     for _ in range(N_ADJUSTMENTS):
         for index in range(len(conditions)):
@@ -482,6 +509,7 @@ def adjust_bounds(
                 (*conditions[:index], condition, *conditions[index + 1 :])
                 for condition in list_adjusted(conditions[index], scorer.table)
             ]
+            # the first of equals: they change only for a better score
             conditions = max([conditions, *adjusted], key=scorer.score)
     return conditions
 
@@ -489,18 +517,22 @@ def adjust_bounds(
 def list_adjusted(
     condition: RuleCondition, table: pd.DataFrame
 ) -> Iterator[RuleCondition]:
-    """Yield a condition with its bounds elsewhere: nodes of trees lie where the nodes
-    above them left them.
+    """Yield a condition with one of its bounds moved to other quantiles of the values.
+
+    Trees choose each bound below others; once these have moved, another one may be
+    better.
     """
     if condition.options is not None:
         return
     values = table[condition.factor].to_numpy()
     if condition.turn:
         values = values % condition.turn
+    # without the smallest and the largest value, which bound nothing
     quantiles = np.quantile(values, np.linspace(0, 1, N_BOUNDS + 1)[1:-1])
     for bound in dict.fromkeys(float(f"{quantile:.3g}") for quantile in quantiles):
         if bound in (condition.low, condition.high):
             continue
+        # a bound that is infinite stays so; of an angle, low may be over high
         if condition.low > -np.inf and (condition.turn or bound < condition.high):
             yield replace(condition, low=bound)
         if condition.high < np.inf and (condition.turn or bound > condition.low):
@@ -524,7 +556,9 @@ class TreeColumn(NamedTuple):
     zero: float = 0.0
 
     def read_values(self, table: pd.DataFrame) -> FloatArray:
-        """Return the column's values (n,)."""
+        """Return the values (n,) of the column: 1 where the factor has the name, else
+        the number, for an angle measured from `zero`.
+        """
         column = table[self.full_condition.factor]
         if self.name is not None:
             return np.asarray(column == self.name, np.float64)
@@ -534,19 +568,23 @@ class TreeColumn(NamedTuple):
         return values
 
     def to_factor(self, condition: RuleCondition) -> RuleCondition:
-        """Return a condition on the column as one on the factor."""
+        """Return a condition on the column as one on the factor: the bounds of an angle
+        are turned back by `zero`.
+        """
         turn = self.full_condition.turn
         if not turn:
             return condition
         low = max(condition.low, 0.0) + self.zero
         high = min(condition.high, turn) + self.zero
+        # an arc that ends at 0 ends at the full turn
         return replace(condition, low=low % turn, high=high % turn or turn)
 
 
 def find_candidates(
     table: pd.DataFrame, min_rows: int, seed: int
 ) -> Iterator[RuleConditions]:
-    """Yield the conditions of all nodes of trees, each once."""
+    """Yield the conditions that lead to the nodes of trees, each once."""
+    # the root has no conditions, and is left out
     yielded_conditions: set[RuleConditions] = {()}
     for tree, columns in grow_trees(table, min_rows, seed):
         for node in walk_tree(tree, columns):
@@ -557,8 +595,8 @@ def find_candidates(
                 conditions_of_factor[condition.factor].append(
                     column.to_factor(condition)
                 )
-            # of several parts of one angle, each in turn: their bounds are adjusted
-            # later
+            # a node may have conditions on several columns of one angle; a rule takes
+            # one of them, so each is tried, and its bounds are adjusted later
             for conditions in product(*filter(None, conditions_of_factor.values())):
                 if conditions not in yielded_conditions:
                     yielded_conditions.add(conditions)
@@ -566,7 +604,12 @@ def find_candidates(
 
 
 def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
-    """Return the columns that trees have of the factors of a table."""
+    """Return the columns of data for trees: one for each number and for each name of a
+    factor.
+
+    An angle that goes all the way round has further columns, each measured from another
+    zero (`ARCS`).
+    """
     columns = []
     for factor, unit in table.attrs["units"].items():
         values = table[factor]
@@ -588,8 +631,11 @@ def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
 def grow_trees(
     table: pd.DataFrame, min_rows: int, seed: int
 ) -> list[tuple[Any, list[TreeColumn]]]:
-    """Return trees of scikit-learn that predict whether the model is right, and the
-    columns of each.
+    """Return trees of scikit-learn that predict whether the model is right, each with
+    the columns of its data.
+
+    They are one tree of all columns, those of a random forest, and one for each further
+    column of an angle alone.
     """
     make_tree = import_library("sklearn.tree").DecisionTreeClassifier
     make_forest = import_library("sklearn.ensemble").RandomForestClassifier
@@ -617,13 +663,22 @@ def grow_trees(
 def walk_tree(
     tree: Any, columns: list[TreeColumn]
 ) -> Iterator[dict[TreeColumn, RuleCondition]]:
-    """Yield the conditions of each node of a tree, by column without a name."""
+    """Yield the conditions that lead to each node of a tree.
+
+    They are kept by column without its name, so that the names of one factor have one
+    condition.
+
+    Args:
+        tree: `tree_` of scikit-learn.
+        columns: of its data, by index.
+    """
     open_nodes: list[tuple[int, dict[TreeColumn, RuleCondition]]] = [(0, {})]
     while open_nodes:
         node, conditions = open_nodes.pop()
         yield conditions
         left = int(tree.children_left[node])
         right = int(tree.children_right[node])
+        # a leaf: both are -1
         if left == right:
             continue
         column = columns[tree.feature[node]]
@@ -634,6 +689,7 @@ def walk_tree(
             below = replace(condition, high=min(condition.high, threshold))
             above = replace(condition, low=max(condition.low, threshold))
         else:
+            # column 0 is below the threshold: another name; 1 is above: this name
             below = replace(condition, options=condition.options - {column.name})
             above = replace(condition, options=condition.options & {column.name})
         open_nodes.append((left, {**conditions, key: below}))
@@ -641,8 +697,10 @@ def walk_tree(
 
 
 def import_library(name: str) -> Any:
-    """Return a module of scikit-learn, such as ``sklearn.tree``. Raises InputError: it
-    is missing.
+    """Return a module of scikit-learn, such as ``sklearn.tree``.
+
+    Raises:
+        InputError: it is missing.
     """
     try:
         return importlib.import_module(name)

@@ -220,8 +220,15 @@ def _assert_claim(
 def _name_objects(
     object: str | Path | workbench.Scene, settings: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[tuple[str, str], Any]]:
-    """Return settings in which names stand for the scene and for controls, and these
-    objects by role and name.
+    """Return settings in which names stand for the objects among them, and the objects.
+
+    Args:
+        object: the scene, or the name of its object.
+        settings: may have controls that are objects.
+
+    Returns:
+        The settings; and the scene and controls by (role, name), as
+        `Config.with_python_objects` takes them.
     """
     # heavy, and pytest imports this module before it collects
     from advsearch.extend import workbench

@@ -37,9 +37,12 @@ _chosen: int | None = None
 
 
 def count_cores(quota: Path = _CPU_MAX) -> int:
-    """The number of cores this process may use: those it is pinned to, and no more than
-    a container's quota allows. The file has the quota and its period in microseconds
-    (control groups, version 2).
+    """Return how many cores this process may use: those that it is pinned to, but no
+    more than a container's quota allows.
+
+    Args:
+        quota: the file with quota and period in microseconds (control groups, version
+            2).
     """
     allowed = (
         len(os.sched_getaffinity(0))
@@ -55,8 +58,8 @@ def count_cores(quota: Path = _CPU_MAX) -> int:
 
 
 def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
-    """Return the processor's name; what the system says where Linux's description has
-    none.
+    """Return the name of the processor, from Linux's description of it or else from
+    Python.
     """
     try:
         for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -74,11 +77,19 @@ MAX_THREADS_PER_CORE = 4
 
 
 def configure(threads: int | None = None, *, rendering: bool = True) -> int:
-    """Give Dr.Jit a number of threads and torch half as many, or all where nothing is
-    rendered, now and (Dr.Jit) when Mitsuba is imported later; return the number that
-    Dr.Jit gets. At most `MAX_THREADS_PER_CORE` for each core are taken. None means what
-    ``OMP_NUM_THREADS`` said when this module was imported, and without it every core
-    that this process may use. Raises InputError: fewer than one thread was asked for.
+    """Set the threads of Dr.Jit and torch, and return how many Dr.Jit gets.
+
+    Torch gets half as many, or all where nothing is rendered. For a library that is not
+    imported yet they are set when it is.
+
+    Args:
+        threads: for Dr.Jit, `MAX_THREADS_PER_CORE` for each core at most; None for what
+            OMP_NUM_THREADS said when this module was imported, and without it all cores
+            of this process.
+        rendering: something is rendered.
+
+    Raises:
+        InputError: fewer than one thread was asked for.
     """
     global _chosen
     if threads is not None and threads < 1:
@@ -101,7 +112,7 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
 
 @contextmanager
 def restore_threads() -> Iterator[None]:
-    """Let torch and Dr.Jit have after the block the threads that they had before it,
+    """After the block, give torch and Dr.Jit the threads that they had before it,
     whatever is configured inside.
     """
     global _chosen
@@ -115,17 +126,19 @@ def restore_threads() -> Iterator[None]:
     finally:
         _chosen = chosen
         if "torch" in sys.modules:
+            # the default if it was imported inside the block
             sys.modules["torch"].set_num_threads(for_torch or _get_default())
         if drjit is not None and drjit.thread_count() != for_drjit:
             drjit.set_thread_count(for_drjit)
+        # imported inside the block
         elif "drjit" in sys.modules and drjit is None:
             apply_to_drjit()
 
 
 @contextmanager
 def all_for_torch() -> Iterator[None]:
-    """Give torch every thread inside the `with`, in which nothing is rendered: a
-    training takes half of the time.
+    """Inside the block, in which nothing is rendered, give torch all threads: training
+    takes half the time.
     """
     configure(_chosen, rendering=False)
     try:
@@ -135,8 +148,8 @@ def all_for_torch() -> Iterator[None]:
 
 
 def apply_to_drjit() -> None:
-    """Set the size of Dr.Jit's pool to what `configure` chose, or to every core. Called
-    after Mitsuba was imported.
+    """Set the threads of Dr.Jit, which is imported, to what `configure` chose, or else
+    to every core.
     """
     drjit = sys.modules["drjit"]
     wanted = _chosen if _chosen is not None else _get_default()

@@ -61,12 +61,12 @@ MAX_DARK_BRIGHTNESS = 0.35
 
 
 def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
-    """Draw the chart on the center of a page, for `write_sheets`.
+    """Draw the colour chart on a page, centered from left to right, for `write_sheets`.
 
     Args:
         title: of the run.
         paper: (width, height) of the page in millimetres.
-        convert: a color transform of PIL; None for none.
+        convert: the colour transform of PIL to the printer's profile; None for none.
     """
     figure, axes = make_blank_page(paper)
     left = (paper[0] - CHART_SIZE[0]) / 2.0
@@ -80,6 +80,7 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
             )
         )
 
+    # an image of one row, since PIL converts images only
     colors = Image.fromarray(np.round(255.0 * CHART_COLORS[None]).astype(np.uint8))
     printed = colors if convert is None else ImageCms.applyTransform(colors, convert)
     levels = np.asarray(printed)[0] / 255.0
@@ -119,7 +120,9 @@ def measured_palette(photograph: str | Path) -> Tensor:
         np.float64
     )
     homography = _compute_homography(CORNER_CENTERS, _find_corners(light, photograph))
+    # points in the middle of a patch, away from its edges, in millimetres
     patch_offsets = _make_pairs(np.linspace(-0.25, 0.25, 7) * PATCH_SIZE)
+    # points in the gap between patches
     paper_offsets = _make_pairs(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH_SIZE))
     # Bare paper at the four corners between a patch and its neighbours.
     crossings = _make_pairs((-PITCH / 2.0, PITCH / 2.0))
@@ -134,6 +137,7 @@ def measured_palette(photograph: str | Path) -> Tensor:
             )
             for crossing in crossings
         ]
+        # relative to the paper around it, so that uneven light cancels out
         colors.append(patch_light / np.maximum(np.mean(paper_light, axis=0), 1e-4))
     return torch.from_numpy(linear_to_srgb(np.array(colors, np.float32)))
 
@@ -165,10 +169,13 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
     if len(squares) < 4:
         raise not_found
     x, y, area = np.array(squares).T
+    # nearest to each corner of the picture: upper left first (smallest x + y), then
+    # upper right, lower left, lower right
     outermost = [
         int(np.argmin(x_sign * x + y_sign * y))
         for y_sign, x_sign in itertools.product((1, -1), repeat=2)
     ]
+    # the four squares are of one size; the camera may see it a little askew
     areas = area[outermost]
     if len({*outermost}) < 4 or areas.max() > 3.0 * areas.min():
         raise not_found
@@ -176,8 +183,13 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
 
 
 def _find_dark_squares(light: Floats) -> list[tuple[float, float, int]]:
-    """Return center x, center y and area in pixels of all dark, filled squares."""
+    """Return center x, center y and area, in pixels, of all dark, filled squares.
+
+    Args:
+        light: (H, W, 3), linear.
+    """
     brightness = light.mean(axis=2)
+    # paper is nearly the brightest; the limit is display-referred, hence the power
     is_dark = brightness < MAX_DARK_BRIGHTNESS**2.2 * np.percentile(brightness, 95)
     labels, count = ndimage.label(is_dark)
     squares = []
@@ -206,7 +218,13 @@ def _compute_homography(points: Floats, pixels: Floats) -> Floats:
 
 
 def _sample(light: Floats, homography: Floats, points: Floats) -> Floats:
-    """Interpolate the light (N, 3) at points (N, 2) of the chart."""
+    """Return the light (N, 3) of a photograph at points of the chart.
+
+    Args:
+        light: (H, W, 3), linear.
+        homography: (3, 3), from the chart to pixels.
+        points: (N, 2), x and y in millimetres.
+    """
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     x, y, w = homography @ homogeneous.T
     coordinates = [y / w, x / w]

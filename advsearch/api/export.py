@@ -62,7 +62,8 @@ class AdversarialRun:
         folder.
 
         Raises:
-            InputError: it has none, or its scene has changed.
+            InputError: it has no adversarial scene, or the scene of the run has changed
+                since.
             FileFormatError: it has not finished, or is of another command.
         """
         folder = find_run(run)
@@ -77,6 +78,7 @@ class AdversarialRun:
         )
         # where conditions vary, those of the picture that the run keeps
         trial = summary.adversarial.trial
+        # the seed of the conditions of that trial
         draw = (
             None if trial is None else seeds.stream(problem.seed, "verification", trial)
         )
@@ -95,8 +97,8 @@ class AdversarialRun:
         return inputs, on_image
 
     def posed_object(self) -> tuple[MeshPart, Shape]:
-        """Return the object as the scene describes it, and as it is in the scene:
-        displaced, in its pose, with its texture.
+        """Return the object as the scene describes it, and its mesh as it stands in the
+        adversarial scene: displaced, in its pose, with its texture.
         """
         description = self.problem.space.scene
         assert description is not None
@@ -104,10 +106,18 @@ class AdversarialRun:
         return part, pose_mesh(part, self.inputs)
 
     def render(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render the scene with some inputs as the run does: an image (H, W, 3), sRGB
-        in [0, 1].
+        """Render the scene with some inputs as the run does.
+
+        Args:
+            inputs: of the scene and of the finished image, by name.
+            seed: of the render.
+            spp: samples per pixel.
+
+        Returns:
+            The image (H, W, 3), sRGB in [0, 1].
         """
         renderer = self.problem.renderer
+        # the renderer takes no inputs of the finished image
         traced = {
             name: value for name, value in inputs.items() if name not in IMAGE_INPUTS
         }
@@ -120,6 +130,7 @@ class AdversarialRun:
     @property
     def image_controls(self) -> list[str]:
         """The names of the controls that change the rendered image."""
+        # an image of noise: a control that changes images changes it
         grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
         slices = self.problem.space.split_by_control(self.u)
         return [
@@ -147,11 +158,13 @@ MAX_OBJECT_SIZE = 100_000.0  # maximum size of a printed object in millimetres
 
 
 def get_real_size(run: str | Path) -> float | None:
-    """Return the size of the object of a run of `attack`, its longest side in
-    millimetres; None if it is unknown.
+    """Return the length of the longest side of a run's object in millimetres; None if
+    it is unknown.
+
+    The run is one of `attack`.
     """
     folder = find_run(run)
-    load_attack_summary(folder)  # refuses others
+    load_attack_summary(folder)  # raises for runs of other commands
     metres = _load_object_scene(
         AttackConfig.from_yaml(folder / CONFIG)
     ).description.object.metres
@@ -235,6 +248,7 @@ def _make_texture_pieces(
     if materials is not None:
         faces = np.concatenate([mesh.materials[name] for name in materials])
     vertices = description.object.mesh.vertices
+    # millimetres per unit of the mesh: the longest side has `size`
     scale = size / float(np.ptp(vertices, axis=0).max())
     texture = read_png(texture_file)
     return _find_charts(control.name, texture, mesh, faces, scale)
@@ -243,7 +257,9 @@ def _make_texture_pieces(
 def _get_relative_patch_size(
     control: Control, config: AttackConfig, summary: AttackSummary
 ) -> float:
-    """Return the size of a patch relative to the object: as found, fixed or default."""
+    """Return the size of a patch as a fraction of the object's: what the search found,
+    what the settings fix, or the default.
+    """
     found = (summary.configuration or {}).get(f"{control.name}.size")
     size: Any
     if found is not None:
@@ -262,7 +278,8 @@ def _get_relative_patch_size(
 def _find_charts(
     name: str, texture: Float32Array, mesh: Mesh, faces: IntArray | None, scale: float
 ) -> Iterator[Piece]:
-    """Yield the connected parts of a texture as seen from outside, the largest first.
+    """Yield the connected parts of an unwrapped texture as pieces, seen from outside,
+    the largest first.
 
     Args:
         name: of the texture.
@@ -284,21 +301,21 @@ def _find_charts(
             continue
         texel_size, distortion = measured
         image = _extend_inside(texture[box], inside)
+        # texture coordinates that run backwards have negative areas
         is_mirrored = uv_areas[np.unique(raster.face[box][inside])].sum() < 0.0
         if is_mirrored:
             image = image[:, ::-1]
             inside = inside[:, ::-1]
         title = name if len(charts) == 1 else f"{name}, piece {number}"
+        # less is rounded to 0 %
         if distortion >= 0.005:
             title += f" (sizes within it differ by {100 * distortion:.0f} %)"
         yield _make_piece(title, image, texel_size, inside)
 
 
 def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
-    """Find the connected parts of a mask (h, w), the largest first.
-
-    Returns:
-        The bounding box of each part, and its mask inside the box.
+    """Return the connected parts of a mask (h, w), the largest first: the bounding box
+    of each (rows, columns), and its mask inside the box.
     """
     labels, count = ndimage.label(is_printed)
     boxes = ndimage.find_objects(labels)
@@ -330,8 +347,11 @@ def _measure_texel_size(
         or a point of texels, which has no area to print.
     """
     distances_by_axis = []
+    # along a row first, which gives the width
     for axis in (1, 0):
         distances = np.linalg.norm(np.diff(positions, axis=axis), axis=-1)
+        # without the first, and without the last: pairs of neighbours that both belong
+        # to the part
         both_inside = np.delete(inside, 0, axis) & np.delete(inside, -1, axis)
         distances_by_axis.append(distances[both_inside])
     if not all(len(distances) for distances in distances_by_axis):
@@ -348,7 +368,8 @@ def _measure_texel_size(
 def _make_piece(
     name: str, image: Float32Array, pixel_size: tuple[float, float], inside: Mask | None
 ) -> Piece:
-    """Return a piece to print, with fine enough pixels and a margin of bleed.
+    """Return a piece to print, with pixels divided until they are fine enough, and a
+    margin of bleed.
 
     Args:
         name: of the piece.
@@ -358,7 +379,8 @@ def _make_piece(
     """
     subdivisions = 1
     if max(pixel_size) > MAX_PIXEL_SIZE:
-        # The next odd number.
+        # rounded up to an odd number, so that the centre of a texel keeps its own
+        # colour
         odd = 2 * math.ceil((max(pixel_size) / MAX_PIXEL_SIZE - 1.0) / 2.0) + 1
         subdivisions = min(MAX_SUBDIVISIONS, odd)
     if subdivisions > 1:
@@ -369,6 +391,7 @@ def _make_piece(
     bleed_columns = math.ceil(BLEED / size[0])
     bleed_rows = math.ceil(BLEED / size[1])
     padding = ((bleed_rows, bleed_rows), (bleed_columns, bleed_columns))
+    # the edge is repeated into the bleed
     levels = np.pad(to_8bit(fine.numpy()), (*padding, (0, 0)), mode="edge")
     mask = None
     if inside is not None and not inside.all():

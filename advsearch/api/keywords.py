@@ -126,8 +126,8 @@ ConfigType = TypeVar("ConfigType", bound=Config)
 
 
 def with_settings_signature(config: type[Config]) -> Callable[[Function], Function]:
-    """Give a function that takes settings as `**settings` their signature and
-    docstring.
+    """Return a decorator for a function that takes settings as `**settings`: it gives
+    the function their signature and docstring.
 
     Every setting becomes a keyword with its declared default, and a line among the
     arguments. A setting that is a parameter of the function already stays as it is.
@@ -160,11 +160,13 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
             [*own_parameters, *added_parameters],
             return_annotation=own_signature.return_annotation,
         )
+        # what `help` shows
         signature.short = own_signature
 
         @wraps(function)
         def wrapper(*args: Any, **keywords: Any) -> Any:
             _check_call(function.__name__, signature, args, keywords)
+            # numbers of numpy and torch become Python's
             plain_keywords = {
                 key: value
                 if key in UNCONVERTED_ARGUMENTS or not is_shallow(value)
@@ -205,6 +207,12 @@ def _check_call(
 ) -> None:
     """Check the arguments of a call, and allow the code that they name.
 
+    Args:
+        name: of the function.
+        signature: with all settings.
+        args: by position.
+        keywords: by name.
+
     Raises:
         TypeError: there is no such argument, or one is missing.
         InputError: a value is of another type.
@@ -223,7 +231,12 @@ def _check_call(
 
 
 def _check_name(function_name: str, key: str, value: object) -> None:
-    """Raise InputError if a setting is an object where only its name is accepted."""
+    """Check that a setting is given by its name, for a function that takes no object
+    there.
+
+    Raises:
+        InputError: it is an object.
+    """
     if not isinstance(value, (str, Mapping, type(None))):
         raise InputError(
             f"{key}: expected a name for {function_name}, got "
@@ -274,6 +287,7 @@ def make_hint(field: str, kind: Any) -> str:
     if optional:
         types = [optional[1], "None"]
     else:
+        # at each | that is not in brackets
         types = re.split(r" \| (?![^\[]*\])", text)
     string_hint = "Path | Names" if field in PYTHON_LIST_SETTINGS else "str | Path"
     hints = []
@@ -314,11 +328,12 @@ def _make_docstring(
 
 
 def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
-    """Create a configuration from settings as Python callers pass them; None counts as
+    """Return a configuration from settings as Python callers pass them; None counts as
     not passed.
 
-    A scene, a model and controls may be objects: the settings name them, hold them
-    (`Config.python_object`), and know which of them exist only in this session.
+    A scene, a model and controls may be objects. Then the settings have their names,
+    and the configuration holds the objects (`Config.python_object`) and notes which of
+    them exist in this session only.
     """
     settings = {name: value for name, value in keywords.items() if value is not None}
     objects: dict[tuple[str, str], Any] = {}

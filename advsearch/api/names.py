@@ -38,10 +38,12 @@ they are complete.
 
 
 def check_names(config: Config) -> None:
-    """Check that names in settings exist.
+    """Check that names in settings are those of something that exists, so that a slip
+    is found before anything is loaded.
 
     Raises:
-        UnknownNameError, InputError: nothing has such a name.
+        UnknownNameError: nothing has such a name.
+        InputError: a run or a file is not there.
     """
     if config.python_only_parts:
         return  # objects of a Python session may have any name
@@ -55,6 +57,7 @@ def check_names(config: Config) -> None:
         name = str(value.get("name", "") if isinstance(value, Mapping) else value)
         names = name.split("+") if setting == "task" else [name]
         _check_words(setting, names, group)
+    # a name that is like none of ours may be a file or code of the user
     like_reference = [
         name
         for name in split_names(values.get("model") or "")
@@ -84,7 +87,8 @@ def check_names(config: Config) -> None:
 
 
 def _check_scene(values: Mapping[str, Any]) -> None:
-    """Check the names of objects, environments, and the thing to judge."""
+    """Check the names of objects and environments, and that of the thing to judge."""
+    # OBJECT@OPTIONS; OBJECT@OPTIONS
     things = [
         part.strip()
         for part in str(values.get("things") or "").split(";")
@@ -121,9 +125,12 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
     """Check that the thing to judge is one of the things in the scene.
 
     Args:
-        judge: its name.
+        judge: its name, which ends in -2, -3 and so on where several things have one.
         things: as in the setting, ``car@12,3.5,name=taxi``.
-        objects: of these things.
+        objects: the objects of these things.
+
+    Raises:
+        UnknownNameError: it is none of them.
     """
     names = []
     for thing, object_name in zip(things, objects, strict=True):
@@ -139,7 +146,9 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
 
 
 def _check_controls(values: Mapping[str, Any]) -> None:
-    """Check names that resemble the name of a control."""
+    """Check names of controls that are like that of a built-in one but none; others may
+    be code of the user.
+    """
     controls = {**(values.get("controls") or {}), **(values.get("over") or {})}
     names = []
     for name, options in controls.items():
@@ -158,7 +167,11 @@ def _check_controls(values: Mapping[str, Any]) -> None:
 
 
 def _check_suite(suite: str) -> None:
-    """Raise InputError if a suite's file does not exist, with a name like it."""
+    """Check that the file of a suite exists.
+
+    Raises:
+        InputError: it does not; the message suggests a file with a similar name.
+    """
     if Path(suite).exists():
         return
     files = [
@@ -175,10 +188,18 @@ def _check_suite(suite: str) -> None:
 def _check_words(
     kind: str, names: Iterable[str], known: Iterable[str], hint: str = ""
 ) -> None:
-    """Raise UnknownNameError if a word is none of the known names.
+    """Check that words are known names; a path of an existing file, or what is no word,
+    passes.
 
-    `known` may be the suffix of a group of entry points instead, to whose names other
-    packages add.
+    Args:
+        kind: what is named, for messages.
+        names: to check.
+        known: the names that there are; or the suffix of a group of entry points, to
+            whose built-in names other packages add theirs.
+        hint: the end of the message.
+
+    Raises:
+        UnknownNameError: a word is none of them.
     """
     for name in names:
         if not WORD.fullmatch(name) or Path(name).exists():

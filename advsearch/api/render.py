@@ -146,8 +146,11 @@ def render_picture_file(
     config: RenderConfig, *, progress: Progress | None = None
 ) -> RenderResult:
     """Render what a configuration describes, write the file, and return what is known
-    about it. Raises InputError as `render`, or where the file would replace one that is
-    read, StorageError where it could not be written.
+    about the picture.
+
+    Raises:
+        InputError: as for `render`, or the file would replace one that is read.
+        StorageError: it could not be written.
     """
     progress = progress or NullProgress()
     out = check_image_path(config.out, config.around or 1)

@@ -91,7 +91,9 @@ def render_rows(run: str, *, every: bool, progress: Progress) -> Iterator[Render
 
 
 def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[RenderedRow]:
-    """Render the images of the run in a folder, or of its parts; see `render_rows`."""
+    """Yield the rendered images of the run in a folder, or of its parts; see
+    `render_rows`.
+    """
     parts = [path for path in sorted((folder / PARTS).glob("*")) if is_run(path)]
     if parts:
         for part in parts:
@@ -121,8 +123,9 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
 def _render_sweep(
     folder: Path, every: bool, progress: Progress
 ) -> Iterator[RenderedRow]:
-    """Render the images of a sweep."""
+    """Yield the rendered images of a sweep, one at a time."""
     config = SweepConfig.from_yaml(folder / CONFIG)
+    # metrics are not computed again
     scenes = load_scenes_of_sweep(config.model_copy(update={"metrics": {}}))
     job = scenes.job
     rows_of_image = _read_sweep_rows(folder, len(job.models))
@@ -132,6 +135,7 @@ def _render_sweep(
         if every or not all(row.correct for row in rows)
     )
     count = job.images_per_scene * len(job.scenes)
+    # checks the first and the last, since the numbers are sorted
     if images and not 0 <= images[0] <= images[-1] < count:
         raise FileFormatError(
             f"{folder / NAME}: expected rows of its {count} "
@@ -147,11 +151,18 @@ def _render_sweep(
 def _render_sweep_image(
     scenes: SceneLoader, image: int, rows: Sequence[Row]
 ) -> RenderedRow:
-    """Render one image of a sweep by its index."""
+    """Render one image of a sweep.
+
+    Args:
+        scenes: of the sweep.
+        image: the index of the image.
+        rows: the predictions of all models for it.
+    """
     job = scenes.job
     view, (query, *_) = scenes.make_queries(image)
     scene = job.scenes[view.number]
     picture = view.render_image(query)
+    # rows of one image are in the order of the models
     first_model = [row.correct for row in rows if row.step % len(job.models) == 0]
     stored = first_model[0] if first_model else None
     return RenderedRow(
@@ -179,12 +190,15 @@ def _read_sweep_rows(folder: Path, n_models: int) -> dict[int, list[Row]]:
 def _render_attack(
     folder: Path, every: bool, progress: Progress
 ) -> Iterator[RenderedRow]:
-    """Render the trials of an attack's adversarial scene and of the clean one; the
-    first of each if no condition varies.
+    """Yield the rendered trials of an attack's adversarial scene and of the clean one.
+
+    Where no condition varies, trials differ in noise alone, and only the first of each
+    is rendered.
     """
     summary = load_attack_summary(folder)
     parts = load_parts_of_run(folder)
     problem, _ = make_problem_with_warnings(parts)
+    # kinds of rows, each with the configuration that its trials have
     configuration_of_kind = dict.fromkeys(CLEAN_KINDS, problem.domain.start)
     if summary.adversarial is not None:
         kind = "baseline verification" if summary.answer_from else "verification"
@@ -199,6 +213,7 @@ def _render_attack(
         u = configuration_of_kind[row.kind]
         seed = max(0, row.seed or 0)
         picture = problem.picture(u, seed, row.spp or problem.spp)
+        # with the conditions that the seed draws
         full_u = problem.add_conditions(u, seed)
         yield RenderedRow(
             name=f"{row.kind.replace(' ', '-')}-{row.step:02d}",
@@ -215,9 +230,10 @@ def _render_attack(
 
 
 def make_object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
-    """Return the facts about the object, whatever thing the run judges.
+    """Return the facts about the object, also where the run judges another thing.
 
-    A label in the settings is that of the judged thing.
+    A label in the settings is that of the judged thing, so it counts only where that is
+    the object.
     """
     judges_object = config.judge not in scene.description.things
     return make_facts(

@@ -136,8 +136,8 @@ from advsearch.trust.yaml_text import parse_yaml as parse_yaml
 
 
 def load_photographs() -> Any:
-    """Return what takes photographs of the real thing in for runs, and counts how they
-    agree with the renderings.
+    """Return what adds photographs of the real thing to runs, and counts how often they
+    and the renderings agree.
 
     It has `list_files(folder, task)`, `add_files(run, files)` and `agreement(run)`
     (`advsearch.photo_agreement`).

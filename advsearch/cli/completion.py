@@ -53,6 +53,8 @@ def completion(args: argparse.Namespace) -> int:
         raise InputError(
             "completion needs the package shtab; install it with: pip install shtab"
         ) from error
+    # a parser with all commands and flags, whose values are then completed: names of a
+    # kind where a flag takes only those, else files, or both
     parser, commands = without_commands()
     names = {
         kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES

@@ -68,7 +68,7 @@ PRIVACY_NOTE = (
 def dashboard(args: argparse.Namespace) -> int:
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
-    # the list says what is wrong with one
+    # not checked here: the page with the list says what is wrong with a run
     runs = [find_run(name, checked=False) for name in args.runs]
     has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])
     photographs = load_attribute(PHOTOGRAPH_PAGES)() if has_photographs else None
@@ -81,6 +81,7 @@ def dashboard(args: argparse.Namespace) -> int:
         "fingerprint": server.fingerprint,
     }
     output.print_answer(args.json, {"command": "dashboard", **facts}, server.address)
+    # a program that waits for the address gets it now
     sys.stdout.flush()
     if server.fingerprint:
         print(

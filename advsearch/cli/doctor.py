@@ -131,12 +131,19 @@ def diagnose() -> list[Component]:
 
 
 def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
-    """Try the parts that load native code, in another process: name to whether it
-    worked and a detail or the error. The part that ended the process, and those after
-    it, are absent; under the name ``""`` stands how it ended.
+    """Try the parts that load native code in another process, which they may crash.
+
+    Args:
+        command: of that process, which prints a line of JSON for each part that it has
+            tried.
+
+    Returns:
+        By name, whether the part worked, with a detail or the error. The part that
+        ended the process and those after it are missing. Under the name "" stands
+        whether the process itself ended well, with how it ended.
     """
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             command,
             capture_output=True,
             text=True,
@@ -144,22 +151,23 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
             check=False,
             cwd=SUBPROCESS_DIRECTORY,
         )
-        printed = done.stdout
-        status = done.returncode
-        good = done.returncode == 0
-        telling = [
+        printed = process.stdout
+        status = process.returncode
+        good = process.returncode == 0
+        error_lines = [
             line.strip()
-            for line in done.stderr.splitlines()
+            for line in process.stderr.splitlines()
             if "ERROR" in line or "Error" in line
         ]
-        how = (
+        status_text = (
             f"signal {signal.Signals(-status).name}"
+            # a negative status is minus the number of a signal
             if status < 0
             else f"status {status}"
         )
         ending = (
-            f"the trial ended with {how}"
-            + (f" ({telling[0][:120]})" if telling else "")
+            f"the trial ended with {status_text}"
+            + (f" ({error_lines[0][:120]})" if error_lines else "")
             if status
             else ""
         )
@@ -183,8 +191,12 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
 
 
 def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
-    """The packages that were tried, with their versions; a render stands for Mitsuba
-    and Dr.Jit together.
+    """Yield what was found about the packages that were tried, with their versions.
+
+    Mitsuba and Dr.Jit were tried together by a render, which has its own entry.
+
+    Args:
+        tried: what `run_probe` returns.
     """
     for name in (
         "numpy",
@@ -226,13 +238,17 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
 
 
 def check_other_packages(requirements: Sequence[str] | None = None) -> Component:
-    """The dependencies that need no trial: present or not. Requirements are as in the
-    package's metadata, e.g. ``"rich>=13"``; None reads them there.
+    """Check that the dependencies which need no trial are installed.
+
+    Args:
+        requirements: as in a package's metadata, for example "rich>=13"; None takes
+            those of advsearch.
     """
     wanted = (
         (metadata.requires("advsearch") or []) if requirements is None else requirements
     )
     names = {
+        # the name: all before a version or a condition
         re.split(r"[^\w.-]", wish, maxsplit=1)[0]
         for wish in wanted
         if "extra ==" not in wish
@@ -270,7 +286,9 @@ def _reinstall(name: str) -> str:
 
 
 def check_llvm() -> Component:
-    """The libLLVM that will be used, what else there is, and why that is not used."""
+    """Check which libLLVM will be used; tell what others there are, and why they are
+    not used.
+    """
     library_setting = os.environ.get(llvm.ENVIRONMENT_VARIABLE, "")
     others = llvm.find_libraries()
     try:

@@ -28,8 +28,14 @@ def probe_import(name: str) -> str:
 
 
 def probe_renderer() -> str:
-    """Render a few pixels of a lit wall and differentiate them with respect to its
-    colour, which is linear.
+    """Render a few pixels of a wall in uniform light, and the derivative of their mean
+    with respect to the wall's reflectance.
+
+    Reflectance 0.5 under light of radiance 1 has brightness 0.5, and the derivative is
+    1. Returns what was used.
+
+    Raises:
+        ArithmeticError: the numbers differ by more than noise.
     """
     # what is probed
     from advsearch.scene.mitsuba_backend.variant import VARIANT, import_mitsuba
@@ -123,10 +129,13 @@ TRIALS: dict[str, Callable[[], str]] = {
 
 
 def main() -> int:
-    """Try every part; an error of one does not keep the next from being tried."""
+    """Try every part, and print a line of JSON for each; an error of one does not keep
+    the next from being tried.
+    """
     for name, trial in TRIALS.items():
         printed = io.StringIO()
         try:
+            # only our lines go to standard output
             with contextlib.redirect_stdout(printed):
                 outcome = {"name": name, "ok": True, "detail": trial()}
         except Exception as error:

@@ -88,9 +88,11 @@ def _begin_lower(sentence: str) -> str:
 def export(args: argparse.Namespace) -> int:
     """Write what the arguments of `export` ask for, and return the exit status."""
     out = None if args.out is None else Path(args.out)
+    # the suffix of the file, which may say the format
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     usable = EXPORTERS.list_usable()
     format = _choose_format(args, by_name, usable)
+    # options that belong to another format are refused
     for option in OPTIONS:
         owners = [
             name for name, exporter in usable.items() if option in exporter.options
@@ -116,7 +118,12 @@ def export(args: argparse.Namespace) -> int:
 def _choose_format(
     args: argparse.Namespace, by_name: str, usable: Mapping[str, type[Exporter]]
 ) -> str:
-    """Return the format that is asked for, by name or by the suffix of the file.
+    """Return the format that is asked for by name, or else by the suffix of the file.
+
+    Args:
+        args: of the command.
+        by_name: the suffix of the file.
+        usable: exporters by the name of their format.
 
     Raises:
         InputError: it was removed.
@@ -124,7 +131,7 @@ def _choose_format(
     """
     format_of_suffix = {table: table for table in FORMATS}
     for name, exporter in usable.items():
-        # a package takes none of ours
+        # setdefault: an exporter of another package gets no suffix that is taken
         format_of_suffix.setdefault(exporter.suffix or name, name)
     format: str = args.format or format_of_suffix.get(by_name, by_name)
     if format == "fiftyone":
@@ -138,7 +145,9 @@ def _choose_format(
 
 
 def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
-    """Write the rows of a run as a table to a file, or print them."""
+    """Write the rows of a run as a table to a file, or print them, and return the exit
+    status.
+    """
     format = args.format or _choose_table_format(args, out, by_name)
     if args.json and out is None and format != "json":
         raise InputError(
@@ -154,6 +163,7 @@ def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> in
             f"{folder}: is a study, whose rows are those of its parts; "
             f"export one of {parts}"
         )
+    # for a terminal the table goes through `print`, which escapes what would steer it
     on_screen = io.BytesIO() if out is None and sys.stdout.isatty() else None
     with Store(folder / NAME, read_only=True) as store, output_errors():
         count = write_rows(
@@ -171,8 +181,8 @@ def _write_table(args: argparse.Namespace, out: Path | None, by_name: str) -> in
 def _choose_table_format(
     args: argparse.Namespace, out: Path | None, by_name: str
 ) -> str:
-    """Return the format of a table by the name of its file; CSV if that says
-    nothing.
+    """Return the format of a table from the suffix of its file; where that says
+    nothing, JSON if JSON is to be printed, else CSV.
     """
     if by_name in FORMATS:
         return by_name

@@ -46,8 +46,13 @@ def add_settings(
     config: type[Config] = AttackConfig,
     only: Collection[str] = (),
 ) -> None:
-    """Add a flag for each setting of a configuration, or for some of them, under the
-    headings of their groups.
+    """Add a flag for each setting of a configuration to a parser, under the headings of
+    their groups.
+
+    Args:
+        parser: of a command.
+        config: the class of the configuration.
+        only: fields of settings to add; empty for all.
     """
     headings: dict[str, argparse._ArgumentGroup] = {}
     for setting in settings(config):
@@ -55,6 +60,7 @@ def add_settings(
             continue
         if setting.group not in headings:
             headings[setting.group] = parser.add_argument_group(setting.group)
+        # flags that were not given are absent from the arguments
         add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
         if setting.field == "object":
             add("--scene", metavar="FILE", help=SCENE)
@@ -70,8 +76,15 @@ def add_settings(
 def make_config(
     args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any
 ) -> AnyConfig:
-    """Return the configuration of a kind that the flags describe, with values for
-    settings that were not given. Raises InputError where a value is not allowed.
+    """Return the configuration that flags describe.
+
+    Args:
+        args: of the command line.
+        config: the class of the configuration.
+        otherwise: values of settings that were not given as flags.
+
+    Raises:
+        InputError: a value is not allowed.
     """
     typed = {
         setting.field: getattr(args, setting.field)
@@ -85,6 +98,7 @@ def make_config(
             f"name one of {_format_inside(args.scene)}"
         )
     if "scene" in args and isinstance(data.get("object"), str):
+        # names of objects are those in the scene file: FILE#NAME
         data["object"] = ",".join(
             f"{args.scene}#{name}" for name in split_names(data["object"])
         )
@@ -103,8 +117,15 @@ def read_command(file: str | Path) -> str:
 def read_file_config(
     command: str, file: str | Path, changes: Mapping[str, object]
 ) -> Config:
-    """Return the configuration that a file describes, `changes` put over it. Raises
-    UnknownNameError where there is no such command.
+    """Return the configuration that a file describes.
+
+    Args:
+        command: that the file names.
+        file: YAML with settings.
+        changes: values by name that replace those of the file.
+
+    Raises:
+        UnknownNameError: there is no such command.
     """
     if command not in IN_A_FILE:
         raise UnknownNameError("command", command, IN_A_FILE, f"It stands in {file}.")
@@ -117,7 +138,7 @@ def _format_inside(scene: str) -> str:
     Raises:
         InputError: there is none.
     """
-    # late: another thing has this name here
+    # late, so that --help answers at once
     from advsearch.scene.importing.files import format_name
 
     # late, so that --help answers at once
@@ -161,6 +182,7 @@ def format_as_flags(message: str) -> str:
             else f"{flags[name]} {value}"
         )
 
+    # any known setting
     names = f"(?P<name>{'|'.join(flags)})"
     message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", written, message)
     return re.sub(

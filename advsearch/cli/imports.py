@@ -51,7 +51,7 @@ def file(args: argparse.Namespace) -> int:
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with open_command_progress(as_json=True, quiet=False):
-        # late: another thing has this name here
+        # late, so that --help answers at once
         from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_contents
 
         if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
@@ -68,7 +68,7 @@ def file(args: argparse.Namespace) -> int:
 
 
 def _describe_mesh_file(file: str, inside: Contents) -> Understood:
-    """Return what the file of a mesh contains, as facts for JSON and as lines of
+    """Return what the file of a mesh contains: facts for JSON, and the lines of the
     text.
     """
     material_sizes = {
@@ -141,7 +141,11 @@ def _describe_object(mesh_object: Any) -> dict[str, Any]:
 
 
 def _list_motions(rig: Any) -> tuple[list[str], list[str], list[str]]:
-    """Return the names of clips, joints and morph targets of a rig, if there is one."""
+    """Return the names of the clips, joints and morph targets of a rig; empty lists
+    without a rig.
+
+    Each joint has parameters NAME.x, NAME.y and NAME.z, and each target NAME.weight.
+    """
     if rig is None:
         return [], [], []
     joints = [name.removesuffix(".x") for name in rig.defaults if name.endswith(".x")]
@@ -172,7 +176,9 @@ def _explain_slow_features(mesh_object: Any) -> list[str]:
 
 
 def _format_nodes(file: str, nodes: Sequence[Any]) -> list[str]:
-    """Return a table of the nodes of a file, and how one becomes the object."""
+    """Return the lines of a table of the nodes of a file, with examples of how to use
+    them.
+    """
     rows = [["node", "in controls", "", "size"]]
     for node in nodes:
         size = " x ".join(f"{length:.3g}" for length in node.size)
@@ -200,7 +206,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     Raises:
         InputError: an image is requested, but no shape can be the object.
     """
-    # late: another thing has this name here
+    # late, so that --help answers at once
     from advsearch.scene.mitsuba_backend.scene_files import read_contents
 
     inside = read_contents(Path(file))

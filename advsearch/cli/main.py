@@ -110,6 +110,9 @@ class ExperimentCommand:
         return self.experiment.examples
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the flags of the experiment's settings, and what it is about as words
+        without a flag, if it takes that.
+        """
         # late, so that --help answers at once
         from advsearch.cli.flags import add_settings
 
@@ -128,8 +131,11 @@ class ExperimentCommand:
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Run the experiment that the arguments describe. Raises InputError where what
-        it is about is missing.
+        """Run the experiment that the arguments describe, or list what it can be about;
+        return the exit status.
+
+        Raises:
+            InputError: what it is about is missing.
         """
         about = self.experiment.about
         subject = getattr(args, about, None)
@@ -154,8 +160,10 @@ class ExperimentCommand:
         )
 
     def read_config(self, args: argparse.Namespace) -> Config:
-        """Return the settings that the arguments describe, over those of the first run
-        that it is about.
+        """Return the settings that the arguments describe.
+
+        Settings that were not given come from the run that the experiment is about, the
+        first one of several, if it takes its settings from runs.
         """
         # late, so that --help answers at once
         from advsearch.cli.flags import make_config
@@ -193,8 +201,13 @@ class ExperimentCommand:
     def run_config(
         self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None
     ) -> int:
-        """Run the experiment with settings, or continue a run; print the result and
-        return the exit status.
+        """Run the experiment, print the result and return the exit status.
+
+        Args:
+            config: its settings.
+            as_json: print the result as JSON.
+            quiet: print no progress.
+            resumed: folder of the run to go on with; None for a new run.
         """
         with open_command_progress(as_json=as_json, quiet=quiet) as progress:
             from advsearch import experiment  # late, so that --help answers at once
@@ -268,14 +281,17 @@ def list_commands() -> list[str]:
 
 
 def group_commands() -> dict[str, list[str]]:
-    """Return the names of the commands by the heading that the help has for them,
-    without those that are missing.
+    """Return the names of the commands by the heading that the help has for them.
+
+    Commands whose modules are missing are left out; experiments that no group names, as
+    those of other packages, are added to the first.
     """
     groups = {
         title: [name for name, target in group.items() if _is_available(name, target)]
         for title, group in GROUPS.items()
     }
     known = {name for group in groups.values() for name in group}
+    # the first group
     next(iter(groups.values())).extend(
         name for name in EXPERIMENTS if name not in known
     )
@@ -327,15 +343,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         open_descriptors()
     with escape_output(), restrict_allowed_code():
         status = _interruptible(sys.argv[1:]) if argv is None else _status(list(argv))
-        if argv is None:  # native code knows no handler of ours
+        if argv is None:  # too late to interrupt: native code knows no handler of ours
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         end_output()
     return status
 
 
 def _interruptible(words: list[str]) -> int:
-    """As `_status`, with Ctrl-C for as long as there is something to interrupt, and
-    never a traceback of it.
+    """Run a command as `_status` does, and let Ctrl-C interrupt it as long as there is
+    something to interrupt, without any traceback.
     """
     sys.unraisablehook = unless_interrupted
     try:
@@ -350,9 +366,13 @@ def _interruptible(words: list[str]) -> int:
 
 
 def _status(words: list[str]) -> int:
+    """Run a command and return its exit status, which is `INTERRUPTED` after any
+    interrupt, whatever error or result came of it.
+    """
     try:
         status = _run_and_tell(words)
-        # whatever has swallowed one: it was asked to stop
+        # some code has swallowed the interrupt: the command was asked to stop all the
+        # same
         if status != INTERRUPTED and INTERRUPTS.count:
             raise KeyboardInterrupt
         return status
@@ -366,6 +386,9 @@ def _status(words: list[str]) -> int:
 
 
 def _run_and_tell(words: list[str]) -> int:
+    """Run a command and return its exit status; one of our errors is printed as a
+    message.
+    """
     try:
         status = _run(words)
         sys.stdout.flush()
@@ -374,20 +397,23 @@ def _run_and_tell(words: list[str]) -> int:
         # late, so that --help answers at once
         from advsearch.cli.flags import format_as_flags
 
-        # no file may name its own code
+        # settings are named as in the file where they come from one, else as flags; but
+        # some advice is a flag always, such as --code, since no file may allow its own
+        # code
         asks_for_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))
         in_a_file = words[0] in ("run", "resume") and not asks_for_flag
         text = str(error) if in_a_file else format_as_flags(str(error))
         print(f"advsearch: error: {shorten_words(text)}", file=sys.stderr)
         return BAD_INPUT
     except BrokenPipeError:
+        # nobody reads the output any more, as behind `head`
         return OK
 
 
 def _run(words: list[str]) -> int:
     """Run the command that the words of the command line name; return its exit status.
 
-    Permission to run the code that `--code` names is given here, for the process.
+    Code that `--code` names is allowed here, for the whole process.
     """
     name = words[0] if words and not words[0].startswith("-") else None
     if name == "plan":
@@ -427,7 +453,9 @@ def _parse(words: list[str], command: str | None) -> argparse.Namespace:
 
 
 def _join_negative_axis(words: list[str]) -> list[str]:
-    """Return the words with `--facing -z` as one, as argparse takes `-z` for a flag."""
+    """Return the words with ``--facing -z`` joined to ``--facing=-z``, as argparse
+    takes ``-z`` alone for a flag.
+    """
     joined: list[str] = []
     for word in words:
         if joined and joined[-1] == "--facing" and word in ("-x", "-y", "-z"):
@@ -440,9 +468,14 @@ def _join_negative_axis(words: list[str]) -> list[str]:
 def without_commands() -> tuple[
     argparse.ArgumentParser, argparse._SubParsersAction[Any]
 ]:
-    """Return the parser, and what `add_command` adds the commands to."""
+    """Return the parser of the command line, without commands yet, and what
+    `add_command` adds them to.
+
+    The help of the parser lists all commands.
+    """
     groups = group_commands()
     column = 4 + max(len(name) for group in groups.values() for name in group)
+    # wide enough for the texts beside the column of names
     width = max(shutil.get_terminal_size().columns - 2, 2 * column)
     lines = []
     for title, names in groups.items():
@@ -481,8 +514,12 @@ def add_command(
     *,
     with_arguments: bool = True,
 ) -> argparse.ArgumentParser:
-    """Return the new parser of a command; if not `with_arguments` it has no arguments, and
-    serves the list of commands.
+    """Add a command to the parsers, and return its parser.
+
+    Args:
+        subparsers: what `without_commands` returns.
+        name: of the command.
+        with_arguments: make its arguments and help; without, it only has a name.
     """
     if not with_arguments:
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))

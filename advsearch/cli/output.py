@@ -74,9 +74,11 @@ class Screen:
 
 @contextmanager
 def output_errors() -> Iterator[None]:
-    """Turn what goes wrong with standard output inside the block into a message. Raises
-    StorageError: it could not be written, for another reason than that nobody reads any
-    more; BrokenPipeError: nobody reads any more.
+    """Turn what goes wrong with standard output inside the block into a message.
+
+    Raises:
+        BrokenPipeError: nobody reads it any more, which is no failure.
+        StorageError: it cannot be written for another reason.
     """
     try:
         yield
@@ -90,7 +92,9 @@ def output_errors() -> Iterator[None]:
 
 @contextmanager
 def escape_output() -> Iterator[None]:
-    """Let everything that is printed inside the block go through a `Screen`."""
+    """Inside the block, let all that is printed go through a `Screen`, which escapes
+    what would steer a terminal.
+    """
     stdout = sys.stdout
     stderr = sys.stderr
     sys.stdout = _screen(stdout, needed=True)
@@ -110,8 +114,10 @@ def get_raw_stream(stream: IO[str]) -> IO[str]:
 
 
 def open_descriptors() -> None:
-    """Point standard streams that were closed at nothing, or the next file that is
-    opened would be one of them.
+    """Point standard streams that are closed at nothing.
+
+    Else the next file that is opened would get the number of one of them, and be
+    written to by `print`.
     """
     for descriptor in (0, 1, 2):
         try:
@@ -121,8 +127,8 @@ def open_descriptors() -> None:
 
 
 def end_output() -> None:
-    """Write out what is left; where that fails, drop it, so that the interpreter's own
-    end does not complain.
+    """Write out what standard output still holds; where that fails, drop it, so that
+    the interpreter does not complain when it ends.
     """
     try:
         sys.stdout.flush()
@@ -132,6 +138,9 @@ def end_output() -> None:
 
 
 def _screen(stream: Any, *, needed: bool) -> TextIO:
+    """Return a `Screen` of a stream, which may be one already; without a stream, one
+    that drops everything.
+    """
     # Python has none where the descriptor was closed
     if not isinstance(stream, Screen):
         stream = Screen(
@@ -172,8 +181,13 @@ def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
 def print_answer(
     as_json: bool, facts: Mapping[str, object], text: str, stream: IO[str] | None = None
 ) -> int:
-    """Print what a command has to say: facts as JSON, or a text, on standard output or
-    another stream. Return the exit status of a command that did its work.
+    """Print the answer of a command, and return the exit status of success.
+
+    Args:
+        as_json: print the facts as JSON on standard output, else the text.
+        facts: the answer for programs.
+        text: the answer for people.
+        stream: for the text; None is standard output.
     """
     if as_json:
         print_json({"schema": 1, **facts})
@@ -190,11 +204,12 @@ def print_json(value: Any) -> None:
     text = json.dumps(
         to_json_value(value), indent=2, allow_nan=False, ensure_ascii=False
     )
+    # letters of other languages stay, invisible ones become escapes of JSON
     text = "".join(
         sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1]
         for sign in text
     )
-    # JSON escapes all others that a terminal would not show
+    # DEL is the one that json.dumps leaves as it is
     print(text.replace("\x7f", "\\u007f"))
 
 
@@ -209,8 +224,8 @@ def print_result(result: Result, *, as_json: bool) -> int:
 
 
 def explain_resume(result: Result) -> str:
-    """Return how to go on with a run that was stopped; nothing of one that was not, or
-    that is kept nowhere.
+    """Return how to go on with a run that was stopped, as the end of a text; "" for a
+    run that ended or is kept nowhere.
     """
     run: Any = getattr(result, "run", None)
     stopped = (
@@ -220,8 +235,9 @@ def explain_resume(result: Result) -> str:
 
 
 def make_resume_command(run: str | Path) -> str:
-    """Return the shell command that goes on with the run in a folder, with the Python
-    code that its settings name.
+    """Return the shell command that goes on with the run in a folder.
+
+    It allows the Python code that the run's settings name.
     """
     # late, so that --help answers at once
     from advsearch.cli.flags import read_command, read_file_config
@@ -231,9 +247,11 @@ def make_resume_command(run: str | Path) -> str:
 
     words = ["advsearch", "resume", format_run_name(run)]
     file = Path(run) / CONFIG
+    # where the file cannot be read, the command says so itself
     with suppress(AdvsearchError):
         config = read_file_config(read_command(file), file, {})
         metrics = getattr(config, "metrics", {}).values()
+        # a colon is in each name of code
         if isinstance(config, SceneConfig) and ":" in "".join(
             [config.model, *config.control_kinds, *metrics]
         ):
@@ -248,14 +266,16 @@ def make_resume_command(run: str | Path) -> str:
 
 @contextmanager
 def redirect_output() -> Iterator[None]:
-    """Send whatever is printed inside the block to standard error, be it by Python or
-    by a native library. So one JSON value, printed afterwards, is all that standard
-    output holds.
+    """Inside the block, send all that is printed to standard error, by Python or by a
+    native library.
+
+    So one JSON value, printed afterwards, is all that standard output holds.
     """
     sys.stdout.flush()
     stdout_descriptor: int | None = None
     with suppress(OSError):  # where one of them is closed
         stdout_descriptor = os.dup(1)
+        # native libraries write to descriptor 1
         os.dup2(2, 1)
     try:
         with redirect_stdout(sys.stderr):
@@ -270,18 +290,18 @@ def redirect_output() -> Iterator[None]:
 
 
 def format_result(result: Result) -> str:
-    """Return what is shown of a result as text: what it says, its parts, by what it
-    came about, and notes.
+    """Return a result as text for a person: its statement, its parts, how it was made,
+    and notes.
     """
     # late, so that --help answers at once
     from advsearch.cli.flags import format_as_flags
     from advsearch.report.views import collect_facts, get_view, list_remarks
     from advsearch.runs.directory import REPORT
 
-    content = get_view(result)
+    view = get_view(result)
     run = getattr(result, "run", None)
-    parts = [content.statement]
-    for part in content.sections:
+    parts = [view.statement]
+    for part in view.sections:
         if part.only not in ("", "text") or part.is_empty:
             continue
         table = align_columns([part.heads, *part.rows] if part.heads else part.rows)
@@ -290,33 +310,30 @@ def format_result(result: Result) -> str:
             for group in part.pictures
             for picture in group
         ]
-        inside = [
+        part_texts = [
             *map(format_as_flags, part.text),
             "\n".join(filter(None, [table, align_columns(pictures)])),
         ]
         parts.append(
-            "\n".join(filter(None, [part.title, "\n\n".join(filter(None, inside))]))
+            "\n".join(filter(None, [part.title, "\n\n".join(filter(None, part_texts))]))
         )
-    facts = [
-        [name.lower(), text] for name, text in collect_facts(result, content).items()
-    ]
+    facts = [[name.lower(), text] for name, text in collect_facts(result, view).items()]
     parts.append(
         align_columns([*facts, *([["page", f"{run}/{REPORT}"]] if run else [])])
     )
     return "\n\n".join(
         [
             *filter(None, parts),
-            *(
-                f"Note: {format_as_flags(text)}"
-                for text in list_remarks(result, content)
-            ),
+            *(f"Note: {format_as_flags(text)}" for text in list_remarks(result, view)),
         ]
     )
 
 
 def align_columns(rows: Sequence[Sequence[str]]) -> str:
-    """Return lines with the cells of `rows` in aligned columns."""
-    wide = [
+    """Return lines with the cells of `rows` in aligned columns; rows may have fewer
+    cells than others.
+    """
+    widths = [
         max(len(row[i]) for row in rows if i < len(row))
         for i in range(max(map(len, rows), default=0))
     ]
@@ -324,7 +341,7 @@ def align_columns(rows: Sequence[Sequence[str]]) -> str:
         (
             "  "
             + "   ".join(
-                cell.ljust(width) for cell, width in zip(row, wide, strict=False)
+                cell.ljust(width) for cell, width in zip(row, widths, strict=False)
             )
         ).rstrip()
         for row in rows
@@ -333,8 +350,12 @@ def align_columns(rows: Sequence[Sequence[str]]) -> str:
 
 @contextmanager
 def open_command_progress(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
-    """Watch a command's work; where JSON is to be printed, keep everything else off
-    standard output meanwhile.
+    """Show the progress of a command inside the block, and let an interrupt end it.
+
+    Args:
+        as_json: JSON is printed afterwards, so everything else is kept off standard
+            output.
+        quiet: show nothing.
     """
     # late, so that --help answers at once
     from advsearch.cli.flags import format_as_flags
@@ -346,6 +367,7 @@ def open_command_progress(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
         progress = InterruptCheckingProgress(watcher)
         progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
+        # raises where one came that nobody has handled
         INTERRUPTS.look()
 
 
@@ -366,8 +388,10 @@ class InterruptCheckingProgress:
         hint: str = "",
         at_most: bool = False,
     ) -> None:
-        """See `Progress.stage`. Raises KeyboardInterrupt where one came that nobody has
-        handled.
+        """See `Progress.stage`.
+
+        Raises:
+            KeyboardInterrupt: there was an interrupt that nobody has handled.
         """
         INTERRUPTS.look()
         self._progress.stage(name, total, hint=hint, at_most=at_most)

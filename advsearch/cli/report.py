@@ -120,7 +120,7 @@ def report(args: argparse.Namespace) -> int:
 
 
 def _format_evidence(evidence: Any, output_paths: Sequence[Path]) -> str:
-    """Return the claims of all runs, notes, and the paths of the files, as text."""
+    """Return, as text, the claims of all runs, notes and the paths of the files."""
     lines = []
     for run in evidence.runs:
         lines.append(run.run)
@@ -155,8 +155,15 @@ def _check_arguments(args: argparse.Namespace, output_paths: Sequence[Path]) -> 
 
 
 def _add_photographs(folder: str, name: str) -> None:
-    """Have a run's model judge the photographs in a folder that the run does not have
-    yet.
+    """Let the model of a run judge photographs, and add them to the run.
+
+    Args:
+        folder: with photographs; their names, or the file `POSES` beside them, say
+            which rendering of the run each one shows.
+        name: of the run.
+
+    Raises:
+        InputError: there are none, or they do not say it.
     """
     from advsearch.extend import directory, settings, workbench  # the last brings torch
 
@@ -190,8 +197,17 @@ def _add_photographs(folder: str, name: str) -> None:
 
 
 def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
-    """Copy the photographs that `POSES` lists, each under the name of the rendering
-    that has its pose.
+    """Copy the photographs that the table `POSES` lists, each under the name of the
+    rendering that has its pose, and return `out`.
+
+    Args:
+        folder: has the table and the photographs.
+        run: a sweep, of which exactly one rendering has each pose.
+        out: an empty folder.
+
+    Raises:
+        InputError: a photograph is missing, or its pose is that of no or several
+            renderings.
     """
     # late, so that --help answers at once
     from advsearch.extend import Store, stored_files
@@ -201,6 +217,7 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
             (row.step, {name: value["value"] for name, value in row.values.items()})
             for row in store.rows("sweep")
         ]
+    # line 1 has the heads
     for line, pose in enumerate(
         csv.DictReader(
             stored_files.read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()

@@ -53,10 +53,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse_changes(words: Sequence[str]) -> dict[str, object]:
-    """Return setting to value from ``NAME=VALUE``, which allows the code that they
-    name. Raises InputError where a word is no such assignment.
+    """Return the settings that are changed by words ``NAME=VALUE``, and allow the code
+    that they name.
+
+    Raises:
+        InputError: a word is no such assignment.
     """
     changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
+    # the nested mapping that dotted names stand for
     typed = dict[str, object]()
     for name, value in changes.items():
         set_dotted(typed, name, value)
@@ -70,12 +74,22 @@ def run_file(
     args: argparse.Namespace,
     resumed: Path | None = None,
 ) -> int:
-    """Do what a YAML file describes, with `changes` put over it. Raises
-    UnknownNameError where there is no such command. If the file is a run's own,
-    `resumed` is its folder; `args` has `json` and `quiet`.
+    """Run what a YAML file describes, and return the exit status.
+
+    Args:
+        file: with settings.
+        changes: values by name that replace those of the file.
+        args: has `json` and `quiet`.
+        resumed: folder of the run to go on with, if the file is its own; None for a new
+            run.
+
+    Raises:
+        UnknownNameError: there is no such command.
+        InputError: the file asks for what only a person may ask for.
     """
     config = read_file_config(read_command(file), file, changes)
     for setting in config.left_out:
+        # in a run of ours it may be left out, as long as it does not decide the numbers
         if resumed is None or setting.name not in config.free:
             raise InputError(
                 f"{file}: {setting.name}: {setting.effect}, which a file "
@@ -122,14 +136,14 @@ def resume(args: argparse.Namespace) -> int:
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
     command = read_command(path / CONFIG)
-    # the map of a sweep's surface, or a recipe's figures anew, with the photographs
-    # that were taken since
+    # these add to a run that is done: the map of a sweep's surface, or a recipe's
+    # figures anew, with the photographs that were taken since
     adds = command == "recipe" or (
         changes.get("surface") is True and command == "sweep"
     )
     if is_finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
-        # the disk was full as it was written, or it was removed
+        # missing: the disk was full as it was written, or somebody removed it
         if not (path / REPORT).is_file():
             write_page(path)
         return show_run(str(path), args.json)

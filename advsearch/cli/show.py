@@ -73,6 +73,7 @@ def show(args: argparse.Namespace) -> int:
     match args.what:
         case ["control" | "policy" | "task" as kind, name]:
             return _show_declared(kind, name, args.json)
+        # a word of an experiment, such as recipe, that can describe its choices
         case [command, name] if command in EXPERIMENTS and (
             target := get_experiment(command).choice_description
         ):
@@ -93,8 +94,13 @@ def show(args: argparse.Namespace) -> int:
 
 
 def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
-    """Print the result of a run, or how far one has come that has none yet, and draw
-    its pictures if wanted.
+    """Print the result of a run, or how far it has come if it has none yet; return the
+    exit status.
+
+    Args:
+        name: of the run, or its path.
+        as_json: print it as JSON.
+        picture: draw its pictures in the terminal, too.
     """
     path = find_run(name)
     if not (path / NAME).is_file():
@@ -316,6 +322,11 @@ def show_pictures(files: Sequence[Path]) -> None:
 
 
 def _drawing() -> tuple[Callable[[Path], None] | None, str]:
+    """Return what draws a picture in this terminal, and why there is none.
+
+    Returns:
+        A function of a picture's path, or None; and a sentence for the user, or "".
+    """
     if not sys.stdout.isatty():
         return None, ""
     try:
@@ -367,8 +378,8 @@ MODELS = {
 
 
 def list_names(kind: str) -> dict[str, str]:
-    """Return the names of one kind, each with one line about it where its registry has
-    one.
+    """Return the names of one kind, each with a line about it, which is empty where
+    nothing is known.
     """
     entries = _registry(kind)
     if isinstance(entries, Registry):
@@ -453,6 +464,7 @@ def labels(args: argparse.Namespace) -> int:
             if args.word is None
             else [index for index, _ in find_similar_labels(args.word, names)]
         )
+        # labels that name nothing, such as a background, are shown only where asked for
         is_nothing_requested = args.word is not None and is_nothing_name(args.word)
         classes = {
             index: names[index]

@@ -98,7 +98,12 @@ class ClusterSite:
 
 
 def make_file_plugin(contents: Mapping[str, bytes]) -> Any:
-    """Return a worker plugin that writes files of a task, given by path."""
+    """Return a plugin that makes each worker of Dask, also one that comes later, write
+    the files of a task.
+
+    Args:
+        contents: of the files, by path.
+    """
     # comes with the extra `dask`
     from distributed import WorkerPlugin
 
@@ -131,6 +136,16 @@ class DaskExecutor(WorkerExecutor):
         contents: Mapping[str, bytes],
         tell: Callable[[str], None],
     ) -> None:
+        """Connect to the scheduler, or start the cluster.
+
+        Args:
+            site: where the workers run.
+            contents: of the task's files, by path, for workers that lack them.
+            tell: takes messages for the user.
+
+        Raises:
+            ClusterError: no scheduler answers.
+        """
         self.description = site.description
         self.stats = WorkerStats()
         self.link = ""  # of a page that shows the workers; empty where there is none
@@ -147,6 +162,7 @@ class DaskExecutor(WorkerExecutor):
         self._fit: frozenset[str] = frozenset()
         # why others are given none, by their addresses
         self._refused: dict[str, str] = {}
+        # never, so that the first count looks
         self._looked_at = float("-inf")
         self._counted_at = self._alone_since = time.monotonic()
         try:
@@ -156,6 +172,12 @@ class DaskExecutor(WorkerExecutor):
             raise
 
     def _open(self, seconds: float) -> None:
+        """Start the cluster if there is one to start, and connect to its scheduler; try
+        again for so many seconds.
+
+        Raises:
+            ClusterError: no scheduler answers.
+        """
         # comes with the extra `dask`
         import dask
         import distributed
@@ -169,16 +191,22 @@ class DaskExecutor(WorkerExecutor):
         logging.getLogger("distributed").setLevel(SILENT)
         while True:
             try:
+                # started once, however often the connection is tried
                 if self._site.start is not None and self._cluster is None:
                     self._cluster = self._site.start(
                         **({} if security is None else {"security": security})
                     )
                     if self._site.count is not None:
                         self._cluster.scale(self._site.count)
-                left = max(1.0, min(CONNECT_SECONDS, deadline - time.monotonic()))
-                where = self._cluster or self._site.address
+                seconds_left = max(
+                    1.0, min(CONNECT_SECONDS, deadline - time.monotonic())
+                )
+                target = self._cluster or self._site.address
                 self._client = untyped.Client(
-                    where, security=security, timeout=left, set_as_default=False
+                    target,
+                    security=security,
+                    timeout=seconds_left,
+                    set_as_default=False,
                 )
                 break
             except (
@@ -206,6 +234,14 @@ class DaskExecutor(WorkerExecutor):
     # ---- who is there
 
     def count_workers(self) -> int:
+        """Return how many workers may be given calls now.
+
+        Who is there is looked up every `LOOK_SECONDS`, and a lost connection is made
+        again.
+
+        Raises:
+            ClusterError: there has been no such worker for too long.
+        """
         now = time.monotonic()
         if now - self._looked_at >= LOOK_SECONDS:
             client = self._client
@@ -216,11 +252,12 @@ class DaskExecutor(WorkerExecutor):
                 or client.scheduler_comm is not self._connection
             ):
                 self._reconnect()
-            # slow, or going; the next look will tell
+            # a scheduler that is slow, or about to end: the next look will tell
             with suppress(OSError, TimeoutError, asyncio.TimeoutError):
                 self._look()
             self._looked_at = time.monotonic()
-        # nobody has asked for a while
+        # the time without workers begins anew if there are some, or if nobody has asked
+        # for so long that nobody looked for them
         if self._fit or now - self._counted_at > LESS_PATIENCE:
             self._alone_since = now
         self._check_hope(now)
@@ -228,6 +265,11 @@ class DaskExecutor(WorkerExecutor):
         return len(self._fit)
 
     def _look(self) -> None:
+        """Ask the scheduler which workers are connected, and sort them.
+
+        Workers that have gone are counted as lost. New ones are fit if they have the
+        same advsearch, else they are refused with the reason.
+        """
         client = self._client
         connected = frozenset(
             client.sync(client.scheduler.ncores, callback_timeout=RESTART)
@@ -280,8 +322,10 @@ class DaskExecutor(WorkerExecutor):
             self._tell(f"{address} is given nothing: {reason}")
 
     def _check_hope(self, now: float) -> None:
-        """Raise ClusterError if there has been no worker that suits the task for too
+        """Raise ClusterError if no worker that suits the task has been there for too
         long.
+
+        Where there are workers, but all were refused, that is sooner.
         """
         patience = LESS_PATIENCE if self._refused else PATIENCE
         if now - self._alone_since > patience:
@@ -295,6 +339,9 @@ class DaskExecutor(WorkerExecutor):
             )
 
     def _reconnect(self) -> None:
+        """Connect to the scheduler again, as at first; what is known of the workers is
+        forgotten.
+        """
         self._tell(
             f"{self.description}: the scheduler has gone; what was under way will be "
             "done again"
@@ -323,8 +370,14 @@ class DaskExecutor(WorkerExecutor):
     async def _call(
         self, client: Any, function: Callable[..., Any], args: tuple[Any, ...]
     ) -> Any:
-        """Run a function on a worker; again if its result was lost, or the worker is
-        unfit.
+        """Run a function on a worker and return its result.
+
+        It is run again if the result was lost, or the worker turns out to be unfit.
+
+        Raises:
+            WorkerDiedError: too many workers died of it.
+            ClusterError: workers cannot even begin it.
+            BrokenExecutor: the connection to the scheduler is gone.
         """
         # comes with the extra `dask`
         from distributed import KilledWorker
@@ -346,7 +399,8 @@ class DaskExecutor(WorkerExecutor):
                 if result is not None and not await self._is_refused(client, *result):
                     return result[1]
             except asyncio.CancelledError:
-                # it is this call that nobody wants any more
+                # Dask cancels the future of a lost worker, and asyncio this call where
+                # nobody wants it any more: only the latter ends it
                 if future.status != "cancelled":
                     raise
             except KilledWorker:
@@ -370,8 +424,8 @@ class DaskExecutor(WorkerExecutor):
         raise BrokenExecutor(f"{self.description}: the scheduler has gone")
 
     async def _wait(self, future: Any, workers: list[str]) -> tuple[str, Any] | None:
-        """Return what a future ends with, None if none of its allowed workers is
-        left.
+        """Return the address and the value that a future of Dask ends with; None if
+        none of the `workers` that may run it is left.
         """
 
         async def fetch() -> tuple[str, Any]:
@@ -380,6 +434,7 @@ class DaskExecutor(WorkerExecutor):
 
         fetching = asyncio.ensure_future(fetch())
         try:
+            # the first of the two sets that wait returns: what is done
             while not (await asyncio.wait([fetching], timeout=LOOK_SECONDS))[0]:
                 if not self._fit.intersection(workers):
                     return None
@@ -388,10 +443,16 @@ class DaskExecutor(WorkerExecutor):
             fetching.cancel()
 
     async def _is_refused(self, client: Any, address: str, value: Any) -> bool:
-        """Return whether another worker has to run the call, or this one with files
-        sent to it.
+        """Return whether a call has to be run again, on another worker or once files
+        were sent.
+
+        Args:
+            client: of the connection that was used.
+            address: of the worker.
+            value: what it returned, a `Reply` for batches.
         """
         failure = value.failure if isinstance(value, Reply) else None
+        # files are sent to all workers at once, for the first one that lacks them
         if failure is Failure.MISSING_FILES and (
             self._sending is None or not self._sending.done()
         ):
@@ -404,6 +465,7 @@ class DaskExecutor(WorkerExecutor):
             with suppress(Exception):
                 await asyncio.shield(self._sending)
             return True
+        # unfit, or without files although they were sent
         if failure in (Failure.UNFIT, Failure.MISSING_FILES):
             self._refuse(address, value.error)
             return True
@@ -413,7 +475,9 @@ class DaskExecutor(WorkerExecutor):
         await client.unregister_worker_plugin(name=self._plugin_name)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
-        """Let the workers go, those that were started for this executor for ever."""
+        """End all calls, remove the files that were sent, and disconnect; workers that
+        this executor started end.
+        """
         for call in list(self._calls):
             call.cancel()
         client = self._client
@@ -455,7 +519,9 @@ code that the file runs.
 def open_dask(
     task: WorkerTask, workers: int | None, cluster: str, tell: Callable[[str], None]
 ) -> tuple[DaskExecutor, WorkerTask]:
-    """Return an executor on a cluster, and the task with the digests of its files."""
+    """Return an executor on a cluster, and the task with the digests of its files, by
+    which workers check that they have the same.
+    """
     site = parse_site(workers, cluster)
     if importlib.util.find_spec("distributed") is None:
         raise InputError(
@@ -468,8 +534,16 @@ def open_dask(
 
 
 def parse_site(workers: int | None, cluster: str) -> ClusterSite:
-    """Parse the address of a scheduler, or a YAML file, and how many workers it
-    needs.
+    """Return where workers run.
+
+    Args:
+        workers: how many to start; None for the default.
+        cluster: the address of a scheduler, or the path of a YAML file that describes
+            the cluster.
+
+    Raises:
+        InputError: it is neither, or `workers` is given for a scheduler that has its
+            own.
     """
     if cluster.startswith(ADDRESS_SCHEMES):
         site = ClusterSite(cluster, address=cluster)
@@ -507,6 +581,7 @@ def _read_site(path: Path, workers: int | None) -> ClusterSite:
         "tls_scheduler_key",
     ):
         if isinstance(security.get(name), str):
+            # paths are relative to the YAML file
             security[name] = str(path.parent / security[name])
     count = entries.get("workers") if workers is None else workers
     is_count = isinstance(count, int) and not isinstance(count, bool) and count >= 1
@@ -531,9 +606,15 @@ def _read_site(path: Path, workers: int | None) -> ClusterSite:
 
 
 def _check_entries(path: Path, entries: dict[str, Any]) -> None:
-    """Check the names of a cluster file's entries, and the types of its mappings."""
+    """Check that a cluster file has the entries that belong together, and mappings
+    where they are needed.
+
+    Raises:
+        FileFormatError: it has not.
+    """
     known = {"address", "class", "arguments", "workers", "security"}
     unknown = sorted(set(entries) - known)
+    # exactly one of the two must be there
     if unknown or ("address" in entries) == ("class" in entries):
         got = "got both or neither"
         if unknown:
@@ -553,7 +634,12 @@ def _check_entries(path: Path, entries: dict[str, Any]) -> None:
 
 
 def _import_cluster(path: Path, name: str) -> Any:
-    """Import a class of Dask that starts a cluster."""
+    """Import one of the classes in `CLUSTER_CLASSES`, which start a cluster of Dask.
+
+    Raises:
+        FileFormatError: there is no such class.
+        InputError: its package is not installed.
+    """
     if name not in CLUSTER_CLASSES:
         raise FileFormatError(
             f"{path}: class: expected one of {', '.join(CLUSTER_CLASSES)}, got {name!r}"

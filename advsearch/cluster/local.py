@@ -36,6 +36,10 @@ class WorkerProcess:
     """One worker, which does one call at a time."""
 
     def __init__(self) -> None:
+        """Start the process; calls go to its standard input, results come from its
+        standard output.
+        """
+        # one thread each, since the processes share the cores
         environ = {**os.environ, "OMP_NUM_THREADS": "1", SERVE_VARIABLE: "1"}
         command = [sys.executable, "-c", START_SECONDS, *sys.path]
         self._popen = subprocess.Popen(
@@ -43,6 +47,7 @@ class WorkerProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=environ,
+            # the interrupt of the terminal reaches this process only
             start_new_session=True,
         )
 
@@ -83,6 +88,11 @@ class LocalExecutor(WorkerExecutor):
     """
 
     def __init__(self, count: int) -> None:
+        """Make an executor of `count` processes, each started when it is needed first.
+
+        Raises:
+            InputError: this process is a worker itself.
+        """
         if SERVE_VARIABLE in os.environ:
             raise InputError(
                 "workers: a module that a worker imports asks for workers itself; put "
@@ -92,7 +102,7 @@ class LocalExecutor(WorkerExecutor):
         self.description = f"{count} workers on this machine"
         self.stats = WorkerStats()
         self._count = count
-        # one waits for the answers of each process
+        # one thread waits for the answers of each process
         self._threads = ThreadPoolExecutor(count, "worker")
         self._lock = Lock()
         self._idle: list[WorkerProcess] = []
@@ -111,6 +121,12 @@ class LocalExecutor(WorkerExecutor):
         return self._threads.submit(self._call, function, args)
 
     def _call(self, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+        """Run a function in a process and return its result, in a new process if one
+        dies of it.
+
+        Raises:
+            WorkerDiedError: `MAX_DEATHS` processes died of it.
+        """
         for _ in range(MAX_DEATHS):
             process = self._take_process()
             try:

@@ -66,9 +66,9 @@ def digest_machine(machine: MachineInfo) -> str:
 
 @cache
 def compute_version() -> str:
-    """Return the version of advsearch, with a digest of its source files.
+    """Return the version of advsearch with a digest of its source files.
 
-    Development versions of one number differ in the digest.
+    Workers compare it, since versions in development may differ under one number.
     """
     digest = hashlib.sha256()
     root = Path(__file__).resolve().parents[1]
@@ -107,10 +107,11 @@ class MissingFilesError(Exception):
 
 
 def read_files(task: WorkerTask) -> dict[str, bytes]:
-    """Read the files that a task's settings name, and files next to them, by path.
+    """Return the contents, by path, of the files that a task's settings name, and of
+    the files next to them that those may refer to.
 
     Raises:
-        InputError: if they are too large to be sent.
+        InputError: they are too large to be sent.
     """
     contents: dict[str, bytes] = {}
     for name in task.files:
@@ -134,6 +135,7 @@ def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
     """Read a file, and the files in its directory that it may refer to, by path."""
     suffix = path.suffix.lower()
     suffixes: tuple[str, ...] = REFERRED_SUFFIXES.get(suffix, ())
+    # a YAML file refers to other files only where it is an environment
     if setting == "environment" and suffix in (".yaml", ".yml"):
         suffixes = ENVIRONMENT_SUFFIXES
     contents = {str(path): path.read_bytes()}
@@ -157,9 +159,11 @@ def compute_digests(contents: Mapping[str, bytes]) -> dict[str, str]:
 
 
 def locate_sent_files(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
-    """Return where files are stored on a worker, by their original paths.
+    """Return where files that were sent are stored on a worker, by their original
+    paths.
 
-    Each set of files has its own directory below `folder`.
+    Each set of files, known by its digests, has a directory of its own below `folder`;
+    in it they lie as on the sending machine.
     """
     name = hashlib.sha256(json.dumps(sorted(digests.items())).encode()).hexdigest()[:32]
     return {
@@ -169,7 +173,9 @@ def locate_sent_files(digests: Mapping[str, str], folder: Path) -> dict[str, Pat
 
 
 def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
-    """Write files that were sent, each atomically."""
+    """Write files that were sent, each in one step, so that other workers on this
+    machine never see half of one.
+    """
     paths = locate_sent_files(compute_digests(contents), folder)
     for name, data in contents.items():
         path = paths[name]
@@ -209,9 +215,11 @@ def _has_digest(path: Path, digest: str) -> bool:
 
 
 def _split_paths(value: str) -> Iterator[str]:
-    """Split ``/a.glb#NODE,/b.obj`` into paths and separators, which join to the value.
+    """Split the value of a setting into paths and what stands between them, which join
+    to the value again.
 
-    Another example is ``/camera.csv+/object.csv``.
+    ``/a.glb#NODE,/b.obj`` gives ``/a.glb``, ``#NODE``, ``,`` and ``/b.obj``. Another
+    example is ``/camera.csv+/object.csv``.
     """
     for part in re.split("(,)", value):
         path, mark, node = part.strip().partition("#")
@@ -259,13 +267,15 @@ class Reply:
 
 
 def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
-    """Compute a batch of a task, which is loaded if it is not cached.
+    """Compute a batch of a task, and return the result with its times, or the failure.
 
-    After `deadline` seconds, or `LOAD_DEADLINE` of loading, the process ends, even if
-    native code hangs, and writes a traceback to its error output.
+    The task is loaded if it is not cached. The process ends itself after `deadline`
+    seconds of computing, or `LOAD_DEADLINE` of loading, even if native code hangs, and
+    writes a traceback to its error output.
     """
     worker = f"{platform.node()}, process {os.getpid()}"
     try:
+        # one batch at a time
         with _batch_lock:
             start = time.perf_counter()
             with kill_after(LOAD_DEADLINE):
@@ -329,7 +339,7 @@ def load_task(task: WorkerTask) -> BatchFunction:
 
 
 def task_key(task: WorkerTask) -> str:
-    """Return a digest that identifies a task."""
+    """Return a digest of all that decides what a loaded task computes."""
     described = [
         task.function,
         task.settings,
@@ -343,7 +353,8 @@ def task_key(task: WorkerTask) -> str:
 def make_private_directory() -> Path:
     """Return a directory on this machine that only this user can write to.
 
-    It outlives the worker.
+    It is the same for all workers of the user and outlives them; if somebody else has
+    made it, there is a new one.
     """
     folder = Path(tempfile.gettempdir()) / f"advsearch-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
@@ -361,11 +372,14 @@ SERVE_VARIABLE = "ADVSEARCH_WORKER"
 
 
 def serve() -> None:
-    """Run the calls that the parent process sends, until it ends.
+    """Run the calls that the parent process sends, until it ends; the body of a worker
+    process.
 
     A call is a pickled pair (function, arguments) on standard input; its pickled result
-    goes to standard output.
+    goes to standard output. Other code here sees an empty input, and what it prints
+    goes to the error output.
     """
+    # copies of the pipes for the calls, before 0 and 1 become something else
     calls = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)

@@ -60,6 +60,14 @@ class PoolWorkers:
         tell: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Make workers for a task.
+
+        Args:
+            executor: runs calls on its workers.
+            task: what the workers do.
+            tell: takes messages for the user.
+            clock: returns seconds; another one in tests.
+        """
         self.stats: WorkerStats = executor.stats
         self._executor = executor
         self._task = task
@@ -69,11 +77,17 @@ class PoolWorkers:
         self._dead_starts = 0
 
     def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
-        """See `Workers.results`."""
+        """See `Workers.compute`.
+
+        A batch whose workers die is split into its items, and a single item whose
+        workers die gives a result without a value.
+        """
         source = iter(batches)
+        # batches that are taken from `batches`, but not given out
         waiting = deque[Sequence[Any]]()
         running = dict[Future[Reply], Sequence[Any]]()
         ended: queue.SimpleQueue[Future[Reply]] = queue.SimpleQueue()
+        # of the last batches, for the deadline of the next
         item_seconds = deque[float](maxlen=MEDIAN_WINDOW)
         counted_at = self._clock()
         try:
@@ -104,6 +118,7 @@ class PoolWorkers:
                     reply = ended_future.result()
                     item_seconds.append(reply.seconds / max(1, len(items)))
                     yield self._read_reply(items, reply)
+                # the executor was lost, not the batch: do it again
                 elif isinstance(error, BrokenExecutor):
                     self.stats.retried += 1
                     waiting.appendleft(items)
@@ -136,8 +151,13 @@ class PoolWorkers:
         return bool(waiting)
 
     def _deadline(self, n_items: int, item_seconds: Sequence[float]) -> float:
-        """Return the seconds after which a worker counts as hanging, and ends
-        itself.
+        """Return after how many seconds a batch counts as hanging, so that its worker
+        ends itself.
+
+        Args:
+            n_items: of the batch.
+            item_seconds: seconds per item of the last batches; a few are needed for an
+                estimate.
         """
         if len(item_seconds) < MIN_BATCHES:
             deadline = LOAD_DEADLINE
@@ -149,11 +169,12 @@ class PoolWorkers:
         return max(deadline, self._task.seconds or 0.0)
 
     def _read_reply(self, items: Sequence[Any], reply: Reply) -> BatchResult:
-        """Return the result in a worker's reply, and count it.
+        """Return the result in a worker's reply; add its times and its machine to the
+        counts.
 
         Raises:
-            RuntimeError: if the worker's code raised an unexpected error.
-            ClusterError: for any other failure.
+            RuntimeError: the worker's code raised an unexpected error.
+            ClusterError: any other failure.
         """
         if reply.failure is Failure.BUG:
             raise RuntimeError(f"on {reply.worker}:\n{reply.error}")
@@ -162,6 +183,7 @@ class PoolWorkers:
         self.stats.batches += 1
         self.stats.busy += reply.seconds
         self.stats.loading += reply.loading
+        # alive counts without loading
         self.stats.alive -= reply.loading
         machine: str | None = digest_machine(reply.machine)
         if machine == self._this_machine:
@@ -178,10 +200,11 @@ class PoolWorkers:
         return BatchResult(items, reply.value, reply.worker, machine)
 
     def _count_dead_start(self) -> None:
-        """Count a worker that died before any batch was finished.
+        """Count a death of a worker, and give up if all die from the beginning, for
+        example while loading.
 
         Raises:
-            ClusterError: if as many died, for example while loading, that all will.
+            ClusterError: `MAX_DEAD_STARTS` died, and no batch was ever finished.
         """
         self._dead_starts += 1
         if self._dead_starts >= MAX_DEAD_STARTS and not self.stats.batches:
@@ -215,17 +238,18 @@ def open_workers(
     cluster: str | None,
     tell: Callable[[str], None],
 ) -> Iterator[Workers | None]:
-    """Open workers for a task.
+    """Open workers for a task, and end them after the block.
 
     Args:
         task: what the workers do.
-        workers: number of processes on this machine, by default one a core.
-        cluster: the address of a scheduler, or a YAML file.
+        workers: number of processes; None for the default, on this machine one a core.
+        cluster: the address of a scheduler, a YAML file, or "local" or None for this
+            machine.
         tell: takes messages for the user.
 
     Yields:
-        The workers, None if `workers` and `cluster` are None: then this process does
-            all.
+        The workers; None if `workers` and `cluster` are both None: then this process
+        does all.
     """
     if workers is None and cluster is None:
         yield None

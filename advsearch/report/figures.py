@@ -51,8 +51,8 @@ STYLE: dict[Any, Any] = {
 
 
 def new_axes() -> Any:
-    """Return matplotlib axes of a new figure of the calling program, which shows it as
-    it shows others.
+    """Return the axes of a new matplotlib figure, opened with pyplot so that the
+    calling program shows it like its own figures.
     """
     # late: matplotlib takes long to import
     import matplotlib.pyplot as plt
@@ -66,15 +66,20 @@ def render_figure(
     kinds: Sequence[str] = ("png", "svg"),
     style: dict[Any, Any] | None = None,
 ) -> Figures:
-    """Return a figure of a size in inches (width, height) as files of some kinds; the
-    style is what differs from `STYLE`.
+    """Draw a figure and return it as the contents of files.
+
+    Args:
+        draw: draws on the empty figure that it is given.
+        size: (width, height) of the figure in inches.
+        kinds: suffixes of the files to make, png or svg.
+        style: matplotlib settings that replace those of `STYLE`.
     """
     # late: matplotlib takes long to import
     import matplotlib.figure
 
     files = {}
     with matplotlib.rc_context({**STYLE, **(style or {})}), warnings.catch_warnings():
-        # a browser has the letter
+        # an SVG keeps its texts, and the browser that shows it has the letter
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
         draw(figure)
@@ -84,6 +89,7 @@ def render_figure(
                 stream,
                 format=kind,
                 dpi=150,
+                # without a date, the same figure always gives the same file
                 metadata={"Date": None} if kind == "svg" else None,
             )
             files[kind] = stream.getvalue()
@@ -109,6 +115,7 @@ def draw_fractions(
         series: their names, for the legend.
         colours: of the series; they repeat.
     """
+    # the dots of a row are spread over at most 0.8 of its height
     spacing = min(0.22, 0.8 / len(series))
     for index, label in enumerate(series):
         colour = colours[index % len(colours)]
@@ -124,6 +131,7 @@ def draw_fractions(
             axes.plot(fraction, y, mark, color=colour, ms=5, label=label)
             label = "_"  # a series has one line in the legend
     axes.set_yticks(range(len(rows)), list(rows))
+    # upside down: the first row is at the top
     axes.set(xlim=(-0.03, 1.03), ylim=(len(rows) - 0.4, -0.6))
     axes.grid(True, axis="x")
 
@@ -134,7 +142,8 @@ def draw_searches(
     axes: Any,
     zero_means: str = "",
 ) -> None:
-    """Draw how the best objective of searches grows over their evaluations.
+    """Draw the best objective so far of searches against their evaluations: a line for
+    the best so far, and a faint dot for each single evaluation.
 
     Args:
         objectives: of each evaluation of each search, by the search's name; None where
@@ -148,7 +157,9 @@ def draw_searches(
         objectives.items(), styles, strict=False
     ):
         objective = np.array(values, dtype=float)  # None is NaN
+        # fmax skips NaN
         best = np.fmax.accumulate(objective) if len(objective) else objective
+        # of a long search only some points are drawn
         indices = _select_points(len(objective))
         # a dot is a line without a length: all of them are one path, and a page stays
         # small
@@ -215,13 +226,22 @@ def draw_heat_map(
     x_label: str,
     y_label: str,
 ) -> None:
-    """Draw values as colours, rows from the lowest, with what they mean and the names
-    of both axes.
+    """Draw a table of values as a map of colours, with a colour bar.
+
+    Args:
+        axes: of matplotlib, on which it is drawn.
+        values: rows of the map, the lowest first.
+        extent: (left, right, bottom, top) of the map on the axes.
+        meaning: of the colours, the label of their bar; `ACCURACY` has the range 0 to
+            1.
+        x_label: the name of the horizontal axis.
+        y_label: the name of the vertical axis.
     """
     finite = [abs(value) for row in values for value in row if math.isfinite(value)]
     if meaning == ACCURACY:
         colours: dict[str, str | float] = {"cmap": "RdBu", "vmin": 0.0, "vmax": 1.0}
     else:
+        # the same limit on both sides, so that 0 has the middle colour
         limit = max([*finite, 1e-6])
         colours = {"cmap": "RdBu", "vmin": -limit, "vmax": limit}
     image = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **colours)
@@ -259,18 +279,27 @@ Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Ma
 
 
 def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
-    """Return a picture (H, W, 3), display-referred sRGB in [0, 1], with shapes drawn
-    into it, magnified where it is small: (h, w, 3) float32.
+    """Return a picture with boxes, masks and maps drawn into it.
 
-    The box or the outline of what is true is blue; a box of the model is orange, and
-    its mask tinted so. The text of a box stands at its upper left corner, that of the
-    true one at the lower left. Maps stand to the right of the picture, what is true
-    first, in greys of one range: that of what is true.
+    What is true is blue, what the model says is orange: boxes and the outline of a true
+    mask are lines, a mask of the model is a tint. The text of the model's box stands
+    above its upper left corner, that of the true box below its lower left. Maps stand
+    to the right of the picture, the true one first, in greys that all use the range of
+    the first.
+
+    Args:
+        picture: (H, W, 3), display-referred sRGB in [0, 1]; a small one is magnified.
+        shapes: what is drawn, with coordinates in pixels of `picture`.
+
+    Returns:
+        The drawing (h, w, 3), float32 in [0, 1].
     """
     levels = to_8bit(picture)
+    # rounded up, so that the longest side has MIN_IMAGE_SIDE pixels at least
     factor = max(1, -(-MIN_IMAGE_SIDE // max(levels.shape[:2])))
     size = levels.shape[1] * factor, levels.shape[0] * factor
     image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
+    # false comes before true, so that true masks are drawn last and stay visible
     for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
             _draw_mask(image, shape)
@@ -284,9 +313,10 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
 
 
 def _draw_mask(image: Image.Image, shape: Shape) -> None:
-    """Tint the pixels of a mask of the model, or draw the outline of a true one."""
+    """Tint the pixels of a mask of the model, or draw only the outline of a true mask."""
     small_mask = Image.fromarray(np.asarray(shape.mask, dtype=bool))
     mask = np.asarray(small_mask.resize(image.size, Image.Resampling.NEAREST))
+    # how much of the colour covers each pixel, in [0, 1]
     strength = mask * TINT
     if shape.true:
         strength = _find_outline(mask).astype(float)
@@ -296,7 +326,11 @@ def _draw_mask(image: Image.Image, shape: Shape) -> None:
 
 
 def _find_outline(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Return the pixels of a mask within two pixels of its border along an axis."""
+    """Return which pixels of a mask (H, W) belong to its outline, two pixels wide.
+
+    A pixel is inside where the pixels two steps above, below, left and right of it are
+    in the mask too; the rest of the mask is outline.
+    """
     padded = np.pad(mask, 2)
     inner = (
         mask
@@ -312,7 +346,9 @@ def _find_outline(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 def _draw_boxes(
     image: Image.Image, shapes: Sequence[Shape], factor: int, font: Any
 ) -> None:
-    """Draw the boxes of shapes, and then their texts, of which none covers another."""
+    """Draw the boxes of shapes, then their texts, each placed so that it covers no text
+    before it.
+    """
     draw = ImageDraw.Draw(image)
     boxes = [
         (shape, _to_pixel_corners(shape.box, factor, image.size))
@@ -332,9 +368,14 @@ def _draw_boxes(
 def _make_map_panels(
     shapes: Sequence[Shape], size: tuple[int, int], font: Any
 ) -> list[Image.Image]:
-    """Return the maps of shapes as grey images with texts, the true one first."""
+    """Return the maps of shapes as grey images with their texts, the true one first.
+
+    Black and white are the smallest and the largest value of the first map; `size` is
+    (width, height) of each image in pixels.
+    """
     maps = sorted(
         (shape for shape in shapes if shape.map is not None),
+        # false comes before true
         key=lambda shape: not shape.true,
     )
     if not maps:
@@ -344,6 +385,7 @@ def _make_map_panels(
     panels = []
     for shape in maps:
         values = np.asarray(shape.map, dtype=np.float64)
+        # the small number is for a map of one value
         greys = np.clip((values - lower) / max(upper - lower, 1e-12), 0.0, 1.0)
         levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
         grey_image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
@@ -357,13 +399,19 @@ def _make_map_panels(
 def _to_pixel_corners(
     box: Box, factor: int, size: tuple[int, int]
 ) -> tuple[int, int, int, int]:
-    """Return the first and last pixels of a box in the magnified image, inside of
-    it.
+    """Return (left, top, right, bottom) of a box in the magnified image, in whole
+    pixels that all belong to the box and lie inside the image.
+
+    Args:
+        box: (x0, y0, x1, y1) in pixels of the image before it was magnified.
+        factor: by which the image was magnified.
+        size: (width, height) of the magnified image.
     """
     x0, y0, x1, y1 = (round(bound * factor) for bound in box)
     width, height = size
     left = min(max(x0, 0), width - 1)
     top = min(max(y0, 0), height - 1)
+    # x1 and y1 are the ends, one past the last pixel
     right = min(x1, width) - 1
     bottom = min(y1, height) - 1
     return left, top, max(left, right), max(top, bottom)
@@ -377,13 +425,24 @@ def _write_label(
     font: Any,
     text_boxes: Sequence[tuple[int, int, int, int]],
 ) -> tuple[int, int, int, int]:
-    """Write the text of a shape at its box, and return the text's box.
+    """Write the text of a shape at its box, and return the box (x0, y0, x1, y1) of the
+    text.
 
-    It stands above the box, or below that of what is true, moved up or down to where no
-    other text is.
+    The text of the model stands above its shape's box, that of the true shape below.
+    Where that would cover another text, it moves to the nearest free height. All
+    lengths are pixels.
+
+    Args:
+        draw: draws on the image.
+        shape: has the text.
+        corners: (left, top, right, bottom) of the shape.
+        size: (width, height) of the image.
+        font: of the text.
+        text_boxes: the boxes of texts written before.
     """
     text = f"true: {shape.text}" if shape.true else shape.text
     left, top, right, bottom = map(round, draw.textbbox((0, 0), text, font=font))
+    # 3 pixels of background on each side
     width = right - left + 6
     height = bottom - top + 6
     x = max(0, min(corners[0], size[0] - width))
@@ -402,6 +461,7 @@ def _write_label(
     y = next(filter(is_free, nearest_first), preferred_y)
     background = TRUE_COLOR if shape.true else PREDICTED_COLOR
     draw.rectangle((x, y, x + width, y + height), fill=background)
+    # a font may begin a little right of and below the place it is given
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
     return x, y, x + width, y + height
 
@@ -417,18 +477,21 @@ MIN_TILE_WIDTH = 160
 def make_contact_sheet(
     pictures: Sequence[Floats], captions: Sequence[Sequence[str]]
 ) -> Floats:
-    """Return pictures side by side on white, each over lines of text, as float32.
+    """Return pictures in rows on a white sheet (h, w, 3), float32, each above its lines
+    of text.
 
     Args:
         pictures: (H, W, 3), display-referred sRGB in [0, 1], all of one size; small
             ones are magnified.
-        captions: lines of each picture; what is too long for the tile is cut.
+        captions: the lines of each picture; what is too long for the tile is cut.
     """
     factor = math.ceil(MIN_TILE_WIDTH / pictures[0].shape[1])
     height, width = (factor * side for side in pictures[0].shape[:2])
+    # all captions get the room of the longest
     cell = width + GAP, height + LINE * max(map(len, captions)) + GAP
     n_columns = choose_column_count(len(pictures))
     n_rows = math.ceil(len(pictures) / n_columns)
+    # each cell has its gap at the right and below, so one more is at the left and above
     sheet_size = GAP + n_columns * cell[0], GAP + n_rows * cell[1]
     sheet = Image.new("RGB", sheet_size, "white")
     for index, picture in enumerate(pictures):
@@ -465,6 +528,7 @@ def _write_caption(
     """Write lines of text below each other, each cut to a width in pixels."""
     left, top = corner
     for index, line in enumerate(lines):
+        # so many letters fit in no tile, and the loop below cuts one at a time
         text = " ".join(line[:200].split())
         start = text
         while start and draw.textlength(text, font=font) > width:
@@ -478,6 +542,7 @@ def choose_column_count(count: int) -> int:
     divisor of the count if one is near.
     """
     min_columns = math.ceil(math.sqrt(count))
+    # with a divisor of the count, the last row is full
     for n_columns in range(min_columns, 2 * min_columns + 1):
         if count % n_columns == 0:
             return n_columns

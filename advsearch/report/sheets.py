@@ -118,14 +118,27 @@ def write_sheets(
     max_sheets: int = DEFAULT_MAX_SHEETS,
     make_last_page: Callable[[str, tuple[float, float], Any], Figure] | None = None,
 ) -> int:
-    """Write the PDF of at least one piece, and return how many pages it has.
+    """Write pieces at their real size to a PDF for a printer, and return how many pages
+    it has.
 
-    Colours are converted into an ICC `profile` of an RGB printer; None leaves them
-    sRGB. At most so many sheets, 1 to `MAX_SHEETS`, may follow the first page, which
-    has the title. `make_last_page` makes one more page, of the title, the size of the paper and
-    the conversion of the profile, if any. Raises InputError where there is no such
-    paper, or there would be more sheets, and FileFormatError where the profile is none
-    of an RGB printer.
+    The first page has the title and how to print; sheets with the parts of the pieces
+    follow.
+
+    Args:
+        path: of the PDF.
+        pieces: what is printed, at least one.
+        title: of the whole.
+        paper: a name in `PAPERS`.
+        profile: the ICC profile of an RGB printer, to which colours are converted; None
+            leaves them sRGB.
+        max_sheets: how many sheets there may be between the first and the last page, 1
+            to `MAX_SHEETS`.
+        make_last_page: makes one more page from the title, the size of the paper in
+            millimetres and the colour conversion (None without a profile).
+
+    Raises:
+        InputError: there is no such paper, or more sheets would be needed.
+        FileFormatError: the profile is not that of an RGB printer.
     """
     if paper not in PAPERS:
         raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
@@ -178,9 +191,18 @@ def write_sheets(
 def arrange_pages(
     pieces: Sequence[Piece], paper: tuple[float, float]
 ) -> Iterator[list[PlacedPart]]:
-    """Yield what is on each page: rows of parts, the highest first, from the upper
-    left. Raises InputError where a pixel is larger than a page, or there would be more
-    than `MAX_SHEETS` pages.
+    """Yield the parts on each page, with their places.
+
+    Pieces are cut into parts that fit on a page. The highest part comes first, and
+    parts fill a page row by row from its upper left corner.
+
+    Args:
+        pieces: what is printed.
+        paper: (width, height) in millimetres.
+
+    Raises:
+        InputError: a pixel is larger than a page, or a piece needs more than
+            `MAX_SHEETS` pages.
     """
     width = paper[0] - 2 * MARGIN
     height = paper[1] - 2 * MARGIN - FOOT
@@ -202,6 +224,7 @@ def arrange_pages(
             x = 0.0
             y = 0.0
             row_height = 0.0
+        # a part is placed by its trimmed corner, inside its bleed and marks
         frame = part.piece.frame
         page.append(replace(part, x=MARGIN + x + frame[0], y=MARGIN + y + frame[1]))
         x = x + part_width
@@ -211,12 +234,14 @@ def arrange_pages(
 
 
 def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart]:
-    """Cut a piece into equal parts that fit on a page with bleed and marks.
+    """Cut a piece into equal parts that fit on a page together with bleed and marks.
 
-    The cuts lie between pixels. Width and height of the page are in millimetres.
+    The cuts lie between pixels. `width` and `height` of the page are in millimetres.
+    The parts are not placed yet.
     """
     left, top = piece.bleed
     n_rows, n_columns = piece.picture.shape[:2]
+    # the length is in pixels without bleed, the room is that beside the marks
     columns = _cut_evenly(
         n_columns - 2 * left, (width - 2 * piece.frame[0]) / piece.pixel[0]
     )
@@ -235,7 +260,11 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
 
 
 def _cut_evenly(length: int, max_length: float) -> list[tuple[int, int]]:
-    """Return bounds of the fewest equal parts of a length, in pixels, that fit.
+    """Cut a length into the fewest equal parts that fit, and return the (begin, end) of
+    each.
+
+    All numbers are pixels. Parts differ by a pixel where the length is no multiple of
+    their number.
 
     Raises:
         InputError: not even one pixel fits.
@@ -300,6 +329,7 @@ def _make_cover(
     top = y + 15.0
     right = x + SQUARE
     bottom = y + 15.0 + SQUARE
+    # the square to measure
     _draw_line(axes, [x, right, right, x, x], [top, top, bottom, bottom, top])
     axes.text(x, bottom + 10.0, "\n".join(lines), fontsize=9, va="top", linespacing=1.6)
     _draw_ruler(axes, paper)
@@ -307,32 +337,43 @@ def _make_cover(
 
 
 def _draw_ruler(axes: Axes, paper: tuple[float, float]) -> None:
-    """Draw a ruler at the foot of a page, with a mark at each centimetre."""
+    """Draw a ruler at the foot of a page, with a mark at each centimetre, so that the
+    scale of the print can be checked.
+    """
     x = MARGIN
     y = paper[1] - MARGIN
     _draw_line(axes, [x, x + RULER], [y, y])
     for centimetre in range(int(RULER) // 10 + 1):
         mark_x = x + 10.0 * centimetre
+        # each fifth mark is longer
         mark_length = 4.0 if centimetre % 5 == 0 else 2.5
         _draw_line(axes, [mark_x, mark_x], [y, y - mark_length])
     axes.text(x + RULER + 3.0, y, f"{RULER:g} mm", fontsize=7, va="bottom")
 
 
 def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
-    """Draw a part on its page: image with bleed, marks, line to cut along and name."""
+    """Draw a part on its page: picture with bleed, cut marks, outline to cut along, and
+    name.
+
+    `convert` converts colours from sRGB to those of the printer; None leaves them.
+    """
     piece = part.piece
     x0, x1, y0, y1 = part.trim
     bleed_x, bleed_y = piece.bleed
     pixel_width, pixel_height = piece.pixel
+    # the part with the bleed around it
     picture = piece.picture[y0 - bleed_y : y1 + bleed_y, x0 - bleed_x : x1 + bleed_x]
     if convert is not None:
         picture = np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
+    # left and right, top and bottom edge in millimetres: trim is without bleed, outer
+    # with it
     trim_x = part.x, part.x + (x1 - x0) * pixel_width
     trim_y = part.y, part.y + (y1 - y0) * pixel_height
     outer_x = trim_x[0] - bleed_x * pixel_width, trim_x[1] + bleed_x * pixel_width
     outer_y = trim_y[0] - bleed_y * pixel_height, trim_y[1] + bleed_y * pixel_height
     axes.imshow(
         picture,
+        # left, right, bottom, top: y grows downwards on the page
         extent=(outer_x[0], outer_x[1], outer_y[1], outer_y[0]),
         interpolation="none",
         aspect="auto",
@@ -350,7 +391,18 @@ def _draw_cut_marks(
     outer_x: tuple[float, float],
     outer_y: tuple[float, float],
 ) -> None:
-    """Draw two marks at each corner, outside of the bleed, in line with the trim."""
+    """Draw two short lines at each corner that show where to cut.
+
+    They stand outside of the bleed, in line with the edges of the trimmed part. Each
+    argument is a pair of edges in millimetres: left and right, or top and bottom.
+
+    Args:
+        axes: of the page.
+        trim_x: left and right edge of the trimmed part.
+        trim_y: its top and bottom edge.
+        outer_x: left and right edge with bleed.
+        outer_y: top and bottom edge with bleed.
+    """
     for x, edge_x, sign_x in zip(trim_x, outer_x, (-1.0, 1.0), strict=True):
         for y, edge_y, sign_y in zip(trim_y, outer_y, (-1.0, 1.0), strict=True):
             mark_x = [
@@ -366,10 +418,16 @@ def _draw_cut_marks(
 
 
 def _draw_cut_line(axes: Axes, part: PlacedPart, inside: Mask) -> None:
-    """Draw the outline of what is cut out of a part, (rows, columns)."""
+    """Draw the outline of what is cut out of a part; `inside` says which of its pixels
+    are.
+
+    It has the shape (rows, columns) of the part without bleed.
+    """
     n_rows, n_columns = inside.shape
     pixel_width, pixel_height = part.piece.pixel
+    # one pixel of outside around all, or the outline would stay open at the edges
     padded = np.pad(inside.astype(float), 1)
+    # the centre of each pixel, in millimetres
     xs = part.x + (np.arange(-1, n_columns + 1) + 0.5) * pixel_width
     ys = part.y + (np.arange(-1, n_rows + 1) + 0.5) * pixel_height
     axes.contour(xs, ys, padded, levels=[0.5], colors="black", linewidths=0.3)

@@ -146,13 +146,18 @@ class ResultPart:
     def make_table(
         cls, rows: Iterable[Any], columns: Mapping[str, Column], **more: Any
     ) -> ResultPart:
-        """Return a table, a row for each of some values, with columns by their heads,
-        and `more` of its attributes.
+        """Return a table with a row for each of some values.
+
+        Args:
+            rows: the values.
+            columns: by the head of each column, what makes its cell from a value: a
+                function, or a text for `str.format`.
+            more: other attributes of the part.
         """
         cells = [
             [
-                cells(row) if callable(cells) else cells.format(row)
-                for cells in columns.values()
+                column(row) if callable(column) else column.format(row)
+                for column in columns.values()
             ]
             for row in rows
         ]
@@ -227,11 +232,16 @@ def list_subjects(result: Result, view: ShownResult) -> list[str]:
 
 
 def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
-    """Return what a result was made with, by name, the facts of its view first."""
+    """Return what a result was made with, as texts by name.
+
+    Facts of the view come first, and replace common facts of the same name; empty ones
+    are left out.
+    """
     renders = getattr(result, "renders", None)
     seconds = getattr(result, "seconds", None)
     n_renders = sum(renders.values()) if isinstance(renders, Mapping) else renders
     environment = getattr(result, "environment", "")
+    # they are told already, all of them
     if "environments" in view.facts:
         environment = ""
     common_facts = {
@@ -242,7 +252,7 @@ def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
         "seed": str(getattr(result, "seed", "")),
         **result.facts(),
     }
-    # the view's facts stand first, and their texts count
+    # the first one sets the order, the last one the texts: both are the view's
     facts = {**view.facts, **common_facts, **view.facts}
     return {name: text for name, text in facts.items() if text}
 
@@ -256,6 +266,7 @@ def make_default_view(result: Result) -> ShownResult:
     values = {name: getattr(result, name) for name in type(result).described()}
     tables = {name: value for name, value in values.items() if _is_table(value)}
     facts = _find_plain_facts(result, values, tables)
+    # objects with fields, and those of their names that the reader sees
     described: list[tuple[Fields, set[str]]] = [
         (result, {name for name, text in facts.items() if text})
     ]
@@ -279,7 +290,9 @@ def _is_table(value: object) -> bool:
 def _find_plain_facts(
     result: Result, values: Mapping[str, Any], tables: Iterable[str]
 ) -> dict[str, str]:
-    """Return the fields of a result that no table and no heading has, as texts."""
+    """Return, as texts by name, those fields of a result that no table and no other
+    part of the page shows.
+    """
     fact_names = [name.replace(" ", "_") for name in result.facts()]
     elsewhere = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
     return {
@@ -311,10 +324,13 @@ def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
 
 
 def _explain_words(described: Iterable[tuple[Fields, set[str]]]) -> ResultPart:
-    """Return a table of what words mean, by the descriptions of the fields they name.
+    """Return a table that explains the names on the page by the descriptions of the
+    fields.
 
     Args:
-        described: objects with fields, and the words that are used of each.
+        described: objects with fields, each with the names of its fields that are on
+            the page. Where two fields have one name, the first one's description is
+            taken.
     """
     meanings = dict[str, str]()
     for fields, words in described:
@@ -410,8 +426,14 @@ REASON_OF_ENDING = {
 def make_case_claim(
     name: str, ending: str, rate: VerifiedRate | None, spent: str | None
 ) -> Claim:
-    """One adversarial scene of many. `spent` is what was searched; None where nothing
-    was, and a scene was only tried again.
+    """Return the claim about one adversarial scene of many.
+
+    Args:
+        name: what the scene is called.
+        ending: how its search, or its trials, ended.
+        rate: of its trials.
+        spent: what was searched; None where nothing was searched, and a known scene was
+            only tried again.
     """
     extent = make_rate_extent("fresh renders that count as a success", rate)
     if ending == "found" and rate is not None and rate.successes:
@@ -456,7 +478,13 @@ def make_average_claim(case: AverageCase, name: str) -> Claim:
 
 def format_searches(renders: Mapping[str, int], policy: str, random: bool) -> str:
     """Return how much was searched: ``24 renders by the policy auto and 24 by random
-    search``, and how many images were predicted instead.
+    search``.
+
+    Args:
+        renders: numbers of renders by purpose; "products" counts images that were
+            predicted instead of rendered.
+        policy: of the search.
+        random: random search ran too, for comparison.
     """
     n_renders = renders.get("search", 0) + renders.get("gradient", 0)
     text = f"{wording.format_count(n_renders, 'render')} by the policy {policy}"
@@ -482,6 +510,16 @@ def make_extent(
     interval: Interval | None,
     share: float | None = None,
 ) -> Extent:
+    """Return how much a claim rests on: `count` of `total`, with the interval of their
+    share.
+
+    Args:
+        what: is counted.
+        count: how many there were.
+        total: of how many.
+        interval: of the share, in [0, 1]; None is the whole of [0, 1].
+        share: where it is not count over total, for example weighted.
+    """
     return Extent.from_count(what, count, total, interval, share)
 
 
@@ -711,9 +749,15 @@ def make_chart_svg(
     width: int = WIDE_WIDTH,
     height: int = CHART_HEIGHT,
 ) -> Html:
-    """Return what `draw` draws on axes, without its title and with the page's legend.
-    The words say what it shows to who does not see it; width and height are in CSS
-    pixels.
+    """Return a chart as an SVG element for a page.
+
+    The title of the axes is left out, and the legend stands above in the page's colour.
+
+    Args:
+        draw: draws on the axes that it is given.
+        description: the text for readers who cannot see the chart.
+        width: in CSS pixels.
+        height: in CSS pixels.
     """
 
     def on_figure(figure: Figure) -> None:
@@ -727,6 +771,7 @@ def make_chart_svg(
             loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"]
         )
 
+    # inches: 72 pixels each
     (file,) = render_figure(
         on_figure, (width / 72, height / 72), ("svg",), STYLE
     ).values()
@@ -742,11 +787,12 @@ def make_chart_svg(
 
 
 def _make_inline_svg(svg: str, prefix: str) -> Html:
-    """Return what a file in SVG draws: without its head, hundredths of a pixel, names
-    and frames to cut at.
+    """Return the shapes of an SVG file, made small and fit to stand in a page.
 
-    All that is drawn lies in the frame. Names that are pointed at, those of markers,
-    stay, behind the prefix: a page of two charts would have them twice.
+    Left out are the head of the file, clipping frames (all that is drawn lies in the
+    frame anyway), digits of coordinates after the first decimal, and ids that nothing
+    refers to. The other ids get a prefix, so that two charts on one page have none in
+    common. Fixed colours become variables of the page's style.
     """
     shapes = svg[svg.index("<g ") : svg.rindex("</svg>")]
     unneeded = (

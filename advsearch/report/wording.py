@@ -119,9 +119,11 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
     """Return ``83`` for 0.83, ``4.6`` for 0.0459, ``0.02`` for 0.000211 and ``99.98``
     for 0.99979.
 
-    Within five of 0 or 100 it has one decimal, and nearer to them as many, `max_decimals` at
-    max_decimals, as show how far it is away.
+    Within five percent of 0 or 100 there is at least one decimal, and nearer to them so
+    many that the first digit of the distance shows, up to `max_decimals`. What would
+    still be rounded to 0 or 100 becomes ``under 0.01`` or ``over 99.99``.
     """
+    # in percent, as all below
     value = 100.0 * fraction
     distance = min(value, 100.0 - value)
     if distance >= 5.0 or distance <= 0.0:
@@ -141,8 +143,11 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
 def format_fraction_of(
     count: int, total: int, interval: tuple[float, float], share: float | None = None
 ) -> str:
-    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``;
-    the share is count over total unless another one is given.
+    """Return a share with its interval and the number that it is of: ``12 % (9 to 16)
+    of 340``.
+
+    The share is count over total unless `share` gives another one, for example
+    weighted.
     """
     if not total:
         return "none of 0"
@@ -155,8 +160,13 @@ def format_fraction_of(
 
 
 def explain_repeats(name: str, repeats: int, units: int) -> str:
-    """Return what is said of a sweep in which nothing is drawn, with so many `repeats`
-    of each of its units, which are called by a `name`.
+    """Return sentences for a sweep in which nothing is drawn by chance, so that repeats
+    of a unit differ in the noise of rendering alone.
+
+    Args:
+        name: what a unit is called.
+        repeats: of each unit.
+        units: how many there are.
     """
     if units == 1:
         return (
@@ -178,8 +188,12 @@ def add_article(name: str) -> str:
 
 
 def format_paired_rates(run: str, pair: Any) -> str:
-    """Return how often a model is right without and with the adversarial scene of a run
-    (`PairedRates`), in sentences.
+    """Return, in sentences, how often a model is right without and with an adversarial
+    scene.
+
+    Args:
+        run: the name of the run that found the scene.
+        pair: its `PairedRates`.
     """
     clean, adversarial = (
         f"{arm.correct} of {arm.configurations} ({percent(arm.accuracy)}, 95 % "
@@ -189,6 +203,7 @@ def format_paired_rates(run: str, pair: Any) -> str:
     )
     lower, upper = (100.0 * bound for bound in pair.interval)
     if pair.difference < 0:
+        # "fewer" says the sign: the bounds lose theirs, and so swap places
         interval = f"{-upper:.0f} to {-lower:.0f}"
         direction = "fewer"
     else:
@@ -243,10 +258,10 @@ def format_goal(objective: str, thing: str) -> str:
 
 
 def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
-    """Return a prediction and its number, for a table.
+    """Return the two cells of a prediction in a table: what is predicted, and a number.
 
     For instance ``["vase", "84 %"]`` and ``["no cup found", "best score of cup
-    0.12"]``.
+    0.12"]``. The second is empty where there is none.
     """
     label = prediction.label
     probability = prediction.probability
@@ -265,7 +280,9 @@ def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
 
 
 def _similarity_text(probability: float, payload: Any) -> str:
-    """Return how similar the best reference is, and where the right one ranks."""
+    """Return how similar the best reference is, and at which rank the right one is if
+    it is not the best.
+    """
     text = percent(probability, PROBABILITY_DECIMALS)
     if not isinstance(payload, dict) or "cosine" not in payload:
         return text
@@ -278,7 +295,11 @@ def _similarity_text(probability: float, payload: Any) -> str:
 
 
 def _detection_cells(label: str, score: float, payload: Any) -> list[str]:
-    """Return what a detector finds, and its score and overlap."""
+    """Return the two cells of a detector's prediction: what it finds, and with which
+    score and overlap.
+
+    Where it missed a cup, `label` is "no cup", and `score` the best one of any cup.
+    """
     outcome = get_outcome(payload)
     stated = payload if isinstance(payload, dict) else {}
     if outcome is Outcome.MISSED:
@@ -318,8 +339,11 @@ VISIBLE_HEADS = (
 
 
 def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
-    """Return what is visible of each thing, for a table, from its name to
-    `runs.results.ThingSeen` as a mapping.
+    """Return a table of what is visible of each thing: name, visible share, box,
+    distance.
+
+    Args:
+        things: by name, each a `runs.results.ThingSeen` as a mapping.
     """
     rows = []
     for name, thing in things.items():
@@ -351,7 +375,9 @@ def format_image_prediction_cells(task: str, prediction: AnyPrediction) -> list[
 
 
 def format_image_prediction(task: str, prediction: AnyPrediction) -> str:
-    """Return the same on one line: ``cup (score 0.77)``, ``mug 91 %``."""
+    """Return one of the predictions of a whole picture on one line: ``cup (score
+    0.77)``, ``mug 91 %``.
+    """
     label, number = format_image_prediction_cells(task, prediction)
     return (
         f"{label} ({number})"
@@ -363,8 +389,14 @@ def format_image_prediction(task: str, prediction: AnyPrediction) -> str:
 def format_mistake(
     task: str, thing: str, label: str, outcome: Outcome | None = None
 ) -> str:
-    """Return what a model does to a thing, as a clause: ``calls this mug a vase``,
-    ``finds no cup``; of a detector by what becomes of the thing.
+    """Return what a model does wrong with a thing, as a clause: ``calls this mug a
+    vase``, ``finds no cup``.
+
+    Args:
+        task: of the model.
+        thing: what it is called in the clause, such as "this mug".
+        label: that the model predicts.
+        outcome: what became of the thing; None where the task has no outcomes.
     """
     if label == NOT_A_NUMBER:
         return f"predicts nothing for {thing}, for its output is not a number"
@@ -390,16 +422,16 @@ def format_mistake(
 def format_mistake_participle(
     task: str, label: str, outcome: Outcome | None = None
 ) -> str:
-    """Return the same of a thing that was named already: ``calling it a vase``,
-    ``finding no cup``.
+    """Return what a model does wrong with a thing that was named already, as a
+    participle: ``calling it a vase``, ``finding no cup``.
     """
     verb, _, rest = format_mistake(task, "it", label, outcome).partition(" ")
     return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
 
 
 def format_outcomes(outcomes: Mapping[str, int] | None, task: str = "") -> str:
-    """Return how often each outcome came about that is not right: ``12 missed, 6 in a
-    loose box``; empty where nothing is known of them.
+    """Return how often each outcome but the right one came about: ``12 missed, 6 in a
+    loose box``; empty where nothing is known of outcomes.
     """
     names = _OUTCOMES | ({Outcome.LOOSE: _LOOSELY[task]} if task in _LOOSELY else {})
     counts = (
@@ -410,8 +442,13 @@ def format_outcomes(outcomes: Mapping[str, int] | None, task: str = "") -> str:
 
 
 def get_only_outcome(outcomes: Mapping[str, int] | None) -> Outcome | None:
-    """Return the outcome of all of some predictions; None where they have several, or
-    nothing is known of them.
+    """Return the outcome that all of some predictions had.
+
+    Args:
+        outcomes: how often there was each, by name.
+
+    Returns:
+        The outcome; None where there were several, or nothing is known of them.
     """
     return (
         get_outcome({"outcome": next(iter(outcomes))})
@@ -461,8 +498,8 @@ def format_interval(interval: Interval | None) -> str:
 
 
 def format_rate(rated: VerifiedRate) -> str:
-    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many outputs
-    are not numbers.
+    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``, and of how many the
+    model's output was not a number.
     """
     nan_text = (
         f"in {rated.not_a_number} its output is not a number"
@@ -513,8 +550,8 @@ def format_count(number: Any, thing: str) -> str:
 
 
 def format_workers(shared: SharedWork | None) -> str:
-    """Return how many workers shared the work, and where their time went; empty if
-    nothing was shared.
+    """Return how many workers shared the work, and where their time went; empty if one
+    process did all.
     """
     if shared is None:
         return ""
@@ -535,8 +572,12 @@ def format_workers(shared: SharedWork | None) -> str:
 def format_formation(
     formation: Formation, gains: Mapping[str, float] | None = None
 ) -> str:
-    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn),
-    exposure 0 stops, gain 1.35``; gains of several scenes by their names.
+    """Return how images were formed: ``128 x 128 pixels, box filter, denoised (oidn),
+    exposure 0 stops, gain 1.35``.
+
+    Args:
+        formation: the settings of it.
+        gains: of several scenes, by their names, where each has its own.
     """
     height, width = formation.resolution
     denoised = "not denoised"
@@ -606,7 +647,9 @@ NO_TWINS = (
 
 
 def format_twin_evidence(evidence: TwinEvidence) -> str:
-    """Return in a sentence or two how far a verdict holds for photographs."""
+    """Return, in a sentence or two, how far a verdict on renders holds for photographs,
+    by a run that compared pairs of both.
+    """
     name = PurePath(evidence.run).name
     row = evidence.row
     if row is None:

@@ -121,7 +121,7 @@ class RunDirectory:
             RunExistsError: there is something already.
         """
         path = _make_numbered_directory(default) if run is None else locate_run(run)
-        # or the folder of the study that it is a part of would be made
+        # else the missing folder of a moved study would be made again
         check_not_moved(path)
         check_free(path, overwrite=overwrite)
         with storage_errors(path):
@@ -180,9 +180,15 @@ class RunDirectory:
 
     @classmethod
     def resume(cls, run: str | Path, config: Config | None = None) -> RunDirectory:
-        """Open and lock the directory of a run, to go on with it by `config`, if
-        anything goes on; an InputError says if another process works on it, or it would
-        give other numbers than the run began with.
+        """Open and lock the directory of a run, to go on with it.
+
+        Args:
+            run: its name or path.
+            config: what it goes on with; None where nothing goes on.
+
+        Raises:
+            InputError: another process works on it, or `config` would give other
+                numbers than the run began with.
         """
         check_not_moved(locate_run(run))
         path = find_run(run)
@@ -206,7 +212,9 @@ class RunDirectory:
         return f"start again with advsearch run {self.path / CONFIG}"
 
     def _note_start(self, config: Config) -> None:
-        """Note what decides the numbers of a new run."""
+        """Store what decides the numbers of a new run: parts from Python, versions and
+        settings.
+        """
         if config.python_only_parts:
             self.store.write_note(
                 PYTHON_ONLY_NOTE, json.dumps(config.python_only_parts)
@@ -214,14 +222,16 @@ class RunDirectory:
         self.check_unchanged(
             summary.VERSIONS_NOTE, summary.collect_versions(_known_settings(config))
         )
-        # last: with it the others are there, too
+        # the last note: where it is there, the others are too
         self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
 
     def _check_settings_unchanged(self, config: Config) -> None:
-        """Refuse settings, versions and files that decide other numbers than those that
-        are stored.
+        """Check that settings, versions and files are those that the run began with.
+
+        Raises:
+            InputError: some are not, so that it would give other numbers.
         """
-        # it was killed before anything was noted
+        # the run was killed before it noted anything: it begins now
         if self.store.read_note(SETTINGS_NOTE) is None:
             if self.store.count_rows():
                 raise FileFormatError(
@@ -241,7 +251,14 @@ class RunDirectory:
         )
 
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
-        """Store facts that decide the numbers of the run under a note.
+        """Store facts that decide the numbers of the run, or check that those stored
+        are the same.
+
+        A fact that is not stored yet is added to the others.
+
+        Args:
+            note: the name under which they are stored.
+            facts: by name.
 
         Raises:
             InputError: a fact is not what it was when it was stored first; the run
@@ -279,8 +296,12 @@ class RunDirectory:
     def append_rows(
         self, *rows: store.Row, cached: store.CachedEvaluation | None = None
     ) -> None:
-        """Add evaluated configurations to the results, and what the last of them told
-        its search; they survive a kill when this returns (see `store`).
+        """Add evaluated configurations to the results; they survive a kill when this
+        returns (see `store`).
+
+        Args:
+            rows: what was evaluated.
+            cached: what the last row told its search, beside the row.
         """
         self.store.append(rows, cached)
         if self._tracker is not None:
@@ -357,8 +378,8 @@ class RunDirectory:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing in it to lose: no result, part, row or answer that
-        was paid for.
+        """Whether nothing would be lost with it: it has no result, no part, no row and
+        no answer of a model that was paid for.
         """
         has_files = any((self.path / name).exists() for name in (summary.NAME, PARTS))
         return (
@@ -404,12 +425,13 @@ class RunDirectory:
 
 @contextmanager
 def create_before_work(config: Config) -> Iterator[Path | None]:
-    """Make the folder of a new run before anything else is done, so that whatever ends
-    the block can be gone on with.
+    """Make the folder of a new run before its work begins, so that the run can be
+    resumed however the block ends.
 
-    Yields its path, closed again: what the block does goes on with it. Where the block
-    raises before anything was evaluated, nothing is left of it. It is None for a run
-    that takes the place of another one, which stays until then.
+    Yields its path; the directory is closed, and the block resumes it. Where the block
+    raises before anything was evaluated, the folder is removed again, with the folders
+    that were made for it. With `overwrite` over an existing run nothing is made, and
+    the path is None: the old run stays until the new one takes its place.
     """
     location, overwrite = config.run_location
     if overwrite and location is not None and is_run(locate_run(location)):
@@ -434,8 +456,10 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
 
 
 def make_default_name(object_name: str, controls: Iterable[str]) -> str:
-    """Return ``mug-texture`` for the object ``mug`` or ``data/mug.obj`` and the control
-    ``texture``: a safe name.
+    """Return the name of a run by default: ``mug-texture`` for the object ``mug`` or
+    ``data/mug.obj`` and the control ``texture``.
+
+    It has only small letters, digits and hyphens, 80 at most.
     """
     words = [Path(object_name).stem, *controls]
     return (
@@ -467,10 +491,15 @@ def format_run_name(path: str | Path) -> str:
 
 
 def find_run(run: str | Path, *, checked: bool = True) -> Path:
-    """Return the directory of an existing run, called by name or by path (of the
-    directory, or of its run.yaml). Raises UnknownNameError where there is none, and,
-    unless it is not `checked`, as it must be before anything in it is read,
-    FileFormatError where it has links in it (`check_links`).
+    """Return the directory of an existing run.
+
+    Args:
+        run: its name, or the path of its directory or of a file in it such as run.yaml.
+        checked: refuse links in it, as is needed before anything in it is read.
+
+    Raises:
+        UnknownNameError: there is no such run.
+        FileFormatError: it has links in it (`check_links`).
     """
     for path in (Path(run).expanduser(), locate_run(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
@@ -485,8 +514,9 @@ def find_run(run: str | Path, *, checked: bool = True) -> Path:
 
 
 def read_python_only(path: Path) -> list[PythonOnly]:
-    """Return the parts of a run that existed only in the Python session that made
-    it.
+    """Return the parts of a run that existed in the Python session that made it only.
+
+    They are noted as a list of pairs; what has another form is left out.
     """
     if not (path / store.NAME).is_file():
         return []
@@ -501,8 +531,9 @@ def read_python_only(path: Path) -> list[PythonOnly]:
 
 
 def is_run(path: Path) -> bool:
-    """Return whether advsearch wrote the directory: by the header of its `run.yaml` or
-    of its `results.sqlite`.
+    """Return whether advsearch wrote a directory.
+
+    It is known by the header of its `results.sqlite`, or of its `run.yaml`.
     """
     if files.is_results_database(path / store.NAME):
         return True
@@ -516,8 +547,12 @@ def is_run(path: Path) -> bool:
 
 
 def check_free(run: str | Path, *, overwrite: bool = False) -> None:
-    """Check that a run may be put at `run`, or raise RunExistsError; call it before any
-    long work.
+    """Check that a new run may be put at `run`; call it before any long work.
+
+    Raises:
+        InputError: it is no possible path.
+        RunExistsError: a file is there, a folder that is no run, or, without
+            `overwrite`, a run.
     """
     path = locate_run(run)
     if "\0" in str(path):
@@ -549,10 +584,10 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
 
 
 def _make_numbered_directory(default: str) -> Path:
-    """Make the directory of the next free number, `default-001` and so on.
+    """Make and return the first free directory of ``default-001``, ``default-002`` and
+    so on.
 
-    Numbers of removed runs below the largest one are not used again. Another process
-    may take the number in between, hence the loop.
+    Numbers below the largest one are not used again, even if their runs were removed.
     """
     pattern = re.compile(re.escape(default) + r"-(\d{3,})")
     with storage_errors(HOME):
@@ -562,6 +597,7 @@ def _make_numbered_directory(default: str) -> Path:
             for path in HOME.iterdir()
             if (match := pattern.fullmatch(path.name))
         ]
+        # another process may take a number between listing and mkdir
         for number in itertools.count(max(used_numbers, default=0) + 1):
             path = HOME / f"{default}-{number:03d}"
             try:
@@ -588,7 +624,9 @@ def _known_settings(config: Config) -> dict[str, Any]:
 
 
 def _format_change(name: str, value: object) -> str:
-    """Return a name with the value that it had, where that is short."""
+    """Return the name of a changed fact, with the value that it had where that is known
+    and short.
+    """
     text = format_value(value)
     return (
         name

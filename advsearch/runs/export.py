@@ -56,8 +56,17 @@ def write_rows(
     stream: IO[bytes],
     kind: str | None = None,
 ) -> int:
-    """Write the rows, or those of one kind, whole or not at all to a file, or to a
-    stream, and return how many there were.
+    """Write the rows of a run as a table, and return how many there were.
+
+    Args:
+        store: has the rows.
+        format: a name in `FORMATS`.
+        out: the file, which is written whole or not at all; None for `stream`.
+        stream: is written to where there is no file.
+        kind: of the rows to write; None for all.
+
+    Raises:
+        UnknownNameError: there is no such format or kind.
     """
     if format not in FORMATS:
         raise UnknownNameError("format", format, FORMATS)
@@ -65,6 +74,7 @@ def write_rows(
     if kind is not None and kind not in counts:
         raise UnknownNameError("kind of rows", kind, counts)
     write = {"csv": _write_csv, "json": _write_json, "parquet": _write_parquet}[format]
+    # all rows are read twice, since the columns have to be known first
     names = list_columns(store.rows(kind))
     if out is None:
         write(map(make_record, store.rows(kind)), names, stream)
@@ -79,8 +89,10 @@ def write_rows(
 
 
 def list_columns(rows: Iterable[Row]) -> list[str]:
-    """Return the columns of a table of these rows; metrics and values in the order in
-    which they first occur.
+    """Return the columns of a table of rows.
+
+    Metrics and values stand between the fixed columns, in the order in which they first
+    occur.
     """
     metrics = dict[str, None]()
     values = dict[str, None]()
@@ -102,8 +114,10 @@ def make_record(row: Row) -> JsonObject:
 def iterate_values(
     values: Mapping[str, Value | JsonValue],
 ) -> Iterator[tuple[str, JsonValue, str]]:
-    """Yield values by name with their units; of several numbers each, as
-    ``camera.target[0]``.
+    """Yield (column, value, unit) of each value of a row.
+
+    A value of several numbers has a column for each, such as ``camera.target[0]``. An
+    entry is a mapping with value and unit, or the value alone.
     """
     for name, entry in values.items():
         value, unit = (
@@ -141,6 +155,7 @@ def _write_csv(
             for name, value in _encode_payload(record).items()
         }
         writer.writerow(cells)
+    # or the stream would be closed with the wrapper
     text.detach()
 
 
@@ -171,7 +186,9 @@ def _write_json(
 def _write_parquet(
     records: Iterable[JsonObject], names: list[str], stream: IO[bytes]
 ) -> None:
-    """Write records as Parquet, of which `ROWS_PER_GROUP` are in memory at once."""
+    """Write records as Parquet, in groups of `ROWS_PER_GROUP`, so that no more are in
+    memory.
+    """
     try:
         # comes with the extra `parquet`
         import pyarrow.parquet
@@ -193,8 +210,10 @@ def _write_parquet(
 
 
 def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
-    """Return the Arrow schema of columns: of metrics and values, which have no declared
-    type, text where one of the first records has text, else float64.
+    """Return the Arrow schema of columns.
+
+    Fixed columns have the type that `Row` declares. A column of a metric or a value is
+    text where one of the first records has text in it, else float64.
     """
     # an optional package
     import pyarrow
@@ -207,6 +226,7 @@ def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
     }
     type_of_column = {}
     for field in fields(Row):
+        # annotations are texts: "int | None" gives "int"
         python_type = str(field.type).partition(" ")[0]
         type_of_column[field.name] = arrow_types.get(python_type, arrow_types["str"])
     for name in set(names) - {*LEADING_COLUMNS, *TRAILING_COLUMNS}:
@@ -238,9 +258,12 @@ MAX_CLASSES_BYTES = 16 << 20  # most bytes of a `class_maps.json`
 
 
 def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
-    """Yield each line of such a folder as a row of a sweep, and the file of its
-    picture, if there is one; a FileFormatError names the line that is not what it
-    should be.
+    """Yield the lines of a folder of 3DB as rows of a sweep, each with the file of its
+    picture, if there is one.
+
+    Raises:
+        FileFormatError: the classes or a line are not as 3DB writes them; it names the
+            line.
     """
     try:
         classes = parse_json(
@@ -261,6 +284,7 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
             f"{folder / DETAILS}: expected the log of 3DB, got {error.strerror}"
         ) from None
     with file:
+        # without end; `range` gives the number of the line
         for number in range(1 << 62):
             line = file.readline(MAX_LINE_BYTES + 1)
             if not line:
@@ -303,7 +327,9 @@ def _parse_line(
 
 
 def _import_values(record: JsonObject, render_args: JsonObject) -> dict[str, Value]:
-    """Return the parameters of a line of 3DB's log, those of lists by their index."""
+    """Return the parameters of a line of 3DB's log by name; each number of a list has
+    its index behind the name.
+    """
     values: dict[str, Value] = {
         "object": _make_value(record.get("model")),
         "environment": _make_value(record.get("environment")),
@@ -320,8 +346,14 @@ def _import_values(record: JsonObject, render_args: JsonObject) -> dict[str, Val
 def _parse_prediction(
     prediction: JsonValue, classes: Sequence[str]
 ) -> tuple[str, int | None]:
-    """Return label and index of the first class of a prediction; a class without a name
-    is called by its index, and "" is no class.
+    """Return label and index of the class that 3DB's log says was predicted.
+
+    Args:
+        prediction: an index, or a list with the best one first.
+        classes: the names by index; a class without a name is called by its index.
+
+    Returns:
+        "" and None where no class was predicted.
     """
     first = prediction[0] if isinstance(prediction, list) and prediction else prediction
     if not _is_number(first):
@@ -332,8 +364,8 @@ def _parse_prediction(
 
 
 def _find_picture(folder: Path, image_id: str) -> Path | None:
-    """Return the file of a picture, unless it is missing, a link, or its id is no plain
-    name.
+    """Return the file of a picture; None if it is missing or a link, or its id is no
+    plain file name.
     """
     if re.fullmatch(r"[A-Za-z0-9_-]{1,100}", image_id) is None:
         return None

@@ -85,9 +85,7 @@ SCHEMA = f"""
 
 
 def is_results_database(path: Path) -> bool:
-    """Return whether the file at `path` starts like a results.sqlite of advsearch; a
-    link does not.
-    """
+    """Return whether a file, and no link, starts like a results.sqlite of advsearch."""
     if os.path.islink(path):
         return False
     try:
@@ -95,13 +93,14 @@ def is_results_database(path: Path) -> bool:
             header = file.read(72)
     except (OSError, FileFormatError):
         return False
+    # SQLite keeps the number of the application at byte 68
     return header[:15] == b"SQLite format 3" and header[
         68:72
     ] == APPLICATION_ID.to_bytes(4, "big")
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
-    """Open the file for writing; where there is none, it is made with its tables in one
+    """Open a database for writing; a new one appears with all of its tables in one
     step.
     """
     check_before_writing(path)
@@ -109,7 +108,7 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
         with replace_file(path) as part, closing(sqlite3.connect(part)) as db:
             # there is nothing in it to lose yet, so the disk isn't waited for
             db.execute("PRAGMA synchronous = OFF")
-            # before the log, so that the file itself has it
+            # before WAL mode, so that it is written into the file itself
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             db.execute("PRAGMA journal_mode = WAL")
             db.executescript(f"BEGIN; {SCHEMA} COMMIT;")
@@ -120,8 +119,11 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
 
 
 def check_version(db: sqlite3.Connection, path: Path) -> None:
-    """Refuse, by a FileFormatError, a file of another version, and say which advsearch
-    reads it.
+    """Check that a database has the version that this advsearch reads.
+
+    Raises:
+        FileFormatError: it has not, and is closed; the message says which advsearch
+            reads it.
     """
     version = read_version(db)
     day = ""
@@ -167,8 +169,8 @@ LAST_FRAME_MS = 2500
 
 
 def to_8bit(image: Any) -> Bytes:
-    """Return ``round(255 clip(image, 0, 1))`` in float32 with halves to even; NaN
-    becomes 0.
+    """Return an image in [0, 1] as uint8: ``round(255 clip(image, 0, 1))`` in float32,
+    halves to even; NaN becomes 0.
     """
     scaled: Floats = np.clip(
         np.nan_to_num(_to_float32(image), nan=0.0), 0.0, 1.0
@@ -236,9 +238,13 @@ def write_exr(path: Path, image: Any) -> Path:
 def write_layers(
     path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]
 ) -> Path:
-    """Write channels (H, W) by name, such as ``normal.X``, as one EXR, whole or not at
-    all, and return the path: numbers in float32, whole numbers as 32 bits, and notes on
-    what they mean as attributes of the file.
+    """Write channels into one EXR file, whole or not at all, and return its path.
+
+    Args:
+        path: of the file.
+        layers: channels (H, W) by name, such as ``normal.X``; numbers become float32,
+            whole numbers 32 bits without sign.
+        notes: what they mean, attributes of the file by name.
     """
     channels = {}
     for name, layer in layers.items():
@@ -270,14 +276,18 @@ def _write_exr(
             with OpenEXR.File(header, dict(channels)) as file:
                 file.write(os.fspath(part))
         except RuntimeError as error:
+            # the message is the only sign of a full disk
             number = errno.ENOSPC if "No space left" in str(error) else errno.EIO
             raise OSError(number, str(error)) from error
     return path
 
 
 def encode_animation(frames: Sequence[Any]) -> bytes:
-    """Return the display-referred pictures as a GIF that repeats, holds its last frame
-    and is at most 3 MB.
+    """Return display-referred pictures as a GIF that repeats and shows its last frame
+    longer.
+
+    It is made again, first with fewer frames and then with smaller ones, until it has
+    `ANIMATION_BYTES` at most, or cannot get smaller.
     """
     count = min(len(frames), ANIMATION_FRAMES)
     shrink = 1
@@ -288,7 +298,10 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
             Image.fromarray(_check_image_shape(to_8bit(frames[index])))
             for index in indices
         ]
+        # each side is divided by this: rounded up, so that the longest one fits into
+        # ANIMATION_SIDE
         block = max(shrink, -(-max(pictures[0].size) * shrink // ANIMATION_SIDE))
+        # cut to a multiple of the block
         width, height = (
             side - side % block if side > block else side for side in pictures[0].size
         )
@@ -299,15 +312,17 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
         if len(data) <= ANIMATION_BYTES or min(pictures[0].size) < 16:
             return data
         if count > 10:
+            # a tenth less, or less in proportion to what is too much
             count = min(count * 9 // 10, count * ANIMATION_BYTES // len(data))
         else:
             shrink *= 2
 
 
 def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:
-    """Encode images as an animation that repeats; the last one stays longer."""
+    """Encode images (one size) as a GIF that repeats; the last one stays longer."""
     # one palette for all frames, by Pillow itself: 20 times as fast as through imageio
     pixels = np.concatenate([np.asarray(picture) for picture in pictures])
+    # the palette is made from some of the rows, _PALETTE_PIXELS at most
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
     palette = Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)
     frames = [
@@ -331,7 +346,11 @@ def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:
 
 
 def _check_image_shape(array: Any) -> Any:
-    """Return (H, W, 3) or (H, W); one channel loses its axis."""
+    """Return an image as (H, W, 3) or (H, W); a single channel loses its axis.
+
+    Raises:
+        ValueError: it has another shape.
+    """
     squeezed = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if squeezed.ndim != 2 and not (squeezed.ndim == 3 and squeezed.shape[2] == 3):
         raise ValueError(

@@ -72,16 +72,22 @@ _LISTED: dict[tuple[str, bool], tuple[object, ListedRun]] = {}
 
 
 def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
-    """Return the run in a folder; what cannot be read is shown as far as it can, and
-    `fault` says why. To count rows takes a second for a million. A run is read again
-    where its files have changed, or a process works on it.
+    """Return what the list of runs says of the run in a folder.
+
+    What cannot be read is left out, and `fault` says why. The result is kept until the
+    files of the run change; a run that a process works on is read again where rows are
+    counted.
+
+    Args:
+        path: of the run.
+        counts: also count its rows, which takes a second for a million.
     """
     running = is_held(path)
-    read = [
+    read_paths = [
         path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
     ]
     key = (os.path.abspath(path), counts)
-    state = (str(path), running, *map(_state, read))
+    state = (str(path), running, *map(_state, read_paths))
     if key not in _LISTED or _LISTED[key][0] != state or (running and counts):
         faults: list[str] = []
         try:
@@ -126,6 +132,7 @@ def _make_listed_run(
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
+    # what fails in such a block is added to the faults
     with _collect_faults(faults, path / CONFIG):
         config = read_yaml(path / CONFIG)
     with _collect_faults(faults, path / summary.NAME):

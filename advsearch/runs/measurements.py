@@ -45,14 +45,19 @@ class Measurements:
         self.n_new = 0
 
     def get(self, key: str, measure: Callable[[], Any]) -> Any:
-        """Return the JSON value that is stored under a key, or what `measure` returns
-        in time, and store it.
+        """Return the JSON value that is stored under a key; measure and store it if
+        there is none.
+
+        Raises:
+            OutOfTime: it would have to be measured, the time is up, and something was
+                measured in this sitting.
         """
         stored = self.read(key)
         if stored is None:
             if self.n_new and time.monotonic() >= self._end:
                 raise OutOfTime
             self.n_new += 1
+            # so that it is the same as when it is read back
             stored = json.loads(json.dumps(measure()))
             self.put(key, stored)
         return stored
@@ -71,8 +76,8 @@ class Measurements:
         row_type: type[AnyFields],
         measure: Callable[[], Sequence[AnyFields]],
     ) -> list[AnyFields]:
-        """Return the rows that `measure` returns, or those that are stored; otherwise
-        as `get`.
+        """Return rows that are stored under a key; measure and store them if there are
+        none, as `get`.
         """
         return [
             row_type.of(row)
@@ -89,11 +94,16 @@ class Measurements:
         self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]
     ) -> AnyResult:
         """Take rows until they end, the time is up or there is an interrupt, and return
-        the result of those.
+        the result of the rows taken.
 
-        After each new row the summary is written, so that a kill leaves it. The summary
-        never has fewer rows than an earlier sitting left in it: those are read back
-        first.
+        The summary is written after each new row, so that a kill leaves it. It never
+        has fewer rows than an earlier sitting left in it: stored rows are taken first,
+        and where an interrupt comes before they were all read, the earlier result is
+        returned.
+
+        Args:
+            rows: measures each row when it is taken.
+            make_result: makes the result from the rows so far.
         """
         context = self._context
         collected_rows: list[Row] = []

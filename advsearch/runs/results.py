@@ -49,7 +49,7 @@ Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
 
 
 def key_validator(*names: str) -> AfterValidator:
-    """Return a validator of a mapping that must have these keys."""
+    """Return a pydantic validator for mappings that must have all of these keys."""
 
     def check(values: Mapping[str, object]) -> Mapping[str, object]:
         missing = [name for name in names if name not in values]
@@ -314,9 +314,13 @@ class Formation(Fields):
 
 
 def to_json_value(value: Any) -> Any:
-    """Return `value` made of what JSON has: numbers of numpy and torch become Python's,
-    NaN and infinity become None. Raises TypeError where something in it has no JSON
-    form.
+    """Return `value` with everything in it turned into what JSON has.
+
+    Numbers and arrays of numpy and torch become Python's, dataclasses become mappings,
+    NaN and infinity become None.
+
+    Raises:
+        TypeError: something in it has no JSON form.
     """
     if isinstance(value, enum.Enum):
         return to_json_value(value.value)
@@ -337,6 +341,7 @@ def to_json_value(value: Any) -> Any:
             field.name: to_json_value(getattr(value, field.name))
             for field in dataclasses.fields(value)
         }
+    # numbers and arrays of numpy and torch
     if hasattr(value, "tolist"):
         return to_json_value(value.tolist())
     raise TypeError(
@@ -408,8 +413,14 @@ class Extent(Fields):
         interval: Interval | None,
         share: float | None = None,
     ) -> Extent:
-        """Return a count with the interval of its share, which is `share` where that is
-        not count over total.
+        """Return a count with the interval of its share.
+
+        Args:
+            what: is counted.
+            count: how many there were.
+            total: of how many.
+            interval: of the share; None is the whole of [0, 1].
+            share: kept only where it is not count over total.
         """
         stated_share = share if total and share != count / total else None
         return cls(
@@ -766,9 +777,15 @@ class SharedWork(Fields):
     def of_facts(
         cls, facts: Any, machines: Mapping[str, Mapping[str, str]]
     ) -> SharedWork | None:
-        """Return the fields from what an executor says; None where it says nothing."""
+        """Return how workers shared a run; None where there were none.
+
+        Args:
+            facts: the `cluster.WorkerStats` of the run, or None.
+            machines: that differ from this one, by name.
+        """
         if facts is None:
             return None
+        # times of different clocks may give a little over 1
         share = min(1.0, facts.busy / facts.alive) if facts.alive else None
         return cls.model_validate(
             {**vars(facts), "utilisation": share, "machines": machines}
@@ -776,8 +793,11 @@ class SharedWork(Fields):
 
 
 def kind_of(values: JsonObject) -> type[Result] | None:
-    """Return the class of the result that a `summary.json` has; None where there is no
-    such experiment.
+    """Return the class of the result in a `summary.json`; None where there is no such
+    experiment.
+
+    An experiment may have several kinds of results; each of the others has a field that
+    tells it from the main one.
     """
     command = str(values.get("command"))
     if command not in registry.EXPERIMENTS:

@@ -126,8 +126,14 @@ class Store:
     NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
-        """Open a database, and check its version and its tables."""
+        """Open a database, and check its version and its tables; without `read_only`,
+        make it if it is missing.
+
+        Raises:
+            FileFormatError: it is none of advsearch, or of another version.
+        """
         self.path = path
+        # the first rows are synced at once
         self._next_sync = -math.inf
         with translate_database_errors(path):
             self._db = connect_to_read(path) if read_only else connect_to_write(path)
@@ -150,9 +156,15 @@ class Store:
     def append(
         self, rows: Sequence[Row], cached: CachedEvaluation | None = None
     ) -> None:
-        """Add rows in one transaction; they survive a kill of the process when this
-        returns, and where the disk is full none of them is kept. A row whose kind and
-        step are there already changes nothing. What it `cached` is that of the last one.
+        """Add rows in one transaction; where the disk is full, none of them is kept.
+
+        When this returns they survive a kill of the process. The disk is waited for
+        only now and then, so that a power cut may lose the last rows. A row whose kind
+        and step are there already changes nothing.
+
+        Args:
+            rows: of evaluations.
+            cached: what the last of them told its search, beside the row.
         """
         check_not_moved(self.path)
         start_time = time.monotonic()
@@ -183,6 +195,7 @@ class Store:
                     )
         if must_sync:
             end_time = time.monotonic()
+            # syncing takes SYNC_SHARE of the time at most
             self._next_sync = end_time + max(
                 SYNC_INTERVAL, (end_time - start_time) / SYNC_SHARE
             )
@@ -202,7 +215,9 @@ class Store:
 
     def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
         """Yield the rows, or those of one kind, in the order in which they were
-        written, behind the id `after`.
+        written.
+
+        Only rows with an id larger than `after` are read.
         """
         condition, parameters = (
             ("id > ?", [after])
@@ -227,8 +242,8 @@ class Store:
         )
 
     def read_cached(self, kind: str, step: int) -> tuple[Row, CachedEvaluation] | None:
-        """Return a row of a search with what it told; None where there is none, or the
-        run is done.
+        """Return a row of a search with what it told the search beside it; None where
+        there is no such row, or the run is done and that was deleted.
         """
         row = self.read_row(kind, step)
         values = (
@@ -247,10 +262,13 @@ class Store:
     def iterate_images(
         self, kind: str, after: int, until: int
     ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield number and picture of what rows of a kind with ids over `after` have
-        told, while the run goes on.
+        """Yield number and picture (H, W, 3) of rows of a kind, as long as the run goes
+        on and keeps them.
+
+        The ids of the rows are larger than `after`, and `until` at most.
         """
         query = (
+            # NULL instead of the gradient, which nobody needs here
             "number, u, non_finite, cost, NULL, picture, height FROM told JOIN "
             "evaluations ON row = id "
             "WHERE kind = ? AND id > ? AND id <= ? AND picture IS NOT NULL ORDER BY id"
@@ -266,7 +284,9 @@ class Store:
         return bool(next(self._select("EXISTS (SELECT * FROM told)"))[0])
 
     def delete_cached(self) -> None:
-        """Remove what searches were told: the run is done."""
+        """Delete what rows told their searches: the run is done. The file gets smaller
+        by it.
+        """
         check_not_moved(self.path)
         with storage_errors(self.path):
             with self._db:
@@ -289,8 +309,8 @@ class Store:
         )
 
     def find_missing_steps(self, kind: str, count: int) -> Iterator[range]:
-        """Yield the steps from 0 to `count` of which there is no row of a kind,
-        neighbours together.
+        """Yield the steps from 0 to below `count` that have no row of a kind,
+        neighbours as one range.
         """
         expected = 0
         for (step,) in self._select(
@@ -359,16 +379,21 @@ _JSON = json.JSONEncoder(allow_nan=False)
 
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
-    """Return a row as the values of its columns; `stamp` is the time.
+    """Return a row as the values of its columns, for SQLite.
 
-    Numbers of numpy and torch become Python's, and mappings become JSON. Metrics that
-    are empty become NULL.
+    Numbers of numpy and torch become Python's, mappings become JSON, and empty metrics
+    become NULL.
+
+    Args:
+        row: of an evaluation.
+        stamp: the time of writing, seconds since 1970.
     """
     values = []
     for name in _ENCODED_FIELDS:
         value = getattr(row, name)
         if name in _AS_JSON and value is not None:
             try:
+                # fails for numbers of numpy and for NaN, which are turned first then
                 value = _JSON.encode(value) if value or name != "metrics" else None
             except (TypeError, ValueError):
                 value = _JSON.encode(to_json_value(value))
@@ -399,7 +424,8 @@ MAX_STEP = (1 << 32) - 1
 
 
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
-    """Return a row from the values of its columns; checks every one of them.
+    """Return a row from the values of its columns, each of which is checked: the file
+    may come from somebody else.
 
     Raises:
         FileFormatError: a column has another type, or a number that no row has.
@@ -411,6 +437,7 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
         if not isinstance(value, _TYPES[name]) or value in _INFINITE
     ]
     if not wrong_columns and not 0 <= by_name["step"] <= MAX_STEP:
+        # an integer, but outside of what a step may be
         wrong_columns = ["step"]
     if not wrong_columns:
         by_name["values"] = _parse_named(by_name["values"], _is_value)
@@ -432,16 +459,17 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
             f"{path}: row {by_name['id']!r}: expected another type of "
             f"{wrong_columns[0]}; {DAMAGED}"
         )
+    # SQLite has no bool: it is 0 or 1
     for name in ("success", "correct"):
         by_name[name] = None if by_name[name] is None else bool(by_name[name])
     return Row(**by_name)
 
 
 def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:
-    """Return what a search was told, from the values of its columns.
+    """Return what an evaluation told its search, from the values of its columns.
 
     Raises:
-        FileFormatError: a column has another type, or the image another size.
+        FileFormatError: a column has another type, or the picture another size.
     """
     number, u, non_finite, cost, gradient, picture, height = values
     try:
@@ -462,8 +490,8 @@ def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:
 
 
 def _parse_named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
-    """What a JSON object has by name; None where it is none, or something in it does
-    not fit.
+    """Return the JSON object in a text; None where it is no object, or `fits` is false
+    for one of its values.
     """
     try:
         named = json.loads(text)
@@ -473,7 +501,9 @@ def _parse_named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | Non
 
 
 def _is_value(entry: object) -> bool:
-    """Return whether this is a value of a parameter: text or finite numbers, and a unit."""
+    """Return whether an entry is the value of a parameter: a text, a finite number or a
+    list of such, with a unit.
+    """
     if (
         not isinstance(entry, dict)
         or not isinstance(entry.get("unit"), str)

@@ -51,9 +51,12 @@ def write_summary(folder: Path, result: Result) -> Path:
 
 
 def read_result(folder: Path) -> Result:
-    """Return the result of the run in `folder`, `RUNNING` if a process works on it and
-    has not come to its end; a FileFormatError says if there is none, or not what this
-    version writes.
+    """Return the result of the run in `folder`.
+
+    Its ending is `RUNNING` if it is not finished and a process works on the run.
+
+    Raises:
+        FileFormatError: there is none, or it is not what this version writes.
     """
     result = read_stored_result(folder)
     return (
@@ -64,8 +67,11 @@ def read_result(folder: Path) -> Result:
 
 
 def read_stored_result(folder: Path) -> Result:
-    """Return the result of the run in `folder` as it was written, whoever works on
-    it.
+    """Return the result of the run in `folder` as it was written, whether or not a
+    process works on the run.
+
+    Raises:
+        FileFormatError: there is none, or it is not what this version writes.
     """
     path = folder / NAME
     try:
@@ -85,6 +91,7 @@ def read_stored_result(folder: Path) -> Result:
     try:
         return kind.of(values)
     except ValidationError as error:
+        # one is enough, and the values are not quoted
         first = error.errors(include_url=False, include_input=False)[0]
         what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
         got = (
@@ -122,8 +129,10 @@ def write_configuration(run: Path, u: NDArray[np.float32]) -> Path:
 
 
 def read_configuration(run: Path) -> NDArray[np.float32]:
-    """Return the configuration (d,) float32 in [0, 1] that a run found, or raise a
-    FileFormatError.
+    """Return the adversarial configuration (d,) that a run found, float32 in [0, 1].
+
+    Raises:
+        FileFormatError: there is none, or the file holds something else.
     """
     path = run / FOLDER / CONFIGURATION
     expected = f"{path}: expected the adversarial configuration of a run, got"
@@ -138,6 +147,7 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
     if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MAX_HEADER_BYTES]:
         raise FileFormatError(f"{expected} something else, or the beginning of one")
     header = HEADER.match(data)
+    # four bytes for each float32 behind the header, and nothing more
     if header is not None and len(data) == header.end() + 4 * int(header[1]):
         u: NDArray[np.float32] = np.frombuffer(
             data, np.float32, int(header[1]), header.end()
@@ -165,8 +175,8 @@ file.
 
 
 def collect_versions(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return versions by package, and the SHA-256 of each file that settings name, by
-    its name in them.
+    """Return what decides the numbers of a run beside its settings: versions by
+    package, and the SHA-256 of each file and bundled thing that the settings name.
     """
     facts = {"python": platform.python_version()}
     for name in PACKAGES:
@@ -198,8 +208,10 @@ NAMES_BUNDLED = (
 
 
 def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return the SHA-256 of what is bundled and settings name: objects, environments
-    and the reference model.
+    """Return the SHA-256 of each bundled object, environment and model that settings
+    name.
+
+    The digest of a folder is that of a list of its files with their digests.
     """
     package = Path(__file__).parent.parent
     names = {
@@ -233,8 +245,11 @@ def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
 
 
 def _find_bundled_names(value: object) -> set[str]:
-    """Return what may be the name of something bundled in a setting: the words of
-    ``mug,car@12,3.5; person@6,-2``, in lists and mappings, but for the paths of files.
+    """Return the words of a setting that may be names of something bundled.
+
+    In ``mug,car@12,3.5; person@6,-2`` these are mug, car and person; numbers and paths
+    are among the words, but nothing bundled is called so. Lists and mappings are
+    searched for texts.
     """
     if isinstance(value, Mapping):
         return {name for inner in value.values() for name in _find_bundled_names(inner)}
@@ -247,10 +262,11 @@ def _find_bundled_names(value: object) -> set[str]:
 def find_changed_facts(
     before: Mapping[str, object], now: Mapping[str, object]
 ) -> list[str]:
-    """Return the names of facts that are others now than before; those that were not
-    known before are none of them.
+    """Return the names of facts that have another value now than before.
 
-    A file is known by the last part of its path, since it may have been moved.
+    A fact that was not known before has not changed. A file is known by the last part
+    of its path, since it may have been moved; where several had that name, one with the
+    same value is enough.
     """
     known: dict[str, list[object]] = {}
     for name, value in before.items():
@@ -265,31 +281,47 @@ def find_changed_facts(
 def find_changed_file(
     before: Mapping[str, object], settings: Mapping[str, object]
 ) -> str | None:
-    """Return the name of a file of some settings that is another one now than before;
-    None if all are the same.
+    """Return the name of one file that settings name and that has changed; None if none
+    has.
+
+    Args:
+        before: digests by path.
+        settings: name the files now.
     """
-    again = {
+    settings_read_again = {
         name: value for name, value in settings.items() if name not in NOT_READ_AGAIN
     }
-    return next(iter(find_changed_facts(before, compute_file_digests(again))), None)
+    return next(
+        iter(find_changed_facts(before, compute_file_digests(settings_read_again))),
+        None,
+    )
 
 
 def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:
-    """Return the SHA-256 of each file that settings name, in hexadecimal, and of each
-    that was read for it: materials, pictures and buffers that a mesh or a scene names.
-    A folder has one for all. What is bundled or gone has none.
+    """Return the SHA-256 of each file that settings name, in hexadecimal, by its name
+    there.
+
+    Files that were read for it (materials, pictures and buffers that a mesh or a scene
+    names) have their own, and a folder has one for all its files. What is bundled or
+    gone has none.
     """
     digests: dict[str, str] = {}
     for name, value in settings.items():
         for path in _find_paths(value):
             with suppress(OSError, ValueError):
+                # one by one, so that those before an error are kept
                 for file_name, digest in _iterate_digests(name, path):
                     digests[file_name] = digest
     return digests
 
 
 def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
-    """Yield names and digests of a folder or a file, and of what was read for it.
+    """Yield name and digest of the folder or the file that a setting names, and of the
+    files that were read for it.
+
+    Args:
+        setting: its name, which says whether it may name a file or a folder.
+        path: a part of its value.
 
     Raises:
         OSError: a file cannot be read.
@@ -308,6 +340,7 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
         yield path, _digest_file(Path(path))
     for opened_file in opened_files:
         if opened_file != absolute_path and Path(opened_file).is_file():
+            # named like the file itself: relative or absolute as in the setting
             relative = os.path.relpath(opened_file, os.path.dirname(absolute_path))
             file_name = os.path.join(os.path.dirname(path), relative)
             yield file_name, _digest_file(Path(opened_file))
@@ -327,8 +360,11 @@ def _digest_folder(folder: Path, pattern: str) -> str:
 
 
 def _find_paths(value: object) -> Iterator[str]:
-    """What may be a file in ``a.pt2,reference@weights.safetensors``, ``scene.glb#NODE``
-    or ``camera.csv+object.csv``, in lists and mappings.
+    """Yield what may be the path of a file in a setting.
+
+    In ``a.pt2,reference@weights.safetensors``, ``scene.glb#NODE`` and
+    ``camera.csv+object.csv`` these are the parts, and each whole, since a path may have
+    these signs in it. Lists and mappings are searched for texts.
     """
     if isinstance(value, (Mapping, list, tuple)):
         for inner in value.values() if isinstance(value, Mapping) else value:

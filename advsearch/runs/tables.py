@@ -74,16 +74,24 @@ class Units:
         return self.find_draw(step // self.models)
 
     def find_draw(self, image_index: Number) -> Number:
-        """Return the number of the draw of a picture, by its number in the whole
-        sweep.
+        """Return the number of the draw that a picture comes from.
+
+        All frames of a drive, all pictures that differ in noise alone, and the pictures
+        with and without an adversarial scene are of one draw.
+
+        Args:
+            image_index: number of the picture in the whole sweep, or an array of them.
         """
         if self.again:
             image_index = image_index % self.again
         image_index = image_index // self.noise
         if self.frames is None:
             return image_index
+        # the picture is a sample of a point of the grid; the frame is one digit of the
+        # point in mixed radix, and is taken out
         point = image_index // self.samples
         sample = image_index % self.samples
+        # points along the axes that are faster than the frames
         after = prod(self.sizes[self.frames + 1 :])
         # scenes are like one more axis, the slowest
         before = point // (self.sizes[self.frames] * after)
@@ -91,9 +99,15 @@ class Units:
 
 
 def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
-    """Return what a run notes of its units; None where it notes nothing. Older notes do
-    not say that samples are noise: the summary's sampler does, so that the caller says
-    whether anything `is_sampled`.
+    """Return what a run notes of its units; None where it notes nothing.
+
+    Args:
+        store: of the run.
+        is_sampled: something was drawn by chance. Older notes do not say it: where
+            nothing was drawn, their samples differ in noise alone.
+
+    Raises:
+        FileFormatError: the note says something impossible.
     """
     noted = store.read_json_note(UNITS_NOTE)
     if noted is None:
@@ -102,9 +116,9 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
         units = TypeAdapter(Units).validate_python(noted)
         if not is_sampled and units.noise == 1:
             units = replace(units, samples=1, noise=units.samples)
-        has_frames = units.frames is None or units.frames < len(units.sizes)
+        is_frame_axis_valid = units.frames is None or units.frames < len(units.sizes)
         if (
-            has_frames
+            is_frame_axis_valid
             and prod(units.sizes) * units.samples * units.noise * units.models
             <= MAX_ROWS
         ):
@@ -139,10 +153,10 @@ RESERVED_NAMES = {*(field.name for field in fields(Row)), "unit", "outcome"}
 
 
 def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
-    """Return rows as a frame, with the columns of an export under plain names.
+    """Return rows as a frame with the columns of an export.
 
-    A value is called ``pose.yaw``, and ``attrs["units"]["pose.yaw"]`` says its unit:
-    "degrees".
+    Names are without units: a value is called ``pose.yaw``, and
+    ``attrs["units"]["pose.yaw"]`` says "degrees".
     """
     row_list = list(rows)
     names = {column: column.partition(" [")[0] for column in list_columns(row_list)}
@@ -152,6 +166,7 @@ def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
     ]
     frame = pd.DataFrame(records, columns=list(names.values()))
     frame.attrs["units"] = {
+        # what is in the brackets of "NAME [UNIT]"
         plain: name[len(plain) + 2 : -1]
         for name, plain in names.items()
         if plain != name
@@ -167,11 +182,22 @@ def read_sweep(
     *,
     is_sampled: bool = True,
 ) -> pd.DataFrame:
-    """Return the rows of the sweep in `run` that were written after the row with this
-    id, `max_rows` of them at most, as `make_sweep_frame` does; `unit` says which rows are not
-    independent (`Units`, `read_units`), ``attrs["unit name"]`` what such a unit is, and
-    ``attrs["edges"]`` where the ranges of drawn parameters are cut. Raises
-    FileFormatError where the results cannot be read.
+    """Return the rows of the sweep in `run` as `make_sweep_frame` does, with their
+    units.
+
+    Column `unit` says which rows are not independent (`Units`), ``attrs["unit name"]``
+    what such a unit is, and ``attrs["edges"]`` where the ranges of drawn parameters are
+    cut.
+
+    Args:
+        run: its folder.
+        after: only rows with a larger id.
+        max_rows: how many at most; None for all.
+        extra_columns: more columns, from a row.
+        is_sampled: something was drawn by chance (`read_units`).
+
+    Raises:
+        FileFormatError: the results cannot be read.
     """
     with Store(run / NAME, read_only=True) as store:
         frame = make_sweep_frame(
@@ -196,14 +222,14 @@ def make_sweep_frame(
     rows: Iterable[Row],
     extra_columns: Callable[[Row], Mapping[str, float]] | None = None,
 ) -> pd.DataFrame:
-    """Return rows of a sweep as a frame: `FIXED_COLUMNS`, a column for each parameter and for
-    what is `extra_columns` told of a row, and `unit`, which here is the step.
+    """Return rows of a sweep as a frame: `FIXED_COLUMNS`, a column for each parameter,
+    the `extra_columns` of each row, and `unit`, which here is the step.
 
     Numbers are float64, NaN where a row has none; `correct` is 1 or 0, NaN where it was
     not judged. `label`, `outcome` (of `options.Outcome`, "" where a row has none) and
-    parameters that have a name anywhere are categories in the order in which they come,
-    "none" where a row has nothing. ``camera.target[0]`` is one of several numbers;
-    ``attrs["units"]`` has the units of parameters.
+    parameters with a text anywhere are categories in the order in which they come,
+    "none" where a row has nothing. A parameter of several numbers has a column for
+    each, such as ``camera.target[0]``; ``attrs["units"]`` has the units.
     """
     units = dict[str, str]()
     frames = list[pd.DataFrame]()
@@ -214,6 +240,7 @@ def make_sweep_frame(
         }
         for number, row in enumerate(rows, 1)
     )
+    # in chunks, since a list of all cells would take far more memory than the frame
     while chunk := list(islice(cells, CHUNK_ROWS)):
         chunk_frame = pd.DataFrame(chunk, dtype=object)
         frames.append(
@@ -221,6 +248,7 @@ def make_sweep_frame(
                 {
                     name: float
                     for name in chunk_frame
+                    # columns with a text stay objects until all chunks are joined
                     if not chunk_frame[name].map(type).eq(str).any()
                 }
             )
@@ -239,8 +267,10 @@ def make_sweep_frame(
 
 
 def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
-    """What is known of a row, the `number`-th, by column; `units` gets those of its
-    parameters.
+    """Return what is known of a row by column, and add the units of its parameters to
+    `units`.
+
+    `number` is the row's place from 1, which is its id where it has none.
     """
     fixed_values = (
         row.id or number,
@@ -263,6 +293,7 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
         parameter_name = f"parameter {name}" if name in RESERVED_NAMES else name
         for column, value, unit in iterate_values({parameter_name: described}):
             units.setdefault(column, unit)
+            # equal texts of many rows share their memory
             cells[column] = sys.intern(value) if isinstance(value, str) else value
     return cells
 

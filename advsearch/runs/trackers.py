@@ -60,7 +60,13 @@ class Tracker:
     """
 
     def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
-        """Start the thread. Settings are cut to `MAX_TEXT_LENGTH` characters each."""
+        """Start the thread that sends.
+
+        Args:
+            name: of the tracker.
+            folder: of the run.
+            settings: of the run; each is cut to `MAX_TEXT_LENGTH` characters.
+        """
         self._name = name
         self._accuracy_counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
         self._queue: Queue[tuple[MetricValues, int] | None] = Queue(MAX_QUEUED)
@@ -90,7 +96,11 @@ class Tracker:
         self._thread.join(MAX_CLOSE_SECONDS)
 
     def _compute_metrics(self, kind: str, rows: Sequence[Row]) -> MetricValues:
-        """Return the means over some rows of a kind, and its accuracy from the beginning."""
+        """Return the means over some rows of a kind, and the accuracy over all rows of
+        the kind so far.
+
+        Names begin with the kind. The counts for the accuracy are brought up to date.
+        """
         metrics = {}
         for name in METRICS:
             stored_values = [getattr(row, name) for row in rows]
@@ -98,6 +108,7 @@ class Tracker:
             if values:
                 metrics[f"{kind}/{name}"] = sum(values) / len(values)
         is_right = [row.correct for row in rows if row.correct is not None]
+        # right rows and judged rows so far
         counts = self._accuracy_counts[kind]
         counts[0] += sum(is_right)
         counts[1] += len(is_right)
@@ -112,7 +123,7 @@ class Tracker:
             return  # a tracker that is that slow is told less; the run has all of it
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
-        """Send messages until the last one; the body of the thread."""
+        """Send messages until None comes; the body of the thread."""
         try:
             log_metrics, close = _open_tracker(self._name, folder, settings)
             message = self._queue.get()
@@ -131,8 +142,16 @@ class Tracker:
 def _open_tracker(
     name: str, folder: Path, settings: Mapping[str, str]
 ) -> tuple[Callable[[MetricValues, int], object], Callable[[], object]]:
-    """Return what tells a tracker numbers by name, of a step of their kind, and what
-    ends its run.
+    """Open a run of a tracker.
+
+    Args:
+        name: of the tracker.
+        folder: of our run.
+        settings: texts by name.
+
+    Returns:
+        A function that sends numbers by name with their step, and one that ends the
+        run.
     """
     package = _import_package(name)
     if name == "mlflow":
@@ -158,8 +177,8 @@ def _open_tracker(
     )
 
     def log(numbers: MetricValues, step: int) -> None:
-        # each kind has steps of its own, which are told as a number: its one counter
-        # only ever goes up
+        # wandb's own counter only ever goes up, but the steps of each kind begin at 0:
+        # they are sent as a number
         kind = next(iter(numbers), "rows/").partition("/")[0]
         run.log({**numbers, f"{kind}/step": step})
 

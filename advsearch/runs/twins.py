@@ -80,6 +80,8 @@ def find_twin_evidence(
         return _make_empty(run, TwinMatch.OTHER_TASK)
     wanted = IN_PHOTOGRAPH if in_photograph else environment
     stem = PurePath(object_name).stem
+    # the nearest row: this object before all together, then this environment, then any
+    # but photographs
     row = max(
         (row for row in rows if not row.condition),
         key=lambda row: (

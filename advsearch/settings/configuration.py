@@ -141,8 +141,12 @@ DERIVED_FIELDS = ("field", "name", "required", "is_switch", "is_mapping")
 
 
 def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
-    """Return a setting as another command declares it, with changed arguments of
-    `setting`.
+    """Return a setting of a configuration as another one declares it.
+
+    Args:
+        config: the other configuration.
+        field: of the setting.
+        changes: arguments of `setting` that differ.
     """
     extra: Any = config.model_fields[field].json_schema_extra
     declared = {
@@ -198,7 +202,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
 
 
 def _describe_expected(info: FieldInfo) -> str:
-    """Describe the values of a field by its type and constraints."""
+    """Return what values a field takes, in words, from its type and constraints."""
     types = [
         value_type
         for value_type in get_args(info.annotation) or (info.annotation,)
@@ -208,6 +212,7 @@ def _describe_expected(info: FieldInfo) -> str:
         return "true or false"
     if get_origin(info.annotation) is Literal:
         return _join_choices(types)
+    # a Literal or None
     if get_origin(types[0]) is Literal:
         return _join_choices(get_args(types[0]))
     limits = {
@@ -218,6 +223,7 @@ def _describe_expected(info: FieldInfo) -> str:
     }
     is_integer = types == [int]
     number = "a whole number" if is_integer else "a number"
+    # 1e6 instead of 1e+06
     upper = limits["le"] if is_integer else f"{limits['le']:g}".replace("e+0", "e")
     if "gt" in limits:
         return f"{number} greater than {limits['gt']:g} and at most {upper}"
@@ -298,12 +304,14 @@ class Config(BaseModel):
     )
 
     def __init__(self, **data: Any) -> None:
-        """Check the settings; numpy and torch values become Python's first.
+        """Check the settings and create the configuration; numpy and torch values
+        become Python's first.
 
         Raises:
             InputError: a value is wrong; the message names the setting.
         """
         _check_shallow(type(self), data)
+        # checked twice: reading turns texts into nested values
         values = _read_mappings(type(self), written.to_python(data))
         _check_shallow(type(self), values)
         try:
@@ -316,6 +324,9 @@ class Config(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
+        """Refuse true and false where a setting is no switch; pydantic would take them
+        for 1 and 0.
+        """
         # YAML's `epsilon: yes` is a slip, not 1
         if (
             isinstance(value, bool)
@@ -333,8 +344,8 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
-        """Check settings that the command does not have, and those that contradict
-        others.
+        """Check that no setting is given that the command does not have, or that
+        contradicts others.
         """
         for name in self.without:
             field = type(self).model_fields[name]
@@ -377,10 +388,12 @@ class Config(BaseModel):
         for name, value in overrides.items():
             written.set_dotted(data, name, value)
         try:
+            # a first configuration, only to ask for its powers
             left_out = [
                 power for power in cls(**data).powers if power.name not in overrides
             ]
             for power in left_out:
+                # a setting may stand there under either name
                 data.pop(power.name, None)
                 data.pop(power.field, None)
             config = cls(**data)
@@ -391,7 +404,9 @@ class Config(BaseModel):
 
     @property
     def powers(self) -> tuple[OmittedSetting, ...]:
-        """The settings that have power over more than the run."""
+        """The settings whose values do more than decide what happens in the run
+        (`trust.powers`).
+        """
         powers = []
         for setting in settings(type(self)):
             value = getattr(self, setting.field)
@@ -413,8 +428,8 @@ class Config(BaseModel):
 
     @property
     def session_settings(self) -> dict[str, Any]:
-        """The settings of this session that may have such power and decide no number,
-        which parts of a run get too.
+        """The settings that parts of a run take over from this session: those that may
+        do more than decide the run, and decide none of its numbers.
         """
         return {
             setting.name: getattr(self, setting.field)
@@ -425,8 +440,14 @@ class Config(BaseModel):
         }
 
     def check_powers(self, where: str) -> None:
-        """Raise InputError if a file, named `where`, has settings with power over more
-        than the run.
+        """Check that no setting does more than decide the run, for a file that nobody
+        can be asked about.
+
+        Args:
+            where: the file, for messages.
+
+        Raises:
+            InputError: one does.
         """
         for name, _, _, effect, _ in self.powers:
             raise InputError(
@@ -436,12 +457,12 @@ class Config(BaseModel):
 
     @classmethod
     def get_shared_settings(cls, other: Config) -> dict[str, object]:
-        """Return the settings of another configuration that this command shares with
-        it.
+        """Return the settings of another configuration that this command has, too.
 
-        They are those of the most specific common class, except for where the run is
-        stored and who shares its work.
+        They are those of the nearest common class, but for where the run is stored and
+        who shares its work.
         """
+        # the first, since the order of bases has the nearest first
         common_class = next(
             base
             for base in cls.__mro__
@@ -528,8 +549,8 @@ class Config(BaseModel):
         return (self.command,)
 
     def make_repeatable(self) -> Self:
-        """Return what `run.yaml` stores: files by absolute path, and no place of the
-        run, because a repetition gets its own.
+        """Return what `run.yaml` stores: with absolute paths of files, and without the
+        place of the run, since a repetition gets its own.
         """
         absolute = {}
         for name in FILES:
@@ -554,10 +575,10 @@ class Config(BaseModel):
         return [part.text for part in self._python_only_parts]
 
     def get_deciding_settings(self) -> JsonObject:
-        """Return the settings that decide a run's numbers, as JSON values: all that are
-        not `free`.
+        """Return the settings that decide the numbers of a run, as JSON values: all
+        that are not `free`.
 
-        Files have their names only, because they may have been moved.
+        Of a file only the name counts, since it may have been moved.
         """
         values = {
             name: value
@@ -575,8 +596,13 @@ class Config(BaseModel):
 
 
 def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
-    """Raise SettingsError for values that are nested too deeply."""
+    """Check that no value is nested too deeply.
+
+    Raises:
+        SettingsError: one is.
+    """
     problems = [
+        # in the form of pydantic's errors
         {"loc": (name,), "input": value, "type": ""}
         for name, value in data.items()
         if not is_shallow(value)
@@ -586,7 +612,12 @@ def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
 
 
 def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values of settings, with mappings read from a text or several texts."""
+    """Return the values of settings, with those that are mappings read from the text or
+    the texts in which they were given.
+
+    Raises:
+        SettingsError: a text cannot be read.
+    """
     values = dict(data)
     for setting in settings(config):
         if not setting.is_mapping:
@@ -618,7 +649,9 @@ def format_python_only(parts: Sequence[str]) -> str:
 
 
 def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
-    """Return one error for pydantic's errors, in the words of the settings."""
+    """Return one error for pydantic's errors, in the words of the settings; of each
+    setting the first is told.
+    """
     declared = settings(config)
     known = {setting.name: setting for setting in declared}
     known |= {setting.field: setting for setting in declared}
@@ -634,6 +667,7 @@ def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> Advsear
             if error["type"] == "missing"
             else written.format_value(error["input"])
         )
+        # an entry of the mapping is wrong, not all of it
         if setting.is_mapping and len(error["loc"]) > 1:
             got = f"{error['loc'][1]}={got}"
         problems.setdefault(setting.name, f"expected {setting.expects}, got {got}")
@@ -641,15 +675,18 @@ def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> Advsear
 
 
 def _make_absolute(name: str) -> str:
-    """Return the absolute path of a file; what is no file stays as it is.
+    """Return a name with the path of its file made absolute; what is no file stays as
+    it is.
 
-    Of two files as in camera.csv+object.csv, each gets its path.
+    Of two files as in ``camera.csv+object.csv`` each gets its path, and the node in
+    ``scene.glb#NODE`` stays.
     """
     paths = split_paths(name)
     if len(paths) > 1:
         return "+".join(map(_make_absolute, paths))
     path = name
     suffix = ""
+    # else # is a part of the file's name
     if not os.path.isfile(name):
         path, mark, part = name.partition("#")
         suffix = f"{mark}{part}"

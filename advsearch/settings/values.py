@@ -24,9 +24,12 @@ MAX_INTEGER = 2**63 - 1
 
 
 def to_python(value: Any) -> Any:
-    """Convert numbers and arrays of numpy and torch in a value, which `is_shallow`, to
+    """Return a value with the numbers and arrays of numpy and torch in it turned into
     Python's.
+
+    It must not be nested too deeply (`is_shallow`).
     """
+    # a mapping that also holds a function
     if isinstance(value, PythonQuantiles):
         return value
     if isinstance(value, Mapping):
@@ -39,11 +42,13 @@ def to_python(value: Any) -> Any:
 
 
 def to_text(value: Any, *, several: bool = False) -> Any:
-    """Return a name as a text: a path, a number, or a list of such if there may be
-    several.
+    """Return a name as a text.
+
+    It may be a path or a number; where there may be `several`, a list of names becomes
+    a text with commas. What is none of these is returned as it is.
 
     Raises:
-        ValueError: it cannot be a name, or there are several where one is expected.
+        ValueError: it is empty, or there are several where one is expected.
     """
     items = value if isinstance(value, (list, tuple)) else [value]
     are_names = all(
@@ -61,8 +66,11 @@ def to_text(value: Any, *, several: bool = False) -> Any:
 
 
 def text_validator(*names: str, several: Sequence[str] = ()) -> Any:
-    """Return a validator that reads settings, and those with `several` names, by
-    `to_text`.
+    """Return a pydantic validator that reads settings by `to_text`.
+
+    Args:
+        names: fields with one name.
+        several: fields that may have several.
     """
 
     def read(value: Any, info: ValidationInfo) -> Any:
@@ -82,8 +90,10 @@ def unique_names_validator(*names: str) -> Any:
 
 
 def are_all_finite(value: Any) -> bool:
-    """Whether all numbers in a value, which `is_shallow`, are finite, and integers at
-    most 2**63 - 1.
+    """Return whether all numbers in a value are finite, and integers at most
+    `MAX_INTEGER` in size.
+
+    It must not be nested too deeply (`is_shallow`).
     """
     if isinstance(value, Mapping):
         return all(are_all_finite(inner) for inner in value.values())
@@ -141,8 +151,11 @@ FOR_ALL = "*"  # the name of the choice for everything without a choice of its o
 
 
 def parse_choices(texts: Iterable[str], setting: str) -> dict[str, object]:
-    """Parse texts as `parse_assignments`; a text without a name is the choice
-    `FOR_ALL`.
+    """Parse texts ``NAME=VALUE`` into a mapping; a text without a name becomes the
+    value of `FOR_ALL`.
+
+    Raises:
+        InputError: a name comes twice.
     """
     pairs = [
         parse_assignment(text, setting) if "=" in text else (FOR_ALL, text)
@@ -169,6 +182,7 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
             else:
                 name = entry.strip()
                 settings = {}
+            # braces that YAML could not read were left as text
             if isinstance(settings, str) and settings.startswith("{"):
                 raise InputError(
                     f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for "
@@ -182,7 +196,9 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
 
 
 def _split_outside_brackets(text: str) -> list[str]:
-    """Split a text at commas that are in no brackets and no quotes within brackets."""
+    """Split a text at its commas, but not at those in brackets; inside brackets a
+    bracket in quotes does not count.
+    """
     entries = [""]
     depth = 0
     quote = ""
@@ -317,9 +333,11 @@ def merge_mappings(
 
 
 def set_dotted(data: dict[str, object], name: str, value: object) -> None:
-    """Set the value of a dotted name in nested mappings.
+    """Set the value of a dotted name in nested mappings: ``controls.pose.yaw`` is
+    ``data["controls"]["pose"]["yaw"]``.
 
-    What follows ``set.`` is one name, because names of parameters have dots.
+    A text or a list on the way becomes a mapping first. What follows ``set.`` or
+    ``grid.`` is one name, since names of parameters have dots.
     """
     first, _, rest = name.partition(".")
     if not rest:
@@ -328,6 +346,7 @@ def set_dotted(data: dict[str, object], name: str, value: object) -> None:
     previous = data.get(first)
     inner = dict[str, object]()
     if isinstance(previous, str):
+        # NAME is short for {name: NAME}, and CONTROL for {CONTROL: null}
         inner = {"name": previous} if first in NAME_SETTINGS else {previous: None}
     elif isinstance(previous, list):
         inner = {key: None for key in previous}

@@ -56,8 +56,11 @@ class Archive:
         return name in self.members
 
     def read(self, name: str, limit: int = LARGEST) -> bytes:
-        """Return the content of a member. Raises FileFormatError where there is none of
-        that name, it is larger than `limit`, or it is damaged.
+        """Return the content of a member.
+
+        Raises:
+            FileFormatError: there is no member of that name, it is larger than `limit`
+                bytes (before `scale_limit`), or it is damaged.
         """
         if name not in self.members:
             raise make_archive_error(
@@ -83,8 +86,10 @@ class Archive:
             raise make_truncation_error(self.path, error) from None
 
     def read_json(self, name: str) -> Any:
-        """Return the value of a member that is JSON; errors as for `read`, and where it
-        is not JSON.
+        """Return the value of a member that holds JSON.
+
+        Raises:
+            FileFormatError: as for `read`, or it is not JSON.
         """
         try:
             return parse_json(self.read(name, LARGEST_TEXT))
@@ -95,9 +100,16 @@ class Archive:
 
 
 def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
-    """Return the archive in an open file of `size` bytes, which stays open as long as
-    that is used. Raises FileFormatError: it is damaged, unpacks to too much, or has
-    members that torch's archives never have.
+    """Check the table of contents of an archive of torch, and return the archive.
+
+    Args:
+        path: named in errors.
+        file: the open archive, which has to stay open as long as the result is used.
+        size: of the file in bytes.
+
+    Raises:
+        FileFormatError: it is damaged, unpacks to too much, or has members that torch's
+            archives never have.
     """
     try:
         archive = zipfile.ZipFile(file)
@@ -114,6 +126,7 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
         got = f"{size:,} bytes that unpack to {unpacked:,}"
     if limit:
         raise make_size_error(path, limit, got)
+    # torch puts all members into one folder, whose name means nothing: it is left out
     roots = {
         entry.filename.partition("/")[0] if "/" in entry.filename else ""
         for entry in entries
@@ -178,10 +191,16 @@ _ITEM_BYTES = {
 
 
 def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
-    """Return an archive for `torch.jit.load` that holds the code, the pickles and the
-    tensors of this one, and whether torch runs a part of the code while it loads it.
-    Raises FileFormatError where its code calls what a network has no use for, or its
-    pickles state what is not there.
+    """Copy the code, the pickles and the tensors of a checked archive into a new one
+    for `torch.jit.load`.
+
+    Returns:
+        The new archive, and whether torch would run a part of its code while it loads
+        it.
+
+    Raises:
+        FileFormatError: the code calls what a network has no use for, or the pickles
+            state what is not there.
     """
     scripts = [
         name
@@ -203,6 +222,7 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
     tensors = [
         name for name in archive.members if name.partition("/")[0] in PICKLES.values()
     ]
+    # torch writes it under one of two names
     name = "version" if "version" in archive else ".data/version"
     version = archive.read(name, 100).decode("ascii", "replace").strip()
     if not re.fullmatch("[0-9]{1,3}", version):
@@ -217,11 +237,14 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
         writer.write_record(name, content, len(content))
     writer.write_end_of_file()
     buffer.seek(0)
+    # torch calls a module's own __setstate__ on loading
     return buffer, any(b"__setstate__" in content for content in code.values())
 
 
 def _find_code_problem(content: bytes) -> str:
-    """Return what speaks against the code of a TorchScript archive, "" if nothing does."""
+    """Return what speaks against source code of a TorchScript archive, as a clause; ""
+    if nothing does.
+    """
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
@@ -234,6 +257,7 @@ def _find_code_problem(content: bytes) -> str:
     # steers a terminal
     escapes = _ESCAPE.findall(text)
     hidden = any(
+        # digits are octal; codes below 128 are plain ASCII
         not e.isdigit() or (int(e, 8) < 128 and int(e, 8) not in _WHITE)
         for e in escapes
     )
@@ -281,8 +305,10 @@ class _Unpickler(pickle._Unpickler):
 
 
 def _check_pickle(archive: Archive, name: str) -> None:
-    """Check that a pickle is no deeper than a network, and that the tensors that it
-    names are as large as it says.
+    """Check that a pickle is nested no deeper than a network, makes no native objects,
+    and names only tensors whose data is there in full.
+
+    Nothing that it names is imported or run.
     """
     reader = _Unpickler(archive.read(name, LARGEST_PICKLE))
     try:
@@ -302,6 +328,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
     _check_values(archive, name, value)
     # torch reads as many numbers as are stated, be they there or not
     for storage in reader.storages:
+        # torch writes ("storage", type, member, device, count of numbers)
         parts = (
             storage if isinstance(storage, tuple) and len(storage) == 5 else (None,) * 5
         )
@@ -319,7 +346,8 @@ def _check_pickle(archive: Archive, name: str) -> None:
 
 
 def _check_values(archive: Archive, name: str, value: Any) -> None:
-    """Check the texts in a nested value: depth by depth, each object once.
+    """Check the texts in a nested value, one level of nesting after the other, each
+    object once.
 
     Raises:
         FileFormatError: a text has hidden characters, or the nesting is deeper than
@@ -353,10 +381,13 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
 
 @contextlib.contextmanager
 def without_unpickling() -> Iterator[None]:
-    """Hold `torch.load` to tensors and plain containers, whoever calls it and whatever
-    it asks for.
+    """Make `torch.load` inside the block load tensors and plain containers only,
+    whoever calls it and whatever arguments it gets.
+
+    It sets an environment variable of torch, and restores the old value afterwards.
     """
     switches = ("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
+    # torch refuses to load where both are set
     before = {key: os.environ.pop(key) for key in switches if key in os.environ}
     os.environ[switches[0]] = "1"
     try:

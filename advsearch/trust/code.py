@@ -64,16 +64,19 @@ def allowed_code() -> tuple[str, ...]:
 
 
 def allow_named(settings: Mapping[str, Any]) -> None:
-    """Allow the code that stands in settings which a person has typed or given in
-    Python: as models, controls or metrics, in any form that they may have there.
+    """Allow the code that settings name which a person has typed, or given in Python.
+
+    Looked at are models, controls and metrics, in each form that they may have.
     Settings that come from a file are never given to this.
     """
     names: list[object] = []
     for key in ("model", "compared", "than"):
         texts = [text for text in _to_list(settings.get(key)) if isinstance(text, str)]
+        # several models have commas between them, and each may have @WEIGHTS
         names += [part.partition("@")[0] for text in texts for part in text.split(",")]
     for key in ("controls", "over"):
         value = settings.get(key)
+        # controls are a list of names or mappings, or a mapping from names to either
         for control in (
             *_to_list(value),
             *(value.values() if isinstance(value, Mapping) else ()),
@@ -92,18 +95,22 @@ def allow_named(settings: Mapping[str, Any]) -> None:
             else metric
         )
     texts = [name.strip() for name in names if isinstance(name, str)]
+    # plain names, such as those of bundled models, need no permission
     _ALLOWED.update(filter(_CODE.fullmatch, texts))
 
 
 def allow_code_of_call(function: Function) -> Function:
-    """Let what a caller gives a function, which is for Python only and not for what a
-    file says, allow code too.
+    """Decorate a function so that the code which its caller names in the arguments is
+    allowed (`allow_named`).
+
+    It is for functions that are called from Python only, never with what a file says.
     """
     signature = inspect.signature(function)
 
     @wraps(function)
     def wrapper(*args: Any, **keywords: Any) -> Any:
-        # of arguments that do not fit, which the function says itself
+        # bind raises it for arguments that do not fit; the function's own error is
+        # better
         with suppress(TypeError):
             allow_named(signature.bind(*args, **keywords).arguments)
         return function(*args, **keywords)
@@ -117,9 +124,7 @@ def _to_list(value: Any) -> list[Any]:
 
 @contextmanager
 def restrict_allowed_code() -> Iterator[None]:
-    """Allow inside the block what is named there alone, and after it what was allowed
-    before.
-    """
+    """Begin the block with no code allowed; after it, only what was allowed before is."""
     before = allowed_code()
     _ALLOWED.clear()
     try:
@@ -145,12 +150,16 @@ def explain_how_to_allow(name: str) -> str:
 
 
 def check_import(name: str) -> None:
-    """Check that "package.module:attribute" may be imported. Raises CodeNotAllowedError
-    where only a file does.
+    """Check that "package.module:attribute" may be imported.
+
+    Raises:
+        CodeNotAllowedError: only a file names it. The message says which file would be
+            run, and how to allow it.
     """
     if name in _ALLOWED:
         return
     importlib.invalidate_caches()
+    # finding the top package runs nothing of it
     spec = PathFinder.find_spec(
         name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()]
     )
@@ -169,8 +178,8 @@ and the folder that a user is in may be somebody else's.
 
 @contextmanager
 def current_directory_importable() -> Iterator[None]:
-    """Look for modules in the current directory too, behind the rest of the path,
-    inside the block.
+    """Inside the block, look for modules in the current directory as well, after all
+    other places.
     """
     directory = os.getcwd()
     added = directory not in sys.path and "" not in sys.path

@@ -47,8 +47,15 @@ def translate_database_errors(path: Path) -> Iterator[None]:
 
 
 def check_schema(db: sqlite3.Connection, path: Path, statements: str) -> None:
-    """Check that the file has what some statements make and no more: a view or a
-    trigger is code, and may never end.
+    """Check that a database has exactly the tables and indices that some statements
+    make.
+
+    More is refused: a view or a trigger is code, and may never end.
+
+    Args:
+        db: is closed before the error.
+        path: of its file, for the error.
+        statements: SQL that makes the right schema.
     """
     if read_schema(db) != _schema_of(statements):
         db.close()
@@ -65,14 +72,14 @@ def _schema_of(statements: str) -> Counter[Any]:
 
 
 def read_schema(db: sqlite3.Connection) -> Counter[Any]:
-    """Return every entry of the schema, whatever its name: type, name, table and
-    statement.
+    """Return every entry of a schema, whatever its name, and how often it is there.
 
-    Statements are compared without comments and line breaks, which mean nothing to
-    SQLite.
+    An entry is (type, name, table, statement). The statement has no comments and line
+    breaks, which mean nothing to SQLite.
     """
     entries = db.execute(
         "SELECT type, name, tbl_name, sql FROM sqlite_master"
+        # a right one has far fewer; a hostile one may have any number
     ).fetchmany(MAX_SCHEMA_ENTRIES)
     return Counter(
         (*names, None if sql is None else _strip_comments(str(sql)))
@@ -101,21 +108,27 @@ def protect(db: sqlite3.Connection) -> None:
 
 
 def check_before_writing(path: Path) -> None:
-    """Check that a file that SQLite is to write into is none, or an ordinary one and no
-    link, with a journal of its own. Raises FileFormatError.
+    """Check that SQLite may write to a path: that there is no file yet, or an ordinary
+    one that is no link, and that its journal names no other file.
+
+    Raises:
+        FileFormatError: it may not.
     """
     if os.path.islink(path):
         raise FileFormatError(
             f"{path}: expected a file of this run, got a link to another; {DAMAGED}"
         )
     if path.exists():
+        # raises where it is no ordinary file
         open_regular(path, "a results.sqlite", LARGEST).close()
     _check_journal(path.with_name(f"{path.name}-journal"))
 
 
 def _check_journal(journal: Path) -> None:
-    """Refuse a journal that ends with the name of a file: SQLite would delete that
-    file. None of ours does.
+    """Refuse a journal that ends with the name of a file, as those of several databases
+    do.
+
+    SQLite would delete the file of that name. No journal of ours has one.
     """
     if not os.path.lexists(journal):
         return
@@ -129,8 +142,10 @@ def _check_journal(journal: Path) -> None:
 
 
 def connect_to_read(path: Path) -> sqlite3.Connection:
-    """Open the file for reading; where the log's index can't be made (a read-only
-    disk), as one that never changes.
+    """Open a database for reading.
+
+    Beside a database in WAL mode SQLite has to make a file. Where it can't (a read-only
+    disk), the database is opened as one that never changes.
     """
     if not os.path.isfile(path):
         raise FileFormatError(
@@ -140,6 +155,7 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     address = path.resolve().as_uri()
     db = sqlite3.connect(f"{address}?mode=ro", uri=True)
     try:
+        # any query would do: it shows whether the file can be read
         read_version(db)
     except sqlite3.OperationalError:
         db.close()

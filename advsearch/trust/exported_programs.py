@@ -74,7 +74,9 @@ def is_symbol(text: str) -> bool:
 
 
 def problem(text: object) -> str:
-    """Return what is wrong with an expression, or nothing."""
+    """Return what is wrong with an expression over sizes of tensors, or "" if torch may
+    evaluate it.
+    """
     if not isinstance(text, str) or len(text) > LENGTH:
         return f"expected a text of at most {LENGTH} characters"
     try:
@@ -82,6 +84,7 @@ def problem(text: object) -> str:
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = (
+            # a plain ValueError is from `_check`; those of Python are subclasses
             str(error.args[0]) if type(error) is ValueError else "it cannot be read"
         )
         return (
@@ -93,8 +96,13 @@ def problem(text: object) -> str:
 
 
 def _check(node: ast.expr, depth: int, power: int) -> None:
-    """Raise ValueError unless the node is arithmetic; `power` is what may still be
-    multiplied up by exponents.
+    """Raise ValueError unless a node of an expression is arithmetic that ends soon.
+
+    Args:
+        node: checked with all that is below it.
+        depth: how many levels may still be nested.
+        power: how large the product of the exponents around may still become, so that
+            9**9**9 is refused.
     """
     if depth <= 0:
         raise ValueError("it is nested too deeply")
@@ -106,6 +114,7 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
             if isinstance(number, int) and abs(number) >= NUMBER:
                 raise ValueError("a number that is too large")
         case ast.Name(id=name):
+            # symbols are numbered by torch: s0, u12
             if not (name in NAMES or (is_symbol(name) and name[-1].isdigit())):
                 raise ValueError(f"the name {name[:40]!r}")
         case ast.Call(
@@ -116,25 +125,28 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
                 if len(arguments) == 1 and isinstance(arguments[0], ast.Constant)
                 else None
             )
-            keys = {word.arg for word in words}
-            values = [
+            keyword_names = {word.arg for word in words}
+            keyword_values = [
                 word.value.value if isinstance(word.value, ast.Constant) else None
                 for word in words
             ]  # repeated keys too
             if name == "Symbol":  # Symbol('s0', positive=True, integer=True)
-                assumed = None not in keys and all(
-                    isinstance(value, bool) for value in values
+                has_plain_assumptions = None not in keyword_names and all(
+                    isinstance(value, bool) for value in keyword_values
                 )
-                if not (isinstance(text, str) and is_symbol(text) and assumed):
+                if not (
+                    isinstance(text, str) and is_symbol(text) and has_plain_assumptions
+                ):
                     raise ValueError("a symbol of another form")
             elif not (
                 isinstance(text, str) and _DECIMAL.fullmatch(text)
             ):  # Float('0.5', precision=53)
                 raise ValueError("a number of another form")
-            elif not keys <= {"precision", "prec", "dps"} or not all(
-                isinstance(value, int) and 0 < value <= 200 for value in values
+            elif not keyword_names <= {"precision", "prec", "dps"} or not all(
+                isinstance(value, int) and 0 < value <= 200 for value in keyword_values
             ):
                 raise ValueError("a number of another precision")
+        # any other call has no keywords
         case ast.Call(keywords=[_, *_]):
             raise ValueError("keywords")
         case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
@@ -169,8 +181,14 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
 
 
 def _power_left(exponent: ast.expr, power: int) -> int:
-    """Return the power that is left for what has this exponent, which has to be a
-    number.
+    """Return by how much exponents below this one may still multiply: `power` divided
+    by it.
+
+    It may be a whole number, also with a sign or in ``Integer(...)``, or half: a root
+    multiplies nothing up.
+
+    Raises:
+        ValueError: it is anything else, or larger than `power`.
     """
     exponent = _without_sign(exponent)
     if (
@@ -265,13 +283,19 @@ _FORGOTTEN: JsonObject = {"metadata": {}, "guards_code": []}
 
 
 def rewrite_program(archive: Archive) -> io.BytesIO:
-    """Return an archive for `torch.export.load` that holds what is harmless of this
-    one: the network and its weights. Raises FileFormatError where it has something in
-    it that a plain network has not; the message says what.
+    """Copy the network and the weights of a checked archive into a new one for
+    `torch.export.load`.
+
+    Compiled code, pickled objects and the rest are left out, or refused.
+
+    Raises:
+        FileFormatError: there is something in it that a plain network does not have;
+            the message says what.
     """
     # a second of compilers, which no other model needs
     from torch.export.pt2_archive import PT2ArchiveWriter
 
+    # archives up to torch 2.7 have other names for the same members
     names = {new: old if old in archive else new for new, old in OLD_NAMES.items()}
     program = archive.read_json(names[PROGRAM])
     if not isinstance(program, dict) or not isinstance(
@@ -281,6 +305,7 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
         raise make_archive_error(
             archive.path, f"cannot be read as torch.export ({expected})"
         )
+    # raises, and leaves out what is not needed
     program = _check_value(archive.path, program, "")
     for name in EXAMPLE:
         if name in archive:
@@ -288,6 +313,7 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
     buffer = io.BytesIO()
     with PT2ArchiveWriter(buffer) as writer:  # type: ignore[no-untyped-call, arg-type, unused-ignore]
         writer.write_bytes(PROGRAM, json.dumps(program).encode())
+        # torch wants the member, and takes an empty one
         writer.write_bytes(EXAMPLE[0], b"")
         for folder, kind in (
             ("data/weights/", "weights"),
@@ -308,8 +334,14 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
 def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> None:
     """Copy the tensors that a table names from an archive to the one that is written.
 
-    Only plain records of numbers are copied: no pickles, and no records that are
-    shorter than the sizes in the table say.
+    Only plain records of numbers are copied: no pickles, and no empty records for
+    tensors that have numbers.
+
+    Args:
+        archive: is read.
+        writer: of the new archive.
+        folder: of the tensors in both archives.
+        config: the member with the table.
 
     Raises:
         FileFormatError: the table or an entry is something else.
@@ -327,8 +359,8 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
     copied: set[str] = set()
     for name, entry in table.items():
         record = entry.get("path_name") if isinstance(entry, dict) else None
-        plain = isinstance(record, str) and _RECORD.fullmatch(record)
-        if not isinstance(entry, dict) or entry.get("use_pickle") or not plain:
+        is_plain = isinstance(record, str) and _RECORD.fullmatch(record)
+        if not isinstance(entry, dict) or entry.get("use_pickle") or not is_plain:
             raise make_archive_error(
                 archive.path,
                 f"{name[:80]!r} is a pickled object or "
@@ -368,8 +400,17 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
 
 
 def _check_value(path: Path, value: JsonValue, key: str) -> Any:
-    """Return a value of the description, which stands under `key`, without what is left
-    out.
+    """Check a value of the network's description with all that is in it, and return it
+    without what is not needed.
+
+    Args:
+        path: of the archive, for errors.
+        value: any JSON value.
+        key: the name under which it stands; for an entry of a list, the name of the
+            list.
+
+    Raises:
+        FileFormatError: a text, number or name is none of a plain network.
     """
     if isinstance(value, list):
         return [_check_value(path, inner, key) for inner in value]
@@ -393,7 +434,9 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
 
 
 def _problem(value: Any, key: str) -> str:
-    """Return what speaks against a value of a program, "" if nothing does."""
+    """Return what speaks against a text, number or name that stands under a key, "" if
+    nothing does.
+    """
     if isinstance(value, str):
         return _TEXTS.get(key, _plain_problem)(value)
     if key == "expr_str":
@@ -409,13 +452,13 @@ def _plain_problem(text: str) -> str:
 
 def _identifier_problem(text: str) -> str:
     """Return what speaks against a name that torch writes into code, "" if nothing does."""
-    proper = text == "" or (
+    is_proper = text == "" or (
         text.isascii()
         and text.isidentifier()
         and not keyword.iskeyword(text)
         and len(text) < 1000
     )
-    return "" if proper else f"expected a name of a value, got {text[:60]!r}"
+    return "" if is_proper else f"expected a name of a value, got {text[:60]!r}"
 
 
 # that an operator is called with, such as 'same' or 'bilinear'
@@ -439,8 +482,14 @@ def _operator_problem(text: str) -> str:
 
 
 def _tree_problem(text: str) -> str:
-    """What a container of inputs or outputs looks like: torch imports the types that it
-    names.
+    """Return what speaks against the description of a container of inputs or outputs,
+    "" if nothing does.
+
+    Torch imports the types that it names, so only tuples, lists and dicts are allowed.
+
+    Args:
+        text: JSON of [version, node]; a node has a type, a context (the keys of a dict)
+            and its children.
     """
     try:
         version, tree = parse_json(text)
@@ -448,14 +497,14 @@ def _tree_problem(text: str) -> str:
         while nodes:
             node = nodes.pop()
             context = "[]" if node["context"] in (None, "null") else node["context"]
-            # of arguments
+            # the keys of a dict; a tuple or list has none
             names: Any = parse_json(context) if isinstance(context, str) else None
-            plain = isinstance(names, list) and all(
+            is_plain = isinstance(names, list) and all(
                 isinstance(name, (str, int)) for name in names
             )
             if (
                 node["type"] not in _CONTAINERS
-                or not plain
+                or not is_plain
                 or any(_plain_problem(str(name)) for name in names)
             ):
                 return (
@@ -493,8 +542,11 @@ _TEXTS: dict[str, Callable[[str], str]] = {
 
 
 def _check_pickle(archive: Archive, name: str) -> None:
-    """Check that a member is what `torch.save` makes of tensors in tuples and dicts;
-    nothing is unpickled here.
+    """Check that a member is a file of `torch.save` with tensors in tuples and dicts;
+    an empty one is fine.
+
+    Nothing is unpickled here: the steps of the pickle are read one by one, and those
+    that import anything else are refused.
     """
     data = archive.read(name)
     if not data:
@@ -505,6 +557,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
     )
     inner = (
         open_archive(archive.path, io.BytesIO(data), len(data))
+        # the first bytes of a zip archive
         if data[:2] == b"PK"
         else None
     )
@@ -515,8 +568,11 @@ def _check_pickle(archive: Archive, name: str) -> None:
     except (ValueError, IndexError, UnicodeDecodeError):
         raise make_archive_error(archive.path, what) from None
     for step, argument, _ in steps:
-        foreign = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
-        if foreign or step.name in (
+        names_other_class = step.name == "GLOBAL" and not _GLOBALS.fullmatch(
+            str(argument)
+        )
+        if names_other_class or step.name in (
+            # other ways to name a class; torch.save uses none of them
             "STACK_GLOBAL",
             "INST",
             "OBJ",

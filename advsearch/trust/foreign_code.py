@@ -57,9 +57,16 @@ class TimedOut(Exception):
 def run_within_limits(
     call: Callable[[], Result], stop: Callable[[], None] | None = None
 ) -> Result:
-    """Return what `call`, which may never end, returns, or raise what it raises; `stop`
-    asks it to end when the time is up. Raises TookTooLong: it has not ended in
-    `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
+    """Call a function of others that may never end, and return its result or raise its
+    error.
+
+    Args:
+        call: the function; it runs in a thread of its own.
+        stop: asks it to end when the time is up.
+
+    Raises:
+        TimedOut: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its
+            thread may go on.
     """
     outcome: Future[Result] = Future()
     gradients = torch.is_grad_enabled()  # a thread has its own
@@ -71,7 +78,7 @@ def run_within_limits(
         except BaseException as error:
             outcome.set_exception(error)
 
-    # a daemon's: the process may end before it
+    # a daemon: the process does not wait for it at its end
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(scale_limit(LONGEST))
@@ -84,8 +91,11 @@ def run_within_limits(
 
 
 def try_torchscript(archive: io.BytesIO) -> str:
-    """Load TorchScript in a process of its own, and return what is wrong, or nothing:
-    torch keeps Python waiting meanwhile. An error that torch raises is not told:
+    """Load TorchScript in a process of its own, and return what is wrong, "" if nothing
+    is.
+
+    In this process it could not be stopped: torch keeps Python waiting while it loads.
+    Only a crash and too long a time are told. An error that torch raises is not, since
     loading it here raises it again.
     """
     command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
@@ -101,6 +111,7 @@ def try_torchscript(archive: io.BytesIO) -> str:
         return str(TimedOut())
     return (
         f"torch crashed while loading it (signal {-done.returncode})"
+        # a negative status is minus the number of a signal
         if done.returncode < 0
         else ""
     )
@@ -151,8 +162,8 @@ _outside: list[Switches] = []  # as `use_plain_switches` found them, the outermo
 
 @contextmanager
 def use_plain_switches() -> Iterator[None]:
-    """Turn torch's switches as it comes, and back at the end: also out of
-    `torch.inference_mode`.
+    """Inside the block, set torch's global switches to their defaults (`PLAIN`), and
+    leave `torch.inference_mode`; restore them afterwards.
     """
     with (
         torch.inference_mode(False)
@@ -172,8 +183,12 @@ def use_plain_switches() -> Iterator[None]:
 
 
 def find_code_switches() -> Switches:
-    """Return the switches as the code of a network has turned them just now, or had
-    before; they are `PLAIN` then.
+    """Return the switches that the code of a network is to run with, and set `PLAIN`
+    again.
+
+    Call it inside `use_plain_switches`, after the code was loaded. Where loading it has
+    turned switches, it runs with those, else with the ones from before the outermost
+    `use_plain_switches`.
     """
     turned = Switches.read_current()
     if turned == PLAIN:
@@ -183,11 +198,14 @@ def find_code_switches() -> Switches:
 
 
 def call_with_switches(module: nn.Module, switches: Switches) -> None:
-    """Have a module called with switches of its own for new tensors, and those of the
-    caller afterwards.
+    """Make every call of a module use its own dtype and device for new tensors;
+    afterwards those of the caller are back.
+
+    It adds hooks to the module, unless both are the defaults.
     """
     if (switches.dtype, switches.device) == (PLAIN.dtype, PLAIN.device):
         return
+    # a stack, since a module may call itself
     before: list[Switches] = []
 
     def enter(*_: Any) -> None:
@@ -202,13 +220,16 @@ def call_with_switches(module: nn.Module, switches: Switches) -> None:
 
 
 def get_first_line(error: BaseException) -> str:
-    """Return a foreign error as one short line."""
+    """Return an error of foreign code as one short line: its type, and the first line
+    of its message with hidden characters escaped.
+    """
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     lines = [
         "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line)
         for line in lines[:1]
     ]
     text = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    # 300 characters with the dots
     return text if len(text) <= 300 else text[:297] + "..."
 
 
@@ -216,8 +237,13 @@ def get_first_line(error: BaseException) -> str:
 def translate_errors(
     what: str, kind: type[AdvsearchError] = ModelError
 ) -> Iterator[None]:
-    """Turn what code of others raises inside the block, which may be anything, into an
-    error: what failed, and the foreign error. One of ours is left as it is.
+    """Turn whatever foreign code raises inside the block into one of our errors; our
+    own errors pass unchanged.
+
+    Args:
+        what: failed, the beginning of the message; the foreign error follows in
+            brackets.
+        kind: of the new error.
     """
     try:
         yield

@@ -50,9 +50,13 @@ class References:
         self._size = 0
 
     def get(self, name: str) -> bytes:
-        """Return the content of a named file; after the name as it stands, its usual
-        distortions are tried. Raises FileNotFoundError: it is not there, or must not be
-        read; `refused` says which.
+        """Return the content of a file that a mesh file names.
+
+        The name is tried as it stands, then with its usual distortions.
+
+        Raises:
+            FileNotFoundError: it is not there, or must not be read; `refused` says
+                which.
         """
         content = self.find(name)
         if isinstance(content, bytes):
@@ -61,16 +65,19 @@ class References:
         raise FileNotFoundError(name)
 
     def find(self, name: str) -> bytes | str:
-        """Return the content of a named file, or why it is not read, which is not
-        remembered.
+        """Return the content of a file that a mesh file names, or why it is not read.
+
+        Unlike `get` it does not add to `refused`.
         """
         reason = MISSING
         spellings = (name.strip(), normalize_name(name))
+        # as written, without a leading slash, and the bare name in the mesh's folder
         forms = [
             form
             for text in spellings
             for form in (text, text.lstrip("/"), os.path.basename(text))
         ]
+        # each once, in this order, without the empty one
         for form in filter(None, dict.fromkeys(forms)):
             try:
                 return self._content(form)

@@ -38,12 +38,16 @@ KEY = "ADVSEARCH_MODEL_KEY"
 
 
 def check_address(spec: str) -> SplitResult:
-    """Return the parts of an address. Raises InputError: it has no host, a secret in
-    it, which would be stored with the run, or the key would go over it unencrypted.
+    """Return the parts of a model's address, once it is safe to use and to store.
+
+    Raises:
+        InputError: it has no host; it holds a secret, which would be stored with the
+            run; or the key would go there unencrypted.
     """
     try:
         address = urlsplit(spec)
         host = address.hostname
+        # read only to check it: a wrong port raises ValueError
         _ = address.port
     except ValueError as error:
         raise InputError(
@@ -51,15 +55,15 @@ def check_address(spec: str) -> SplitResult:
         ) from None
     if not host or not spec.isascii() or not spec.isprintable() or " " in spec:
         raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH")
-    secret = [
+    secret_names = [
         name
         for name, _ in parse_qsl(address.query)
         if re.search("key|token|secret|passw|sig|auth", name, re.I)
     ]
-    if "@" in address.netloc or secret:
+    if "@" in address.netloc or secret_names:
         where = (
-            f"`{secret[0]}` in the address"
-            if secret
+            f"`{secret_names[0]}` in the address"
+            if secret_names
             else "the user and password in the address"
         )
         raise InputError(
@@ -83,11 +87,14 @@ def is_local(host: str) -> bool:
 
 
 def read_key() -> str:
-    """Return the key from the environment, or nothing. Raises InputError: it is no
-    printable ASCII.
+    """Return the key for models behind an address from the environment, "" if there is
+    none.
+
+    Raises:
+        InputError: it is not printable ASCII.
     """
     key = os.environ.get(KEY, "").strip()
-    # http.client would show it in its error
+    # checked here, since the error of http.client would show the key
     if not (key.isascii() and key.isprintable()):
         raise InputError(
             f"{KEY}: expected a key of printable ASCII characters, got others"
@@ -106,9 +113,17 @@ DAYS = 7  # for which a certificate is good
 
 
 def make_https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
-    """Return what speaks HTTPS under some names and addresses, and the SHA-256
-    fingerprint of its new certificate. Raises InputError where there is no `openssl`,
-    or it makes none.
+    """Make a certificate of our own for HTTPS.
+
+    Args:
+        hosts: names and addresses that it is for.
+
+    Returns:
+        The TLS context of a server that uses it, and the certificate's SHA-256
+        fingerprint, pairs of hexadecimal digits between colons.
+
+    Raises:
+        InputError: there is no program `openssl`, or it makes none.
     """
     names = ",".join(
         f"IP:{host}" if is_address(host) else f"DNS:{host}"
@@ -117,6 +132,7 @@ def make_https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
     with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
         key = Path(folder) / "key.pem"
         certificate = Path(folder) / "certificate.pem"
+        # made before openssl writes it, so that nobody else can read it
         key.touch(mode=0o600)
         command = [
             "openssl",
@@ -186,8 +202,11 @@ def is_address(host: str) -> bool:
 
 @contextlib.contextmanager
 def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
-    """Let this thread connect to nobody inside the block, unless that is allowed; each
-    try is noted in `tries`.
+    """Inside the block, refuse every connection that this thread makes, unless
+    `allowed`.
+
+    `tries` is extended by the address of each connection that was refused. Other
+    threads connect as usual.
     """
     if allowed:
         yield

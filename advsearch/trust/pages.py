@@ -55,17 +55,20 @@ def check_request(
     port: int,
     token: str | None,
 ) -> None:
-    """Check that a request may be answered. Raises Refused.
+    """Check that a request may be answered.
 
     Args:
         command: such as "GET".
         path: what is asked for, with its query.
         headers: of the request.
         scheme: that the server speaks, "http" or "https".
-        named: what the server was told to listen at.
+        named: the host that the server was told to listen at.
         port: that it listens at.
-        token: what the address or a cookie has to have; None of a server of this
-            machine alone.
+        token: the secret that the address or a cookie has to have; None for a server
+            that only this machine can reach.
+
+    Raises:
+        RequestRejected: it may not.
     """
     if len(path) > LONGEST:
         raise RequestRejected(
@@ -83,6 +86,7 @@ def check_request(
             HTTPStatus.FORBIDDEN,
             "a page of another origin asks; open the address that was printed",
         )
+    # another site may link to a page here, but not read or change anything
     if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
         if headers.get("Sec-Fetch-Mode") != "navigate" or command == "POST":
             raise RequestRejected(HTTPStatus.FORBIDDEN, "a page of another site asks")
@@ -93,6 +97,7 @@ def check_request(
             if name == f"{COOKIE}-{port}":
                 tokens.append(value)
         if not any(
+            # takes as long for a wrong token as for the right one
             hmac.compare_digest(token, candidate)
             for candidate in tokens
             if candidate.isascii()
@@ -104,8 +109,10 @@ def check_request(
 
 
 def _is_server_address(host: str, named: str, port: int, token: str | None) -> bool:
-    """Whether a request's Host is an address of this server: a name would need a name
-    server to lead here.
+    """Return whether the Host of a request is an address of this server.
+
+    Any other name is refused: a site could let its own name lead here (DNS rebinding).
+    A number as address needs no name server, so it is always the right one.
     """
     name, _, port_text = host.rpartition(":")
     if not port_text.isdecimal() or int(port_text) != port:
@@ -130,7 +137,13 @@ def compute_script_digest(code: bytes) -> str:
 
 
 def make_page_policy(digests: Iterable[str], *, connects: bool) -> str:
-    """Return what a page may load and run; `digests` are those of its scripts."""
+    """Return the Content-Security-Policy that stands in a page: what it may load and
+    run.
+
+    Args:
+        digests: of the scripts that may run.
+        connects: it may load pictures from its server, and send requests there.
+    """
     images, connect = (
         ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
     )
@@ -143,10 +156,15 @@ def make_page_policy(digests: Iterable[str], *, connects: bool) -> str:
 
 
 def make_served_policy(digests: Iterable[str], *, is_generated: bool) -> str:
-    """Return the `Content-Security-Policy` that a server sends; `digests` are those of
-    all our scripts. A page that it has made itself may ask its server for more. All
-    else lies in the folder of a run, which may be somebody else's: it gets an origin of
-    its own, so that it can read and send nothing, and runs no script but ours.
+    """Return the `Content-Security-Policy` that the server sends with a page.
+
+    A page that the server made itself may ask it for more. Any other page lies in the
+    folder of a run, which may come from somebody else: it gets an origin of its own, so
+    that it can read and send nothing, and runs no scripts but ours.
+
+    Args:
+        digests: of all our scripts.
+        is_generated: the server made the page itself.
     """
     sandbox = (
         "form-action 'none'; sandbox allow-scripts allow-popups "
@@ -157,11 +175,14 @@ def make_served_policy(digests: Iterable[str], *, is_generated: bool) -> str:
 
 
 def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
-    """Return whether a page has a script whose digest is none of these. Scripts that
-    are data do not count; one pass, as the page may be somebody else's.
+    """Return whether a page has a script whose digest is none of `digests`.
+
+    Scripts that are data do not count. The page may come from somebody else, so that it
+    is gone through once only, however long it is.
     """
     end = 0
     for opening in re.finditer(rb"<script", page, re.IGNORECASE):
+        # it stands inside the script before it
         if opening.start() < end:
             continue
         begin = page.find(b">", opening.end()) + 1

@@ -31,8 +31,8 @@ def no_power(value: Any) -> str:
 
 
 def describe_processes(count: int | None) -> str:
-    """Of a number of processes; as many as there are processors are no more than a run
-    takes anyway.
+    """Return the power of a setting for a number of processes: none up to one a
+    processor, which a run uses anyway.
     """
     n_processors = count_cores()
     return (
@@ -90,8 +90,8 @@ class OmittedSetting(NamedTuple):
 
     @property
     def how_to_set(self) -> str:
-        """How a person asks for it, and how to do without, as both are typed behind a
-        file or a run.
+        """How a person sets it, and how to do without it, as both are typed after the
+        name of a file or a run.
         """
         value_text, default_text = (
             str(v).lower() if isinstance(v, bool) else v

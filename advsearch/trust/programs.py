@@ -30,9 +30,19 @@ def run_converter(
     seconds: int,
     env: Mapping[str, str] | None,
 ) -> subprocess.CompletedProcess[str]:
-    """Run a program that makes glTF of the file at `path`, in a folder, and return what
-    it said. Raises OSError: it can't be started; FileFormatError: it takes longer than
-    so many seconds, before `scale_limit`.
+    """Run a program that converts a file to glTF, and return what it printed.
+
+    Args:
+        path: of the file, for errors.
+        program: its name, for errors.
+        command: the program with its arguments.
+        folder: in which it runs.
+        seconds: that it may take, before `scale_limit`.
+        env: its environment; None is ours.
+
+    Raises:
+        OSError: it can't be started.
+        FileFormatError: it takes too long.
     """
     longest = scale_limit(seconds)
     unread = subprocess.DEVNULL
@@ -56,8 +66,8 @@ def run_converter(
 
 
 def make_environment(folder: str) -> dict[str, str]:
-    """Return the environment of a process that has a folder for its home, and nothing
-    of ours but the path.
+    """Return the environment variables of a process whose home is `folder`; of ours it
+    gets the search paths only.
     """
     variables = {
         name: os.environ[name]
@@ -74,15 +84,22 @@ those that are looked for.
 
 
 def find_blender(who: str, otherwise: str) -> list[str]:
-    """Return the program that is given a script behind it, with what makes it run that
-    and nothing else. Raises FileFormatError, for which it is told who needs it, and
-    what else can be done: there is none.
+    """Return the command that runs a script in Blender; the path of the script goes
+    after it.
+
+    Args:
+        who: needs it, the beginning of the error.
+        otherwise: what else can be done, its end.
+
+    Raises:
+        FileFormatError: there is no Blender.
     """
     program = os.environ.get(BLENDER) or shutil.which("blender")
     if program is None and importlib.util.find_spec("bpy") is not None:
+        # Blender as a package of this Python
         program = sys.executable
-    runs = shutil.which(program or "")
-    if runs is None:
+    executable = shutil.which(program or "")
+    if executable is None:
         missing = (
             "none is installed"
             if program is None
@@ -94,8 +111,9 @@ def find_blender(who: str, otherwise: str) -> list[str]:
             "`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
             f"{BLENDER}=bpy/bin/python; or {otherwise}"
         )
-    program = os.path.abspath(runs)
+    program = os.path.abspath(executable)
     if Path(program).name.startswith("python"):
+        # a Python with the package bpy, without the user's own modules
         return [program, "-I"]
     return [
         program,

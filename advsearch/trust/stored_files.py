@@ -46,8 +46,10 @@ _OPENED: dict[str, dict[str, None]] = {}
 
 @contextmanager
 def track_opened_files(path: Path | str) -> Iterator[None]:
-    """Files that are opened inside are parts of this one (see `list_opened_files`), unless it
-    is part of another itself.
+    """Inside the block, note each file that is opened as a part of the file `path`;
+    `list_opened_files` lists them.
+
+    Within another such block, files stay parts of the outer one's file.
     """
     token = _ROOT.set(_ROOT.get() or os.path.abspath(path))
     try:
@@ -88,8 +90,12 @@ def scale_limit(limit: int) -> int:
 
 
 def make_size_error(path: Path | str, expected: str, size: str) -> FileFormatError:
-    """Return the error for input over a limit, which names what raises it: "a mesh of
-    at most 100 faces", "120".
+    """Return the error for input that is over a limit; it says how to raise the limit.
+
+    Args:
+        path: of the input.
+        expected: such as "a mesh of at most 100 faces".
+        size: what it has instead, such as "120".
     """
     return FileFormatError(
         f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the "
@@ -99,18 +105,26 @@ def make_size_error(path: Path | str, expected: str, size: str) -> FileFormatErr
 
 
 def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
-    """Return an ordinary file, such as ``"a label file"``, opened for reading; close
-    it. Links are followed. Raises FileFormatError: a directory, a pipe, a socket or a
-    device, none of which is read; or more bytes than the limit, which is `scale_limit`.
-    Raises OSError as `open`: it is not there, or there is no permission.
+    """Open an ordinary file for reading; the caller closes it. Links are followed.
+
+    Args:
+        path: of the file.
+        expected: what it should be, for errors, such as "a label file".
+        limit: how many bytes it may have, before `scale_limit`.
+
+    Raises:
+        FileFormatError: it is a directory, a pipe, a socket or a device, none of which
+            is read, or it is too large.
+        OSError: as for `open`: it is not there, or there is no permission.
     """
     if "\0" in str(path):
         raise FileFormatError(
             f"{path}: expected the name of a file, got one with a zero byte in it"
         )
-    # before it is opened: to open a device or a pipe may change it
+    # checked before it is opened, since opening a device or a pipe may change it, and
+    # once more after that, since another file may have taken its place
     _check(path, os.stat(path), expected, limit)
-    # Not blocking, for whatever has taken its place since.
+    # without blocking: a pipe that has taken its place would wait for a writer
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     try:
         _check(path, os.fstat(descriptor), expected, limit)
@@ -167,8 +181,16 @@ def read_existing_text(path: Path | str, expected: str, limit: int) -> str:
 def parse_text(
     path: Path | str, text: str, kind: str, parse: Callable[[str], Any]
 ) -> Any:
-    """Return what the text of a file says. Raises FileFormatError where it is not of
-    its kind, such as "JSON".
+    """Return the value that the text of a file describes.
+
+    Args:
+        path: of the file, for errors.
+        text: its content.
+        kind: what it should be, for errors, such as "JSON".
+        parse: makes the value; raises ValueError or SyntaxError.
+
+    Raises:
+        FileFormatError: it is not of its kind.
     """
     try:
         return parse(text)
@@ -200,7 +222,9 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
 
 
 def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
-    """Return whether lists and mappings are nested at most `levels` deep in a value."""
+    """Return whether lists and mappings in a value are nested at most `levels` deep;
+    other values have level 0.
+    """
     children: Iterable[Any] = ()
     if isinstance(value, Mapping):
         children = value.values()
@@ -244,9 +268,17 @@ LARGEST_FILE = 1 << 29
 def check_most(
     path: Path | str, count: int, limit: int, expected: str, got: str | None = None
 ) -> None:
-    """Raise FileFormatError where a file has more of something than a limit, before
-    `scale_limit`; what was expected has {} in the place of that, and what it got is the
-    count by itself.
+    """Check that a file does not have more of something than a limit.
+
+    Args:
+        path: of the file.
+        count: how much it has.
+        limit: how much it may have, before `scale_limit`.
+        expected: the text for the error, with {} for the limit.
+        got: what it has instead, for the error; None takes `count`.
+
+    Raises:
+        FileFormatError: it has more.
     """
     if count > (most := scale_limit(limit)):
         raise make_size_error(

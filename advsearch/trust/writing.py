@@ -55,6 +55,7 @@ def storage_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
+        # raises where the folder was moved, which explains any of these errors
         check_not_moved(path)
         if isinstance(error, OSError):
             known = _ADVICE.get(error.errno or 0)
@@ -65,14 +66,15 @@ def storage_errors(path: Path) -> Iterator[None]:
                 None,
             )
             text = str(error)
+        # what to do about a known error, else the error itself
         advice = known or f"{text}; choose another place with `run`"
         raise StorageError(f"cannot write {path}: {advice}") from error
 
 
 @contextmanager
 def name_setting_in_errors(setting: str) -> Iterator[None]:
-    """Let the advice of a `StorageError` inside the block name the setting that says
-    where the file goes.
+    """Make a `StorageError` inside the block advise to change this setting, instead of
+    `run`.
     """
     try:
         yield
@@ -105,9 +107,18 @@ def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def check_free_folder(out: Path, setting: str) -> None:
-    """Check that a folder that is to be written whole is not there, or is empty. Raises
-    InputError, also of a link: a folder takes the place of no link, and what it leads
+    """Check that a folder, which will be written as a whole, is not there yet or is
+    empty.
+
+    A link is refused: the finished folder could not take its place, and what it leads
     to may be somebody else's.
+
+    Args:
+        out: the folder.
+        setting: that names it, for the error.
+
+    Raises:
+        InputError: it is not free.
     """
     if os.path.islink(out):
         raise InputError(
@@ -151,14 +162,18 @@ are.
 
 
 def note_open(results: Path) -> Callable[[], None]:
-    """Note that the results of a run are open for writing, for `check_not_moved`; return
-    what notes that they are not.
+    """Note that the results of a run are open for writing, so that `check_not_moved`
+    looks after them.
+
+    Returns:
+        What to call when they are closed.
     """
     with storage_errors(results):
         found = results.stat()
     entry = _open[results.parent] = results, (found.st_dev, found.st_ino)
 
     def closed() -> None:
+        # the run may have been opened again since
         if _open.get(results.parent) is entry:
             del _open[results.parent]
 
@@ -166,15 +181,21 @@ def note_open(results: Path) -> Callable[[], None]:
 
 
 def check_not_moved(path: Path) -> None:
-    """Check that a path does not lie in the folder of a run that is written to here and
-    was removed or renamed since: what is open is still written then, but to nowhere.
-    Raises StorageError.
+    """Check that `path` is not in the folder of a run that this process writes to and
+    that somebody has removed or renamed.
+
+    Such a folder must not be made again: writing to the open files would succeed, but
+    nobody could find them.
+
+    Raises:
+        StorageError: it was removed or renamed.
     """
     for folder in (path, *path.parents):
         if folder not in _open:
             continue
         results, known = _open[folder]
         try:
+            # compared by device and inode: a new file of that name is another one
             found = results.stat()
         except OSError:
             found = None
@@ -244,12 +265,13 @@ class RunLock:
 
 
 def is_held(folder: Path) -> bool:
-    """Whether a process works on the run in `folder`; nothing is written."""
+    """Return whether a process works on the run in `folder`; nothing is written."""
     try:
         descriptor = os.open(folder / LOCK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
         return False
     try:
+        # can be taken only where nobody holds the lock for writing
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
         return True
@@ -259,10 +281,19 @@ def is_held(folder: Path) -> bool:
 
 
 def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) -> None:
-    """Check that what a run's folder has is its own: one that somebody else made may
-    link to any file, which would be shown, copied or overwritten. The folder itself may
-    be reached by a link. Looked at are the lock and its `contents`, by name, without
-    what is in folders whose path ends in `unchecked_suffix`. Raises FileFormatError.
+    """Check that the folder of a run holds files and folders only, and no links.
+
+    In a run that somebody else made, a link may lead to any file, which would be shown,
+    copied or overwritten. The folder itself may be a link.
+
+    Args:
+        run: the folder.
+        contents: names in it that are looked at, beside the lock.
+        unchecked_suffix: end of the paths of those folders whose subfolders are not
+            looked into.
+
+    Raises:
+        FileFormatError: there is a link, or a pipe or the like.
     """
     folders = [str(run)]
     while folders:

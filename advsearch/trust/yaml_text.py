@@ -110,8 +110,21 @@ def _short(text: str) -> str:
 
 
 def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
-    """Return how many values a node has; `counts` holds those of the nodes above (0)
-    and of those done.
+    """Check a node of a YAML document, and return how many values it has with all that
+    is in it.
+
+    An alias is counted at each place, so that a short text cannot stand for a huge
+    value.
+
+    Args:
+        node: of the document.
+        depth: how many nodes are around it.
+        counts: the results so far, by id of the node; 0 for a node that is still being
+            counted, which can only come again inside itself. It is extended.
+
+    Raises:
+        yaml.YAMLError: it has a tag that no setting has, is nested too deeply, repeats
+            a name, or has too many values.
     """
     if node.tag not in _PLAIN:
         raise _problem(node, f"the tag {node.tag[:40]!r}, which no setting has")

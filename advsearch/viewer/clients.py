@@ -45,7 +45,8 @@ NO_QR = "pip install segno"
 def find_reachable_address(host: str) -> str:
     """Return the address under which other machines reach what listens at `host`.
 
-    If it listens at all addresses, that is the address of the default route.
+    A server that listens at all addresses is reached by the one that this machine has
+    on its way to the internet; without a network, only from this machine.
     """
     if host not in ("0.0.0.0", "::", ""):
         return host
@@ -83,8 +84,8 @@ class ConnectionPool:
     """Serve the connections that a socket accepts until `close`.
 
     Args:
-        listening: the socket that listens.
-        answer: serves a connection in a worker's thread; calls `report_waiting` when it
+        listening_socket: the socket that listens.
+        handle: serves a connection in a worker's thread; calls `report_waiting` when it
             begins or ends to wait for the client.
         context: for HTTPS; without it, HTTP.
     """
@@ -137,9 +138,11 @@ class ConnectionPool:
             self._ready.put(None)
 
     def report_waiting(self, seconds: float | None) -> None:
-        """Report, in a worker's thread, that it waits for its client from now on.
+        """Report, from a worker's thread, that it waits for its client from now on, or
+        no longer.
 
-        It waits for `seconds` at most; None reports that it no longer waits.
+        Args:
+            seconds: that it will wait at most; None where it no longer waits.
         """
         client = self._connections[threading.get_ident()]
         if seconds is None:
@@ -151,11 +154,14 @@ class ConnectionPool:
         client.due = now + seconds
 
     def _watch(self, selector: selectors.BaseSelector) -> None:
-        """Pass connections that have sent something to workers; enforce time limits."""
+        """Accept connections, pass those that have sent something to the workers, and
+        close those that take too long; return when the pool is closed.
+        """
         # address, and since when it is silent, by connection
         silent: dict[Any, tuple[Any, float]] = {}
         listens = False
         while not self._closed.is_set():
+            # with too many connections, new ones wait in the system's queue
             has_room = len(silent) + self._ready.qsize() < MAX_WAITING
             if has_room and not listens:
                 selector.register(self._listening, selectors.EVENT_READ)
@@ -173,6 +179,7 @@ class ConnectionPool:
                     selector.unregister(connection)
                     self._ready.put((connection, silent.pop(connection)[0]))
             now = time.monotonic()
+            # silent clients have less time where others wait
             patience = (
                 REQUEST_SECONDS
                 if has_room
@@ -188,14 +195,15 @@ class ConnectionPool:
             connection.close()
 
     def _end_slow_clients(self, now: float) -> None:
-        """End clients whose time is up.
+        """Disconnect clients that a worker has waited for too long.
 
-        While others wait, those that have had `SLOW_CLIENT_SECONDS` end too, the
-        slowest first.
+        Where connections wait for a worker, clients that have had `SLOW_CLIENT_SECONDS`
+        have to go too, the slowest first, as many as are needed.
         """
         clients = sorted(
             self._connections.copy().values(), key=lambda client: client.since
         )
+        # as long as a worker is free, nobody has to go
         n_waiting = self._ready.qsize() if len(clients) == N_WORKERS else 0
         for client in clients:
             makes_room = n_waiting > 0 and now - client.since > SLOW_CLIENT_SECONDS
@@ -213,6 +221,8 @@ class ConnectionPool:
         try:
             connection.setblocking(True)
             if self._context is not None:
+                # the handshake waits for the client, so it is done below, when the time
+                # counts
                 connection = self._context.wrap_socket(
                     connection, server_side=True, do_handshake_on_connect=False
                 )
@@ -226,6 +236,7 @@ class ConnectionPool:
         finally:
             self._connections.pop(thread, None)
             with suppress(OSError):
+                # the plain method: that of an SSL socket would forget that it is one
                 socket.socket.shutdown(connection, socket.SHUT_WR)
             connection.close()
 

@@ -66,10 +66,14 @@ class Boxes:
             self._put_box(detection["box"], detection["label"], round(10_000 * score))
 
     def _put_box(self, box: Any, name: object, score: int) -> None:
-        """Add the values of a box, with corners clipped to what uint16 can hold."""
+        """Add the values of a box (x0, y0, x1, y1) in pixels, with its name and score.
+
+        Corners are clipped to what uint16 can hold below `NO_BOX`.
+        """
         x0, y0, x1, y1 = (
             min(max(round(BOX_STEPS * float(corner)), 0), NO_BOX - 1) for corner in box
         )
+        # names beyond the limit share its index
         next_index = min(len(self.names), MAX_LEVELS)
         name_index = self.names.setdefault(str(name), next_index)
         self.values.extend((x0, y0, x1, y1, name_index, score))
@@ -121,10 +125,11 @@ def read_columns(
 
 
 def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
-    """Return the corners of a row's true box and its best detection; fill `boxes`.
+    """Return the corners of a row's true box and of its best detection, and add all its
+    boxes to `boxes`.
 
-    The detection is the first with the label that the prediction is, or misses. Rows
-    of other tasks have no corners.
+    The best detection is the first one with the label that the model predicted or,
+    where it missed the object, should have. Rows of other tasks have no corners.
     """
     payload: Any = row.payload
     corners: Mapping[str, float] = {}
@@ -141,6 +146,7 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
             for corner in box or [None] * 4:
                 values.append(math.nan if corner is None else float(corner))
         corners = dict(zip(CORNERS, values, strict=True))
+    # for every row, also one without boxes
     boxes.ends.append(len(boxes.values) // VALUES_PER_BOX)
     return corners
 
@@ -148,18 +154,20 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
 def pack_columns(
     rows: pd.DataFrame, *, has_more: bool = False, is_running: bool = False
 ) -> bytes:
-    """Serialize rows for a browser: length of the head, the head, the columns.
+    """Return rows as bytes for a browser: the length of the head, the head, the
+    columns.
 
-    The length is a uint32; the head is JSON, padded to a multiple of 4 bytes. It has
-    the count, names, and the offset of each column behind it. All is little-endian;
-    columns of four bytes a value come first, so that each is aligned. Boxes are (n, 8)
-    uint16 in `BOX_STEPS` of a pixel, or `NO_BOX`. `others` are all `Boxes`, up to each
-    row's `others end`.
+    All is little-endian. The length is a uint32. The head is JSON, padded to a multiple
+    of 4 bytes; it has the count of rows, the names, and the offset of each column
+    behind the head. Columns of four bytes a value come first, so that each one is
+    aligned. Column "boxes" is (n, 8) uint16 in `BOX_STEPS` of a pixel, or `NO_BOX`;
+    "others" are the values of all `Boxes`, and "others end" how many boxes there are up
+    to each row.
 
     Args:
         rows: a frame as `read_columns` returns it.
-        has_more: whether the run has further rows already.
-        is_running: whether the run is adding rows.
+        has_more: the run has further rows already.
+        is_running: the run is still adding rows.
     """
     columns, labels, outcome_names = _prediction_columns(rows)
     parameter_columns, parameters = _parameter_columns(rows)
@@ -191,7 +199,9 @@ def pack_columns(
 def _make_layout(
     arrays: Sequence[tuple[str, npt.NDArray[Any]]],
 ) -> list[dict[str, object]]:
-    """Return the name, the type, the offset and the width of each column."""
+    """Return a description of each column: name, type, offset in bytes, and how many
+    values a row has.
+    """
     layout = list[dict[str, object]]()
     offset = 0
     for name, values in arrays:
@@ -201,6 +211,7 @@ def _make_layout(
             "at": offset,
             "width": values.size // max(len(values), 1),
         }
+        # the one column whose length does not follow from the rows
         if name == "others":
             entry["length"] = values.size
         layout.append(entry)
@@ -211,13 +222,18 @@ def _make_layout(
 def _prediction_columns(
     rows: pd.DataFrame,
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """Return the columns of predictions, and the names of labels and outcomes."""
+    """Return the columns about predictions, and the names that the indices in "answer"
+    and "outcome" stand for.
+
+    Probabilities are in 1/10000; "right" is 0, 1 or `UNKNOWN`.
+    """
     labels, label_names = _encode_levels(rows["label"])
     outcomes, outcome_names = _encode_levels(rows["outcome"])
     probability = 10_000 * rows["probability"].clip(0.0, 1.0).to_numpy()
     probability = np.where(
         np.isnan(probability), NO_PROBABILITY, probability.round()
     ).astype(np.uint16)
+    # out of view nothing was predicted, so nothing was judged
     is_right = rows["correct"].where(rows["label"] != OUT_OF_VIEW).fillna(UNKNOWN)
     columns = {
         "step": rows["step"].to_numpy(np.uint32),
@@ -234,7 +250,9 @@ def _prediction_columns(
 def _parameter_columns(
     rows: pd.DataFrame,
 ) -> tuple[dict[str, Any], list[dict[str, object]]]:
-    """Return the columns of parameters, and their names, units, levels and edges."""
+    """Return the columns of the parameters, and for each parameter its name, unit,
+    levels (the names that its numbers stand for, if any) and edges of its ranges.
+    """
     edges = rows.attrs["edges"]
     columns = dict[str, Any]()
     parameters = list[dict[str, object]]()
@@ -245,6 +263,7 @@ def _parameter_columns(
             unit = ""
             values, levels = _encode_levels(column)
         else:
+            # too large for float32: it becomes infinite
             with np.errstate(over="ignore"):
                 values = column.to_numpy(np.float32)
         columns[f"parameter {index}"] = values
@@ -255,13 +274,14 @@ def _parameter_columns(
 
 
 def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
-    """Return the columns of boxes, empty if the rows have none."""
+    """Return the columns with boxes; none if no row has a box."""
     columns = dict[str, Any]()
     if CORNERS[0] in rows:
         pixels = rows[list(CORNERS)].to_numpy()
         steps = (BOX_STEPS * pixels).clip(0, NO_BOX - 1).round()
         columns["boxes"] = np.where(np.isnan(pixels), NO_BOX, steps).astype(np.uint16)
     boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
+    # the ends fit only if the boxes are those of exactly these rows
     if boxes is not None and boxes.values and len(boxes.ends) == len(rows):
         columns["others"] = np.asarray(boxes.values, np.uint16)
         columns["others end"] = np.asarray(boxes.ends, np.uint32)

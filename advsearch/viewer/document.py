@@ -133,7 +133,10 @@ def quote_name(name: str) -> str:
 
 
 def make_data_script(value: object, name: str) -> Html:
-    """Return a value as JSON in a script element, which code finds by its `id`."""
+    """Return a value as JSON in a script element, which code finds by its `id`.
+
+    The signs < > & are escaped, so that no text in it can end the element.
+    """
     text = (
         json.dumps(value)
         .replace("<", "\\u003c")
@@ -162,8 +165,12 @@ def read_asset(name: str) -> str:
 
 
 def make_header(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
-    """Return the header of a page: a line about its subject, the result, and
-    remarks.
+    """Return the header of a page.
+
+    Args:
+        eyebrow: a line above the title, about what the page is of.
+        text: the title, what came out.
+        remarks: sentences below it.
     """
     return make_element(
         "header",
@@ -174,9 +181,8 @@ def make_header(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
 
 
 def remarks_html(remarks: Sequence[str]) -> Html:
-    """Return a list of remarks on a result, and one of notes on how files were read.
-
-    Many notes are folded.
+    """Return a list of remarks on a result, and behind it one of notes on how files
+    were read, which is folded where it is long.
     """
     notes = [remark for remark in remarks if _FILE_REMARK.match(remark)]
     others = [remark for remark in remarks if remark not in notes]
@@ -195,8 +201,11 @@ def _list_html(lines: Sequence[str], css: str) -> Html | None:
 
 
 def subject_html(*parts: tuple[str, str]) -> Html:
-    """Return what a run is about: kinds with names; paths are short, and full on
-    hover.
+    """Return what a run is about as HTML.
+
+    Args:
+        parts: (kind, name) each; the kind may be empty. A path is shortened, and shown
+            in full where the mouse is over it.
     """
     content = list[Html | str]()
     for index, (kind, text) in enumerate(parts):
@@ -247,6 +256,7 @@ def make_table(
                 make_element("td", _interval_bar(bars[index]), class_="hide-small")
             )
         lines.append(make_element("tr", *cells))
+    # the column of bars has no head
     bar_head = make_element("td", class_="hide-small") if bars else None
     column_heads = (make_element("th", text, scope="col") for text in heads)
     head = make_element("tr", *column_heads, bar_head)
@@ -265,8 +275,10 @@ def _cell_class(text: str, share: float | None) -> str:
 
 
 def _interval_bar(bar: tuple[float, float, float] | None) -> Html | None:
-    """Return a bar from a lower to an upper fraction of the width, with a mark on
-    it.
+    """Return a bar for an interval in a table cell; None for None.
+
+    Args:
+        bar: (lower end, upper end, mark), as fractions of the width.
     """
     if bar is None:
         return None
@@ -281,9 +293,8 @@ def _interval_bar(bar: tuple[float, float, float] | None) -> Html | None:
 
 
 def link_parts(run: Path, parts: Sequence[str | None]) -> list[str]:
-    """Return the addresses of the pages of a run's parts, relative to its own page.
-
-    They are empty of parts that have no page.
+    """Return the addresses of the pages of a run's parts, relative to the run's own
+    page; "" for a part without a page.
     """
     links = []
     for part in parts:

@@ -50,9 +50,10 @@ MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 def find_image(
     run: Path, name: str | Path, max_bytes: int = MAX_FIGURE_BYTES
 ) -> Path | None:
-    """Return an image file of a run, None if it is missing, outside of it or too large.
+    """Return the path of an image in a run; None if it is missing, outside of the run
+    or too large.
 
-    Names come from a summary, which may name any file.
+    The name comes from a summary, and may be that of any file.
     """
     file = run / name
     if not is_inside(file, run) or not file.is_file():
@@ -61,9 +62,15 @@ def find_image(
 
 
 def make_part(run: Path, part: ResultPart, description: str) -> Html:
-    """Return a part of a result as HTML; a folded one opens at its title.
+    """Return a part of a result as HTML.
 
-    `description` describes the chart of a part without text of its own.
+    A part that a script fills is hidden until then, and a folded one opens at its
+    title.
+
+    Args:
+        run: directory of the run.
+        part: of its result.
+        description: of the chart, where the part has no text of its own.
     """
     content = _part_content(run, part, description)
     title = make_element("h2", part.title) if part.title else None
@@ -82,10 +89,13 @@ def make_part(run: Path, part: ResultPart, description: str) -> Html:
 
 
 def _part_content(run: Path, part: ResultPart, description: str) -> Html:
-    """Return text, chart or figure, table, images and note of a part."""
+    """Return a part of a result without its title: text, chart or figure, table, images
+    and note.
+    """
     content = list[Html | None]()
     if part.draw is not None:
         alt = " ".join([f"{part.title}.", *(part.text or [description])])
+        # the style of the page shows the one that fits the window
         charts = [
             views.make_chart_svg(part.draw, alt, width, part.height)
             for width in (views.WIDE_WIDTH, views.NARROW_WIDTH)
@@ -121,6 +131,7 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
             continue
         data = file.read_bytes()
         if is_png and len(data) > MAX_UNSCALED_BYTES:
+            # large pictures would make the page huge
             data = shrink_png(data, MAX_SCALED_SIZE)
         image = make_element(
             "img",
@@ -139,7 +150,9 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
 
 
 def _embed_figure(run: Path, name: str, alt: str) -> Html | None:
-    """Return a wide figure, None without a file that can be embedded."""
+    """Return a wide figure of a run as HTML; None if there is no such file that can be
+    embedded.
+    """
     file = find_image(run, name) if name else None
     if file is None:
         return None
@@ -154,7 +167,7 @@ def _embed_figure(run: Path, name: str, alt: str) -> Html | None:
 def make_end(run: Path, result: Result, view: ShownResult) -> Html:
     """Return the end of a page: cost and conditions, commands, and all settings.
 
-    The commands resume a run that was stopped, and repeat it.
+    The commands resume a run that was stopped, and repeat a run.
     """
     facts = {
         name[:1].upper() + name[1:]: text
@@ -230,8 +243,9 @@ def make_object_data(data: bytes) -> list[Html]:
 
 
 def _read_header(data: bytes) -> dict[str, dict[str, object]]:
-    """Read the JSON header of a binary glTF file; empty if the file is corrupt."""
+    """Return the JSON header of a binary glTF file; empty if the file is corrupt."""
     try:
+        # magic, version and length of the file; then length and kind of its first chunk
         magic, _, _, length, kind = struct.unpack_from("<4sII I4s", data)
         if (magic, kind) != (b"glTF", b"JSON"):
             return {}
@@ -321,8 +335,8 @@ def make_view_page(
 
 
 def _list_parts(run: Path, parts: list[object]) -> Html | None:
-    """Return a folded list of the runs of a run, linked to their pages if they
-    exist.
+    """Return a folded list of the runs that a run consists of, with links to their
+    pages; None if there are none, or they are something else than names.
     """
     names = [part for part in parts if isinstance(part, str)]
     if not parts or len(names) < len(parts):

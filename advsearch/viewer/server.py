@@ -82,7 +82,11 @@ from advsearch.viewer.thumbnails import (
 
 
 def make_list_page(runs: Mapping[str, Path]) -> str:
-    """Return the page that lists runs (directories by name), the newest first."""
+    """Return the page with the list of runs, the newest first.
+
+    Args:
+        runs: their directories by name.
+    """
     listed = [
         (name, listing.read_listed_run(path, counts=False))
         for name, path in runs.items()
@@ -196,9 +200,14 @@ def is_unfinished(run: Path) -> bool:
 
 
 def make_progress_page(name: str, run: Path) -> str:
-    """Return the page that follows a run's progress, by its name in the dashboard.
+    """Return the page that follows the progress of a run.
 
-    Without its script it shows the progress at the time of the request.
+    Its script asks for what is new; without it the page shows the state at the time of
+    the request.
+
+    Args:
+        name: of the run in the dashboard.
+        run: its directory.
     """
     listed = listing.read_listed_run(run)
     facts = (listed.command, listed.object, " and ".join(listed.controls))
@@ -248,16 +257,17 @@ def _attack_list_html(run: Path) -> Html | None:
 
 
 def make_progress_json(run: Path, after: int) -> bytes:
-    """Return what is new in a run as JSON.
+    """Return, as JSON, what is new in a run.
 
     Args:
         run: directory of the run.
-        after: `next` of the previous response, or `FIRST_ROW_ID`.
+        after: "next" of the previous response, or `FIRST_ROW_ID`.
 
     Raises:
-        FileFormatError: if the stored results are corrupt.
+        FileFormatError: the stored results are corrupt.
     """
-    # before the rows are read: later ones are requested next time
+    # looked up before the rows are read: rows that come in between are asked for next
+    # time
     running = is_held(run)
     ended = not is_unfinished(run)
     last = after
@@ -328,7 +338,7 @@ class PhotographServer(Protocol):
         """Return media type and data of a "rendering" or a "photo" of a run.
 
         Raises:
-            Refused: if there is none.
+            RequestRejected: there is none.
         """
 
     def store_photograph(
@@ -341,8 +351,15 @@ class PhotographServer(Protocol):
     ) -> tuple[str, bytes]:
         """Store a photograph, and return media type and data of the response.
 
+        Args:
+            run: directory of the run.
+            name: of the rendering that it shows.
+            headers: of the request.
+            key: that the page has and the request needs.
+            read_data: reads the photograph's file from the request.
+
         Raises:
-            Refused: if it is no photograph, or the request lacks the page's key.
+            RequestRejected: it is no photograph, or the request lacks the key.
         """
 
 
@@ -436,13 +453,14 @@ class Dashboard(HTTPServer):
         return {path.name: path for path in paths}
 
     def find_run(self, name: str) -> Path:
-        """Return the directory of a run.
+        """Return the directory of a run by its name in the dashboard.
 
         Raises:
-            Refused: if there is no such run.
-            FileFormatError: if it has links.
+            RequestRejected: there is no such run.
+            FileFormatError: it has links in it.
         """
         path = self._explicit_runs.get(name)
+        # the name comes from a request, and must not lead out of the folder
         is_name = name not in ("", ".", "..") and not set("/\0") & set(name)
         if not self._explicit_runs and is_name and is_run(HOME / name):
             path = HOME / name
@@ -456,7 +474,7 @@ class Dashboard(HTTPServer):
         """What handles photographs.
 
         Raises:
-            Refused: if this server takes none.
+            RequestRejected: this server takes none.
         """
         if self.photographs is None:
             raise RequestRejected(
@@ -514,9 +532,10 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing."""
 
     def do_GET(self) -> None:
-        """Respond to a request; any error becomes a response."""
+        """Respond to a request of any method; any error becomes a response."""
         headers: dict[str, str] = {}
         status = HTTPStatus.OK
+        # from here until the response is sent the worker computes
         self.server.clients.report_waiting(None)
         try:
             self._check_request()
@@ -545,7 +564,9 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_POST = do_GET
 
     def _check_request(self) -> None:
-        """Refuse a request without the token, or from another origin."""
+        """Check that the request may be answered: it needs the token, and must not come
+        from another origin.
+        """
         server = self.server
         check_request(
             self.command,
@@ -558,7 +579,7 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def _respond(self) -> tuple[Response, dict[str, str]]:
-        """Return the response to a request, and headers to send with it."""
+        """Return the response to a request, and further headers to send with it."""
         if not self.path.startswith("/"):
             raise RequestRejected(HTTPStatus.BAD_REQUEST, "this server is no proxy")
         address = urlsplit(self.path)
@@ -568,7 +589,7 @@ class _Handler(BaseHTTPRequestHandler):
             headers["Set-Cookie"] = make_token_cookie(
                 self.server.server_port, self.server.token
             )
-        # names of files may be no text
+        # surrogates stand for bytes of a file name that are not UTF-8
         parts = [
             unquote(part, errors="surrogateescape")
             for part in address.path.split("/")[1:]
@@ -627,8 +648,8 @@ class _Handler(BaseHTTPRequestHandler):
         raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _serve_run(self, name: str) -> Response:
-        """Return the page of a run: of a sweep, a run in progress, or a finished
-        one.
+        """Return the page of a run: that of a sweep, that of a run in progress, or the
+        stored page of a run that has ended.
         """
         run = self.server.find_run(name)
         if listing.read_listed_run(run, counts=False).command == "sweep":
@@ -642,6 +663,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _serve_part(self, name: str, part: str) -> Response:
         """Return the stored page of a part of a run, such as an attack of a study."""
+        # compared to names that exist, since the name comes from a request
         for path in (self.server.find_run(name) / PARTS).iterdir():
             if path.name == part:
                 if (path / REPORT).is_file():
@@ -686,14 +708,18 @@ class _Handler(BaseHTTPRequestHandler):
         return _serve_page(page, "../")
 
     def _serve_rows(self, query: Query, run: Path) -> Response:
-        """Return rows of a sweep as columns; those of a finished one may be stored."""
+        """Return rows of a sweep as packed columns.
+
+        The first rows of a finished sweep may be stored in this form already.
+        """
         media_type = "application/octet-stream"
         after = _parse_after(query)
         if not after and (run / COLUMNS).is_file() and listing.is_finished(run):
             stored = read_bytes(run / COLUMNS, "columns of a sweep", MAX_COLUMNS_BYTES)
             return Response(media_type, stored)
         max_rows = MAX_ROWS if after else FIRST_ROWS
-        # before the rows are read: later ones are requested next time
+        # looked up before the rows are read: rows that come in between are asked for
+        # next time
         running = is_held(run)
         rows = read_columns(run, after, max_rows)
         has_more = len(rows) == max_rows
@@ -702,11 +728,11 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def _read_body(self) -> bytes:
-        """Read the body of a request.
+        """Return the body of a request.
 
         Raises:
-            Refused: if its length is missing, wrong or more than
-                `clients.LARGEST_SENT`.
+            RequestRejected: its length is missing, wrong or more than
+                `clients.MAX_BODY_BYTES`.
         """
         length = self.headers.get("Content-Length", "")
         if not re.fullmatch(r"[0-9]{1,15}", length):
@@ -733,7 +759,9 @@ def _parse_after(query: Query) -> int:
 
 
 def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
-    """Return the status and the text of the response to an error."""
+    """Return status and text of the response to an error; of an error of others only
+    its type is told.
+    """
     if isinstance(error, RequestRejected):
         return error.status, str(error)
     if isinstance(error, AdvsearchError):
@@ -745,13 +773,17 @@ def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
 
 
 def _make_source(name: str, run: Path, base: str) -> SweepSource:
-    """Return where a page requests a sweep's rows and images.
+    """Return where the page of a sweep gets rows and images from.
 
-    `base` is the address of the run relative to the page.
+    Args:
+        name: of the run.
+        run: its directory.
+        base: address of the run, relative to the page.
     """
     return SweepSource(
         name,
         f"{base}rows",
+        # the page has no rows of its own, but asks for them
         is_partial=True,
         thumbnails=find_thumbnails(run),
         thumbnail_address=f"{base}pictures",
@@ -764,7 +796,9 @@ HTML = "text/html; charset=utf-8"
 def _serve_page(
     page: str, home: str | None = None, above: tuple[str, str] | None = None
 ) -> Response:
-    """Return a page that the server has made; for arguments see `_add_navigation`."""
+    """Return the response with a page that the server has made itself; for `home` and
+    `above` see `_add_navigation`.
+    """
     data = page.encode("utf-8", "replace")  # names of files may be no text
     if home:
         data = _add_navigation(data, home, above)
@@ -774,7 +808,11 @@ def _serve_page(
 def _serve_stored_page(
     run: Path, home: str, above: tuple[str, str] | None = None
 ) -> Response:
-    """Return the stored page of a run; for arguments see `_add_navigation`."""
+    """Return the response with the stored page of a run; for `home` and `above` see
+    `_add_navigation`.
+
+    The run may be somebody else's, so only our own scripts run in its page.
+    """
     page = read_bytes(run / REPORT, "a page", MAX_PAGE_BYTES)
     remark = None
     if has_other_scripts(page):
@@ -804,5 +842,6 @@ def _add_navigation(
         make_element("nav", *anchors, aria_label="back"),
         make_element("p", remark, class_="remarks") if remark else None,
     )
+    # behind the start of the body, or at the beginning of a page without one
     start = page.find(b"<body>") + len(b"<body>") if b"<body>" in page else 0
     return page[:start] + navigation.encode("utf-8", "replace") + page[start:]

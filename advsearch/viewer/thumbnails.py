@@ -50,9 +50,8 @@ def make_thumbnail(picture: object) -> bytes:
 
 
 def make_cover(run: Path) -> bytes:
-    """Return a small image of a run as a JPEG; gray if it has none.
-
-    That is its worst prediction, or else its first figure.
+    """Return a small image of a run as a JPEG: its adversarial picture, or else another
+    one; gray if it has none.
     """
     preferred = ("adversarial", "clean", "worst")
     files = [run / IMAGES / f"{name}.png" for name in preferred]
@@ -138,10 +137,13 @@ class Thumbnails:
         return tuple(sorted(_list_numbers(self.run)))
 
     def read_png(self, step: int) -> bytes | None:
-        """Return the image of a configuration as a PNG, None if it was not stored.
+        """Return the image of a configuration as a PNG; None if it was not stored.
+
+        Args:
+            step: of the row; several rows may be of one image.
 
         Raises:
-            FileFormatError: if the file is no JPEG.
+            FileFormatError: the file is no JPEG.
         """
         try:
             data = read_thumbnail(self.run, step // self.configurations_per_image)
@@ -161,12 +163,13 @@ class Thumbnails:
     def list_data_urls(
         self, rows: pd.DataFrame, max_bytes: int
     ) -> Iterator[tuple[str, str]]:
-        """Yield number and data URL of thumbnails, those of the worst margins first.
+        """Yield number and data URL of thumbnails, those with the worst margins first.
 
-        The URLs take at most `max_bytes` bytes in all.
+        It ends before the URLs take more than `max_bytes` in all.
         """
         steps = rows["step"].to_numpy()
         margins = rows["margin"].to_numpy()
+        # rows without a margin come last
         order = np.argsort(np.nan_to_num(margins, nan=np.inf), kind="stable")
         remaining = set(self.numbers)
         n_bytes = 0
@@ -176,6 +179,7 @@ class Thumbnails:
                 continue
             remaining.discard(number)
             data = read_thumbnail(self.run, number)
+            # base64 makes 4 letters of 3 bytes
             n_bytes += len(data) * 4 // 3
             if n_bytes > max_bytes:
                 return

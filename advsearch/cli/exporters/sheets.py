@@ -24,11 +24,13 @@ class Sheets(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
+        """See `Exporter.write`."""
         from advsearch.extend import exports  # takes seconds
 
         known_size = options["size"]
         if known_size is None:
             known_size = exports.get_real_size(run)
+        # length of the object's longest side in millimetres
         longest = USUAL_SIZE if known_size is None else known_size
         pieces = exports.make_printable_pieces(run, longest)
         profile = None if options["icc"] is None else Path(options["icc"])

@@ -31,10 +31,17 @@ PLACED = ("environment", "object")  # values that have a place of their own in a
 def write_threedb(
     rows: Callable[[], Iterable[Any]], out: Path, picture: Callable[[int], bytes | None]
 ) -> int:
-    """Write the rows of a sweep as such a folder, made or empty, with the PNG of each,
-    where one was kept, and return how many there were. ``loss`` is the margin with its
-    sign turned: over 0 where a prediction is not right. The parameter ``network`` tells
-    what several networks predict apart.
+    """Write the rows of a sweep as a folder of 3DB, with the PNG of each where one was
+    kept, and return how many there were.
+
+    Args:
+        rows: returns the rows; it is called twice, since all names have to be known
+            first.
+        out: the folder, which is made, or empty.
+        picture: returns the PNG of a row by its step, None if none was kept.
+
+    Raises:
+        InputError: there are no rows, or the folder is not empty.
     """
     writing.check_free_folder(out, "out")
     names = dict[str, None]()
@@ -64,6 +71,7 @@ def write_threedb(
                         out / IMAGES / f"{line['id']}_rgb.png", data, durable=False
                     )
                 n_rows += 1
+        # a list by index, in which gaps get a name
         class_names = [
             class_by_number.get(number, f"class {number}")
             for number in range(max(class_by_number) + 1)
@@ -75,12 +83,14 @@ def write_threedb(
 def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]:
     """Return one line of a 3DB log, for a row of a sweep.
 
+    3DB minimizes where we maximize, so its loss is the negative margin: over 0 where a
+    prediction is wrong.
+
     Args:
         row: of the results.
-        names: parameters that every line has; one that the row lacks is "none".
+        names: parameters that every line has; one that the row lacks is "none". The
+            model is called "network" here, since 3DB's "model" is the object.
         prediction: index of the predicted class.
-
-    3DB minimizes where we maximize, so that its loss is the negative margin.
     """
     value_of = {name: entry["value"] for name, entry in row.values.items()}
     parameters = {
@@ -93,6 +103,7 @@ def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]
         "environment": environment,
         "model": model,
         "is_correct": str(bool(row.correct)),
+        # 0.0 minus the margin, since -0.0 would be written as such
         "loss": None if row.margin is None else 0.0 - row.margin,
         "prediction": [prediction],
         "output_type": "classes",
@@ -111,6 +122,7 @@ class ThreeDB(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
+        """See `Exporter.write`."""
         from advsearch.extend import exports  # takes seconds
 
         run_path = directory.find_run(run)

@@ -16,6 +16,7 @@ class _Dataset(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
+        """See `Exporter.write`."""
         from advsearch.cli.exporters.dataset.files import write_dataset  # takes seconds
 
         count, notes = write_dataset(

@@ -43,8 +43,13 @@ class Categories:
     unnamed: set[str] = field(default_factory=set)
 
     def find_things(self, image: Any) -> list[tuple[Any, int]]:
-        """Return the things that an image shows, each with the index of its
-        category.
+        """Return the things that an image shows, each with the index of its category.
+
+        The labels become those of the first image; things that no label names are added
+        to `unnamed`.
+
+        Raises:
+            InputError: another image of the run has other labels.
         """
         task = image.task
         facts = image.facts
@@ -54,6 +59,7 @@ class Categories:
         object_category = 0
         if isinstance(task, tasks.ClassTask) and task.labels:
             labels = task.labels
+            # the first of the classes that are right for the object
             object_category = task.find_right_classes(facts)[0]
         if self.labels not in ((), labels):
             raise InputError(
@@ -79,13 +85,13 @@ def write_dataset(
 ) -> tuple[int, list[str]]:
     """Write the pictures of a run as a dataset, with what is true of them.
 
-    It is written whole or not at all; nothing is written of no pictures.
+    It is written whole or not at all; where there are no pictures, nothing is written.
 
     Args:
         run: of `sweep` or `attack`, or with such parts (a suite, a study).
         out: the folder, which is made, or empty.
         format: "coco" or "yolo".
-        every: whether also pictures that all models are right about are written.
+        every: also write pictures that all models are right about.
         progress: is told how far it is.
 
     Returns:
@@ -131,8 +137,10 @@ def write_dataset(
 
 
 def make_yolo_labels(image: Any, things: list[tuple[Any, int]]) -> str:
-    """Return a line for each thing: its class, and center and size of its box as
-    fractions of the picture.
+    """Return the labels of a picture for YOLO, a line for each thing: ``CATEGORY X Y
+    WIDTH HEIGHT``.
+
+    X and Y are the center of the box; all four are fractions of the picture.
     """
     (image_height, image_width) = image.picture.shape[:2]
     lines = []
@@ -156,6 +164,7 @@ def write_yolo_index(folder: Path, categories: Categories) -> None:
         "val": IMAGES,
         "names": [*categories.labels],
     }
+    # JSON is YAML, too
     writing.write_text(folder / YOLO, json.dumps(index, indent=1) + "\n")
 
 
@@ -167,8 +176,8 @@ def write_coco_index(
 ) -> None:
     """Write the JSON of a COCO dataset.
 
-    Labels that name nothing, such as a background, are no categories, and the others
-    keep their numbers.
+    A label that names nothing, such as a background, is no category; the others keep
+    their indices as ids.
     """
     category_entries = [
         {"id": index, "name": name, "supercategory": ""}
@@ -190,7 +199,7 @@ def write_coco_index(
 
 def make_notes(categories: Categories, n_changed: int) -> list[str]:
     """Return sentences about things without a category, and about pictures that the
-    model now judges otherwise.
+    model judges in another way than when the run was made.
     """
     notes = []
     if categories.unnamed:
@@ -207,7 +216,11 @@ def make_notes(categories: Categories, n_changed: int) -> list[str]:
 
 
 def make_image(image_id: int, image: Any) -> dict[str, Any]:
-    """Return the entry of a picture in COCO's JSON, with its predictions and values."""
+    """Return the entry of a picture in COCO's JSON.
+
+    Under "advsearch", which is not COCO's, it has the predictions of all models and the
+    values of the parameters.
+    """
     height, width = image.picture.shape[:2]
     predictions: list[dict[str, Any]] = [
         {
@@ -262,7 +275,14 @@ def make_things(
 
 
 def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, Any]:
-    """Return the annotation of a thing in COCO's JSON, with its mask as runs."""
+    """Return the annotation of a thing in COCO's JSON; its mask is run-length encoded.
+
+    Args:
+        number: the id of the annotation.
+        image: the id of its picture.
+        thing: what is true of it.
+        category: the index of its label.
+    """
     fraction = thing.visible_fraction
     return {
         "id": number,

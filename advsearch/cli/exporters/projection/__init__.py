@@ -19,6 +19,7 @@ class Projection(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
+        """See `Exporter.write`."""
         # takes seconds
         from advsearch.cli.exporters.projection.images import write_projection
 

@@ -32,18 +32,19 @@ SPP = 64  # samples a pixel of the picture of the scene with the marks
 
 
 def write_projection(run: str | Path, out: Path) -> list[str]:
-    """Write a folder for each projector of a run's adversarial scene.
+    """Write a folder with what to project for each projector of a run's adversarial
+    scene.
 
-    It has `picture.png` to project, `texels.png` with the exact values, `marks.png` to
-    project first, `seen.png`, where the run's camera sees these marks, and
-    `README.txt`.
+    It has `picture.png` to project, `texels.png` with the exact values, `marks.png`
+    with numbered crosses to project first, `seen.png` with these crosses as the run's
+    camera sees them, and `README.txt`.
 
     Returns:
         Sentences about what to set.
 
     Raises:
-        InputError: it has no projector, or the folder is there already; other errors
-            as for `AdversarialRun.load`.
+        InputError: the scene has no projector, or the folder is there already; other
+            errors as for `AdversarialRun.load`.
     """
     if os.path.lexists(out):
         raise InputError(f"out: {out} is there already; choose another name")
@@ -69,11 +70,20 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
 def write_projector(
     folder: Path, adversarial: Any, control: Any, values: dict[str, Tensor]
 ) -> list[str]:
-    """Write the files of one projector, and return sentences about what to set."""
+    """Write the files of one projector, and return sentences about what to set.
+
+    Args:
+        folder: to write into.
+        adversarial: the `AdversarialRun` with the scene.
+        control: the projector.
+        values: its values by name; "pattern" is (rows, columns, 3) in sRGB.
+    """
     pattern = values["pattern"]
     n_rows, n_columns = pattern.shape[:2]
+    # rounded up, so that pictures have ROWS pixels of height at least
     factor = -(-ROWS // n_rows)
     marks, marked_texels = make_marks((n_rows, n_columns), factor)
+    # the mean of each texel, at the resolution of the pattern
     texel_marks = torch.nn.functional.avg_pool2d(marks.permute(2, 0, 1)[None], factor)[
         0
     ].permute(1, 2, 0)
@@ -105,6 +115,7 @@ def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
     unit = "m" if control.scene.object.metres is not None else "object sizes"
     fov = control.part.fov
     white = control.measured(values, {})["white"]["value"]
+    # half the width of the picture at distance 1; the throw ratio is distance by width
     half_width = math.tan(math.radians(fov) / 2.0)
     return [
         f"{number['lumens']:g} lumens for a white picture, "
@@ -123,10 +134,19 @@ def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
 def describe_marks(
     control: Any, marked_texels: list[tuple[int, int, float, float]]
 ) -> list[str]:
-    """Return texel and direction of each mark, a line each."""
+    """Return a line for each mark: its texel, and its direction from the projector's
+    axis in degrees.
+
+    Args:
+        control: the projector.
+        marked_texels: of each mark row, column, and x and y as fractions of the picture
+            from its upper left.
+    """
     half_width = math.tan(math.radians(control.part.fov) / 2.0)
     lines = []
     for index, (row, column, x, y) in enumerate(marked_texels, 1):
+        # x and y are 0 to 1 from the upper left; -1 to 1 from the middle times half the
+        # width is the tangent
         right = math.degrees(math.atan((2 * x - 1) * half_width))
         up = math.degrees(math.atan((1 - 2 * y) * half_width / control.part.aspect))
         lines.append(
@@ -148,15 +168,16 @@ def has_pattern(control: Control) -> bool:
 def make_marks(
     shape: tuple[int, int], factor: int
 ) -> tuple[Tensor, list[tuple[int, int, float, float]]]:
-    """Return a picture of a frame and nine numbered crosses, and where these are.
+    """Return a picture of a frame and nine numbered crosses, and where the crosses are.
 
     Args:
         shape: rows and columns of the projector's pattern.
-        factor: width of a texel of it in pixels of the picture.
+        factor: how many pixels of the picture a texel is wide.
 
     Returns:
-        The picture on black, (h, w, 3) linear in [0, 1]; and of each cross row and
-        column of its texel, and the texel's center as fractions of width and height.
+        The picture, white on black, (h, w, 3) linear in [0, 1]; and for each cross row
+        and column of its texel, and x and y of the texel's center as fractions of
+        width and height.
     """
     n_rows, n_columns = shape
     width = n_columns * factor
@@ -166,6 +187,7 @@ def make_marks(
     line = max(2, height // 200)
     draw.rectangle((0, 0, width - 1, height - 1), outline=255, width=2 * line)
     marked_texels = []
+    # three rows and three columns of crosses
     for down, across in itertools.product(SHARES, SHARES):
         row = int(down * n_rows)
         column = int(across * n_columns)
@@ -187,7 +209,15 @@ def draw_cross(
     line: int,
     text: str,
 ) -> None:
-    """Draw a white cross with its number; lengths are in pixels."""
+    """Draw a white cross with its number.
+
+    Args:
+        draw: draws on the picture.
+        center: of the cross (x, y) in pixels.
+        arm: length of an arm in pixels, also the size of the number.
+        line: width of the lines in pixels.
+        text: the number.
+    """
     x, y = center
     draw.line((x - arm, y, x + arm, y), fill=255, width=line)
     draw.line((x, y - arm, x, y + arm), fill=255, width=line)

@@ -20,6 +20,7 @@ class Gltf(Exporter):
     def write(
         self, run: str, out: Path, options: Mapping[str, Any], progress: Progress
     ) -> Exported:
+        """See `Exporter.write`."""
         from advsearch.cli.exporters.scene.files import write_gltf  # takes seconds
 
         notes = write_gltf(run, out)

@@ -20,17 +20,16 @@ XML = ".xml"
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
-    """Write the adversarial scene of a run as XML with its meshes and pictures.
-
-    These stand beside it, and their names begin with its own.
+    """Write the adversarial scene of a run as XML, with its meshes and pictures in
+    files beside it whose names begin with that of the XML.
 
     Args:
         run: a name or a folder.
         out: a file that ends in .xml, or a folder for `scene.xml`.
 
     Returns:
-        Sentences about how its picture becomes that of the run, and what is no part of
-        it.
+        Sentences about how a rendering of it becomes the picture of the run, and what
+        is missing in it.
 
     Raises:
         InputError: such files are there, or stock Mitsuba has no such scene; other
@@ -43,6 +42,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     inputs, on_picture = adversarial.split_inputs()
     backdrop = on_picture.get("backdrop.color")
     hazy = has_haze(renderer, inputs)
+    # a photograph is an image, a plain background one colour
     if backdrop is not None and backdrop.ndim > 1:
         raise InputError(
             f"{adversarial.folder}: the scene is rendered into a photograph, which is "
@@ -55,6 +55,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         )
     gain = renderer.formation.gain
     if "camera.exposure" in on_picture:
+        # an exposure in stops: each doubles the light
         gain *= float(torch.exp2(on_picture["camera.exposure"]))
     notes = [
         *describe_formation(renderer, gain, backdrop),
@@ -101,7 +102,9 @@ def check_free(path: Path, out: Path) -> None:
 
 
 def has_haze(renderer: Any, inputs: Mapping[str, Any]) -> bool:
-    """Return whether a scene with these inputs has haze that scatters light."""
+    """Return whether a scene with these inputs has haze; with density 0 a haze does
+    nothing.
+    """
     names = [
         part.name
         for part in renderer.scene.definition[0].parts
@@ -111,7 +114,15 @@ def has_haze(renderer: Any, inputs: Mapping[str, Any]) -> bool:
 
 
 def describe_formation(renderer: Any, gain: float, backdrop: Any) -> list[str]:
-    """Return how the radiance of the scene becomes the run's picture, in sentences."""
+    """Return sentences about how radiance that Mitsuba renders becomes the run's
+    picture.
+
+    Args:
+        renderer: of the run.
+        gain: factor from radiance to the value that the sRGB curve takes.
+        backdrop: the colour (3,) behind the scene, already times the gain; None
+            without.
+    """
     height, width = renderer.formation.resolution
     notes = [
         f"The sensor has {width} x {height} pixels, and light paths have at most "
@@ -130,7 +141,7 @@ def describe_formation(renderer: Any, gain: float, backdrop: Any) -> list[str]:
 
 
 def describe_omissions(adversarial: Any, *, hazy: bool) -> list[str]:
-    """Return what differs between the scene's files and the run, in sentences."""
+    """Return sentences about how the files differ from the scene of the run."""
     notes = []
     if hazy:
         notes.append(
@@ -150,10 +161,19 @@ def describe_omissions(adversarial: Any, *, hazy: bool) -> list[str]:
 
 
 def write_gltf(run: str | Path, out: Path) -> list[str]:
-    """Write the object of a run's adversarial scene as binary glTF, a file that ends in
-    .glb: displaced and in its pose, with its texture; return sentences about what is
-    not as in the run. Raises errors as `AdversarialRun.load`, and InputError where the
-    file is called otherwise.
+    """Write the object of a run's adversarial scene as binary glTF: displaced, in its
+    pose, with its texture.
+
+    Args:
+        run: a name or a folder.
+        out: a file that ends in .glb.
+
+    Returns:
+        Sentences about what is not as in the run.
+
+    Raises:
+        InputError: the file is called otherwise; other errors as for
+            `AdversarialRun.load`.
     """
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
@@ -162,6 +182,7 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     description = adversarial.problem.space.scene
     metres = None if description is None else description.object.metres
     if metres is not None:
+        # lengths of our scenes are in object sizes, those of glTF in metres
         found = replace(
             found,
             mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)),
