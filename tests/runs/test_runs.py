@@ -47,7 +47,8 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 run = RunDirectory.create(Path(sys.argv[1]))
 for step in range(100_000):
-    run.append_rows(Row("search", step, seed=step * 7, objective=step / 3, values={"p": {"value": step, "unit": "degrees"}}))
+    values = {"p": {"value": step, "unit": "degrees"}}
+    run.append_rows(Row("search", step, seed=step * 7, objective=step / 3, values=values))
     print(step, flush=True)
 """
 
