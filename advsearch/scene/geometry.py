@@ -104,14 +104,21 @@ class Frame:
 def _compute_edge_tangents(
     description: SceneDescription, fov: Tensor, aspect: float
 ) -> Tensor:
-    """Return the tangents (2,) of the angles from the middle of an image to its
-    edges.
+    """Return the tangents (2,) of the angles from the middle of an image to its edges.
+
+    The first is to the side, the second to the top.
+
+    Args:
+        description: the scene; a lens of the user's wins over `fov`.
+        fov: () field of view along the larger side of the image, degrees.
+        aspect: width over height.
     """
     model = description.camera_model
     if model is not None and model.name:  # of what it shows, a rectangle
         return torch.tensor(
             model.visible_tangents, dtype=torch.float64, device=fov.device
         )
+    # half-width and half-height, as fractions of half the larger side
     shape = torch.tensor(
         [min(1.0, aspect), min(1.0, 1.0 / aspect)],
         dtype=torch.float64,
@@ -145,6 +152,8 @@ def compute_framing_distance(
     axes = torch.from_numpy(compute_camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
     (half_width, half_height) = edge_tangents * FRAME_FILL
+    # A vertex is in the image from the distance at which its tangent, which is left /
+    # (distance - outwards), is no more than the edge's.
     from_default_view = (
         outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
     ).max()
@@ -195,9 +204,11 @@ def _compute_framing_distance_all_around(
 ) -> Tensor:
     """Return the distance at which every vertex is in the image from every azimuth.
 
-    Seen from all around, a vertex runs through a circle of radius rho at height z: what
-    it needs is a sine of the azimuth plus a constant for each edge of the image, whose
-    largest value is known in closed form.
+    Seen from all around, a vertex runs through a circle of radius rho at height z. For
+    each edge of the image, the distance that it needs is a constant plus a sine of the
+    azimuth: `A sin + B cos` is at most `sqrt(A^2 + B^2)`, so that the largest distance
+    is known in closed form. The result is the largest over all vertices and edges, in
+    the unit of the offsets.
 
     Args:
         offsets: (V, 3) of the vertices from the middle of the object.
@@ -210,7 +221,9 @@ def _compute_framing_distance_all_around(
     sine = math.sin(math.radians(elevation))
     inverse_width = 1.0 / tangents[0]
     inverse_height = 1.0 / tangents[1]
+    # outwards = rho cosine cos(a) + z sine, left = rho sin(a)
     for_sides = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
+    # up = z cosine - rho sine cos(a), and its negative for the bottom edge
     for_top = rho * (cosine - sine * inverse_height).abs() + z * (
         sine + cosine * inverse_height
     )
@@ -295,21 +308,28 @@ def compute_base_vertices(part: MeshPart) -> Float64Array:
 def _compute_pose(
     positions: Float64Array, floor: float, parameters: Mapping[str, float]
 ) -> Float64Array:
-    """Return the pose (4, 4) by parameters of `settings.POSE`.
+    """Return the pose (4, 4) that parameters of `settings.POSE` give to vertices.
 
-    Scale and rotate positions (V, 3) about the middle of their bounding box, put the
-    lowest at `floor`, and shift. The middle stays above the same point before the
-    shift.
+    It scales and rotates about the middle of their bounding box, puts the lowest at the
+    height `floor`, and then shifts by x, y and z. Without the shift the middle stays
+    above the same point of the ground.
+
+    Args:
+        positions: (V, 3) of the vertices.
+        floor: height of what they stand on.
+        parameters: by name; angles in degrees.
     """
     center = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
     linear = parameters["scale"] * make_rotation(
         parameters["yaw"], parameters["pitch"], parameters["roll"]
     )
     lowest = float(((positions - center) @ linear.T)[:, 2].min())
+    # `- linear @ center` moves the middle to the origin
     translation = (
         np.array([parameters["x"], parameters["y"], floor + parameters["z"] - lowest])
         - linear @ center
     )
+    # back above the same point; the height follows from the floor instead
     translation[:2] += center[:2]
     return make_pose(linear, translation)
 
@@ -394,6 +414,7 @@ def project_points(
         .double()
         .reshape(())
     )
+    # in pixels; the field of view is that of the larger side
     focal = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0)
     depth = points[:, 2]
     positions = focal * points[:, :2] / depth.clamp_min(MIN_DEPTH)[:, None]
@@ -404,13 +425,16 @@ def project_points(
 
 
 def compute_carried_pose(carrier: Tensor, pose_on_carrier: Tensor) -> Tensor:
-    """Return the rigid pose (4, 4) of what is fixed to a carrier.
+    """Return the pose (4, 4) of what is fixed to a carrier, without a scale.
+
+    Its position is scaled with the carrier, its axes are only turned.
 
     Args:
         carrier: (4, 4) pose of the carrier, which may be scaled: what it carries keeps
             its size.
         pose_on_carrier: (4, 4) pose in the carrier's coordinates.
     """
+    # the scale of a uniformly scaled rotation is the cube root of its determinant
     scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
     return make_affine(
         carrier[:3, :3] / scale @ pose_on_carrier[:3, :3],
@@ -421,7 +445,8 @@ def compute_carried_pose(carrier: Tensor, pose_on_carrier: Tensor) -> Tensor:
 def compute_car_pose(camera: Tensor) -> Tensor:
     """Return the pose (4, 4) of a car that a camera (4, 4) looks ahead from.
 
-    It is level, with its +x ahead, on the ground below the camera; differentiable.
+    It is level, with its +x ahead and +z up, at the height 0 below the camera;
+    differentiable. A camera looks along its own +z, the third column of its pose.
     """
     forward = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
     zero = torch.zeros_like(forward[0])
@@ -436,8 +461,10 @@ def compute_car_pose(camera: Tensor) -> Tensor:
 def compute_real_harmonics(height: int, width: int) -> Tensor:
     """Return the nine real spherical harmonics of degrees 0 to 2: (height, width, 9).
 
-    Over a map of equal angles. Each has root mean square 1 over the sphere (Ramamoorthi
-    and Hanrahan 2001, section 3).
+    They are evaluated at the texel centers of an equirectangular map: row 0 is around
+    +z, and columns go round from +x to +y. Each has root mean square 1 over the sphere,
+    which is sqrt(4 pi) times the factors of Ramamoorthi and Hanrahan 2001, section 3.
+    The last axis has the degrees 0 (one), 1 (y, z, x) and 2 (five).
     """
     theta = (torch.arange(height) + 0.5) * math.pi / height
     phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
@@ -528,6 +555,7 @@ def make_hidden_pose(camera: Tensor) -> Tensor:
 
 def compute_footprint(points: Float64Array) -> Footprint:
     """Return the convex outline from above and the height range of points (N, 3)."""
+    # QJ jogs the input: points on one line have a (thin) hull too
     corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
     return Footprint(
         points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max())
@@ -536,6 +564,7 @@ def compute_footprint(points: Float64Array) -> Footprint:
 
 def is_overlapping(first: Footprint, second: Footprint) -> bool:
     """Return whether two footprints overlap from above, at heights that both have."""
+    # any direction will do: they overlap if they do so at a shift of 0
     start, end = find_overlap_interval(first, second, np.array([1.0, 0.0]))
     return start < 0.0 < end
 
@@ -543,7 +572,7 @@ def is_overlapping(first: Footprint, second: Footprint) -> bool:
 def find_overlap_interval(
     first: Footprint, second: Footprint, direction: Float64Array
 ) -> tuple[float, float]:
-    """Return over which interval of a shift one footprint overlaps another.
+    """Return between which shifts along a direction one footprint overlaps another.
 
     By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1): on
     the normal of each edge both footprints are intervals, which overlap for an interval
@@ -552,10 +581,10 @@ def find_overlap_interval(
     Args:
         first: the footprint that is shifted.
         second: the footprint that stays.
-        direction: (2,) of the shift; the interval is in its length.
+        direction: (2,) a shift of t moves the first footprint by t times this.
 
     Returns:
-        Begin and end; (inf, -inf) where they never overlap.
+        The first and the last t; (inf, -inf) where they never overlap.
     """
     if min(first.upper, second.upper) <= max(first.lower, second.lower):
         return math.inf, -math.inf
@@ -567,9 +596,12 @@ def find_overlap_interval(
     )
     # (k, 2); corners at the same point have no edge
     normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
+    # corners along each axis, (corners, k); and how far a shift of 1 moves along it
     moving_range = first.outline @ normals.T
     fixed_range = second.outline @ normals.T
     speed = normals @ direction
+    # (2, k): how far the first has to move along each axis until it overlaps the second,
+    # and until it no longer does
     separations = np.stack(
         [
             fixed_range.min(axis=0) - moving_range.max(axis=0),
@@ -577,9 +609,11 @@ def find_overlap_interval(
         ]
     )
     # The shift does not move it along such an axis: they are apart always or never.
+    # Apart means that 0 is not within their separations.
     is_parallel = speed == 0.0
     if (is_parallel & ((separations[0] >= 0.0) | (separations[1] <= 0.0))).any():
         return math.inf, -math.inf
+    # sorted, since a negative speed swaps begin and end
     intervals = np.sort(separations[:, ~is_parallel] / speed[~is_parallel], axis=0)
     start = float(intervals[0].max())
     end = float(intervals[1].min())

@@ -90,7 +90,8 @@ class ThingPart(MeshPart):
 def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
     """Read the things of a setting, see above.
 
-    A name that is taken gets a number behind it, unless it was chosen with `name=`.
+    They are separated by semicolons. A name that is taken gets a number behind it,
+    unless it was chosen with `name=`.
 
     Raises:
         InputError: it is invalid, or has more than `MAX_THINGS`.
@@ -257,7 +258,10 @@ def _make_thing(
 
 
 def _list_overlap_remarks(scene: SceneDescription) -> list[str]:
-    """Return a remark on each two of the object and the things that overlap."""
+    """Return a remark on each pair that overlaps, of the object and the things.
+
+    That is by their convex outlines from above, at heights that both have.
+    """
     footprints = {"the object": compute_footprint(scene.base_vertices)} | {
         name: compute_footprint(compute_base_vertices(part))
         for name, part in scene.meshes.items()
@@ -280,8 +284,13 @@ def _compute_pose(
     """Return the pose (4, 4) of a thing: at its place, on the ground, turned and
     scaled.
 
-    `metres` is the longest side that it has.
+    Args:
+        scene: with the object, whose size is the unit of lengths.
+        asset: the thing's object.
+        requested: where it stands and how it is turned.
+        metres: its longest side.
     """
+    # the point of the mesh that is put on the ground, and its longest side
     foot_point, extent = find_footing(asset.mesh.vertices.astype(np.float64))
     scaled_rotation = (
         metres / scene.metres / extent * make_rotation(requested.heading, 0.0, 0.0)
@@ -318,10 +327,12 @@ def find_ground_height(scene: SceneDescription, position: Float64Array) -> float
 def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list[float]:
     """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,).
 
-    Only triangles that have the point inside count, seen from above; those that stand
-    upright do not.
+    A triangle counts if the point is inside it or on its border, seen from above; one
+    that stands upright does not. Its height is that of its plane at the point.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
+    # Signed, from above, of the triangles that the point makes with each side. Divided
+    # by their sum they are the weights of the corners opposite, a, b and c.
     doubled_areas = [
         (end[:, 0] - start[:, 0]) * (position[1] - start[:, 1])
         - (end[:, 1] - start[:, 1]) * (position[0] - start[:, 0])
