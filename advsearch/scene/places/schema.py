@@ -33,7 +33,9 @@ class _Entry(BaseModel):
 def _is_convex(corners: Float64Array) -> bool:
     """Return whether corners (K, 2), in turn, turn to one side only, and hold an area.
 
-    Either side will do; a corner on a straight line does not count, within rounding.
+    That is, whether the outline is convex: left or right turns only. A corner on a
+    straight line does not count, within rounding. If all are on one line, the outline
+    holds no area.
     """
     edges = np.roll(corners, -1, axis=0) - corners
     # cross products of successive edges
@@ -89,7 +91,10 @@ class SolidEntry(_Entry):
         return self
 
     def list_footprints(self) -> list[Footprint]:
-        """Return the outlines, in metres."""
+        """Return the outlines, in metres: the one, or a polygon around each position.
+
+        A round outline is a regular polygon with its corners on the circle.
+        """
         if self.outline is not None:
             return [Footprint(np.array(self.outline), *self.heights)]
         turn = np.arange(N_CIRCLE_CORNERS) * (2.0 * np.pi / N_CIRCLE_CORNERS)
