@@ -321,7 +321,8 @@ def _translate_kitti(
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate the intrinsics of RealSense.
 
-    Models without our equivalent are none where all coefficients are 0.
+    Two models that we do not have count as "none" where all coefficients are 0: there
+    they are the same as a pinhole.
     """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
     kind = re.sub(
@@ -346,9 +347,10 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of OpenSfM, whose lengths are fractions of the larger side.
 
-    The principal point counts from the middle of the image; here from the center of the
-    first pixel. `focal` is that of both axes unless they have their own. A camera of an
-    unknown kind, or a panorama, keeps only its kind and size.
+    The principal point counts from the middle of the image there, and here from the
+    center of the first pixel, which is (side - 1) / 2 before the middle. `focal` is
+    that of both axes unless they have their own. For a camera of an unknown kind, or a
+    panorama, no lengths are translated.
     """
     stated_type = str(camera["projection_type"])
     entries = {
@@ -392,9 +394,17 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
 def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of Agisoft Metashape (manual, appendix "Camera models").
 
-    The focal lengths are f + b1 along x and f along y, and b2 is the skew. Offsets are
-    from the center of the image, p1 and p2 are swapped against OpenCV, and k4 is the
-    fourth coefficient of a polynomial.
+    The focal lengths are f + b1 along x and f along y, and b2 is the skew, in pixels.
+    cx and cy count from the center of the image, which is (side - 1) / 2 from the
+    center of the first pixel. p1 and p2 are swapped against OpenCV. k4 is the fourth
+    coefficient of the radial polynomial, which only a fisheye of OpenCV has.
+
+    Args:
+        path: the file, for messages.
+        data: its entries; those of numbers are 0 if they are missing.
+
+    Raises:
+        FileFormatError: it has a k4 and is no fisheye, or no size.
     """
     stated_type = str(data.get("projection", "frame"))
     value_by_name = {

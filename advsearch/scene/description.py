@@ -348,7 +348,11 @@ class SceneDescription:
         return replace(scene, camera_model=model)
 
     def _with_mounted_camera(self, name: str) -> SceneDescription:
-        """Return the scene as a mounted camera sees it, by its name.
+        """Return the scene as a mounted camera sees it, by its name in `PRESETS`.
+
+        Its height counts from the floor: that of the place, or the floor that a table
+        with a small object stands on. Settings that were requested stay. The camera
+        stands at the preset's distance, or farther if the object would not fit.
 
         Raises InputError: the object's size in metres is not known.
         """
@@ -681,7 +685,9 @@ class SceneDescription:
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values.
 
-        The metered exposure times `camera.exposure`.
+        2 to the power of `camera.exposure`, times the exposure: by `camera.ev`, where
+        it is set; else that of the photograph that the scene is rendered into; else the
+        metered one, or 1 where exposure is not metered.
         """
         stops = self.values.get("camera.ev")
         unit = None if self.environment is None else self.environment.candelas

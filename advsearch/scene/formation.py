@@ -315,8 +315,8 @@ def _compute_distant_light(
     on_ground = (power[is_up] * directions[is_up, 2:]).sum(axis=0)
     albedo = srgb_to_linear(np.array(scene.ground_color, np.float32))
     reflected = albedo * on_ground / math.pi
-    # Where a direction meets the height 0, from the middle of the ground. For directions
-    # that point up it means nothing, and they are left out below.
+    # Where a direction meets the height 0, from the middle of the ground. For
+    # directions that point up it means nothing, and they are left out below.
     distance = center[2] / np.maximum(-directions[:, 2:], 1e-9)
     offset = np.abs(center[:2] + directions[:, :2] * distance)
     # otherwise the map has what comes from below

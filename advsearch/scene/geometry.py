@@ -600,8 +600,8 @@ def find_overlap_interval(
     moving_range = first.outline @ normals.T
     fixed_range = second.outline @ normals.T
     speed = normals @ direction
-    # (2, k): how far the first has to move along each axis until it overlaps the second,
-    # and until it no longer does
+    # (2, k): how far the first has to move along each axis until it overlaps the
+    # second, and until it no longer does
     separations = np.stack(
         [
             fixed_range.min(axis=0) - moving_range.max(axis=0),

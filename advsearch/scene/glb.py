@@ -57,7 +57,11 @@ class GlbBuffer:
         self.accessors: list[dict[str, Any]] = []
 
     def add_view(self, data: bytes, target: int | None = None) -> int:
-        """Append bytes, padded to four, and return the index of their view."""
+        """Append bytes, padded to four, and return the index of their view.
+
+        Bytes that were added before with the same target keep their view. `target` is
+        one of the two above; None for what is no geometry, such as an image.
+        """
         key = (data, target)
         if key in self._view_of_data:
             return self._view_of_data[key]
@@ -280,7 +284,10 @@ def _add_material(
 def _add_texture(
     document: dict[str, Any], buffer: GlbBuffer, image_file: bytes
 ) -> dict[str, int]:
-    """Add an image file as a texture, and return the reference to it."""
+    """Add an image file as a texture, and return the reference to it.
+
+    Each texture has an entry and an image of its own, with the same index.
+    """
     document["images"].append(
         {
             "mimeType": find_mime_type(image_file),
@@ -295,7 +302,8 @@ def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
     """Return the material of a shape with a texture of its base color.
 
     An opacity of 0 and 1 alone is a mask; another one is blended. Extensions are
-    written only where the surface differs from glTF's default.
+    written only where the surface differs from glTF's default; a specular above
+    `DEFAULT_SPECULAR` is cut to it, since glTF's factor is at most 1.
     """
     surface = shape.material
     material: dict[str, Any] = {"name": shape.name, "doubleSided": True}

@@ -170,8 +170,8 @@ def compute_irradiance(radiance: Tensor) -> Tensor:
     the upper half. Row 0 is straight up, the last one straight down. Differentiable.
     """
     rows, columns = radiance.shape[:2]
-    # Angles from straight up at which rows begin and end. The first and the last row are
-    # half as high as the others, since their middle is a pole.
+    # Angles from straight up at which rows begin and end. The first and the last row
+    # are half as high as the others, since their middle is a pole.
     row_bounds = (
         torch.arange(rows + 1, device=radiance.device, dtype=torch.float64) - 0.5
     ) * (math.pi / (rows - 1))
@@ -411,10 +411,11 @@ def find_valid_range(
 ) -> tuple[float, float]:
     """Return up to which distance and height an environment's picture fits a camera.
 
-    In the lengths of `surroundings`, infinite without a bound; 0 and 0 where the picture
-    is turned against the ground, so that it fits nowhere. The distance has two bounds,
-    as said above: what stands around becomes too large, or the end of the ground comes
-    into sight. The camera's own distance does not count, its height and angles do.
+    In the lengths of `surroundings`, infinite without a bound; 0 and 0 where the
+    picture is turned against the ground, so that it fits nowhere. The distance has two
+    bounds, as said above: what stands around becomes too large, or the end of the
+    ground comes into sight. The camera's own distance does not count, its height and
+    angles do.
     """
     if abs((surroundings.rotation + 180.0) % 360.0 - 180.0) > MAX_MAP_ROTATION:
         return 0.0, 0.0

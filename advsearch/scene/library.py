@@ -278,8 +278,10 @@ class LightImage:
 def read_light(path: Path, label: str = "environment") -> LightImage:
     """Read an ``.hdr`` or ``.exr`` image of any shape.
 
-    Errors are those of `import_environment`; radiance that is not finite, or negative,
-    is one, of which the message names the first texel.
+    Its rows become floats only when they are read, so that a large one takes less
+    memory. Errors are those of `import_environment`; radiance that is not finite, or
+    negative, is one, of which the message names the first texel. `label` is what the
+    image is, for messages.
     """
     data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":
@@ -290,6 +292,7 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
             tuple(notes),
         )
     planes, notes = read_exr(path, data)
+    # RGBE cannot hold such values, so that only these files are checked.
     kinds: tuple[tuple[str, Callable[[Plane], BoolArray], str], ...] = (
         ("NaN", np.isnan, "paint them over"),
         (
@@ -362,8 +365,10 @@ def _resize_map(
     """Average a map down to at most `MAX_MAP_SIZE`, or repeat texels up to
     `MIN_MAP_SIZE`.
 
-    Both sides shrink by the same factor. Texels are weighted by their solid angles, the
-    sine of the polar angle of their row. `read_rows` and `size` are as in `LightImage`.
+    Both sides shrink by the same factor. A new texel is the mean of those that it
+    covers, weighted by their solid angles, which go by the sine of the polar angle of
+    their row: the weighted texels are averaged, and divided by the averaged weights.
+    `read_rows` and `size` are as in `LightImage`.
     """
     height, width = size
     shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
@@ -384,6 +389,7 @@ def _resize_map(
             )
             / mean_weight
         )
+    # rounded up; 1 for a map that is large enough
     repeat_rows, repeat_columns = (
         -(-smallest // extent)
         for smallest, extent in zip(MIN_MAP_SIZE, texels.shape[:2], strict=True)

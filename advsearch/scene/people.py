@@ -505,8 +505,8 @@ def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
             angle_by_joint[f"{side}_{joint}"] = (
                 angle_by_joint[f"{side}_{joint}"] + stride * swing
             )
-    # The chest turns against the pelvis by up to 5 degrees, to the left as the left heel
-    # strikes.
+    # The chest turns against the pelvis by up to 5 degrees, to the left as the left
+    # heel strikes.
     chest_turn = stride * 5.0 * torch.cos(phase)
     angle_by_joint["spine_turn"] = angle_by_joint["spine_turn"] + chest_turn
     limits = {

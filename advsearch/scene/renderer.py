@@ -145,6 +145,7 @@ class Renderer:
         estimators: Mapping[str, str] | None = None,
         moments: Sequence[Moment] = (),
     ) -> None:
+        """Plan how each coordinate is differentiated; arguments are the class's."""
         self.scene = scene
         self.space = space
         self.formation = formation
@@ -754,8 +755,8 @@ class Renderer:
         """Find the scene inputs that each group of coordinates reaches.
 
         Reaches means that the derivative of the input with respect to one of the
-        group's coordinates is not zero, by autograd at one point. Empty where an adjoint,
-        for which alone it is needed, is valid for no group.
+        group's coordinates is not zero, by autograd at one point. It is needed for
+        adjoints alone, and empty where they are valid for no group.
 
         Returns:
             Names of scene inputs, by the group's name.

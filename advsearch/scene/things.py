@@ -384,8 +384,9 @@ def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
 def list_camera_remarks(
     scene: SceneDescription, eyes: Sequence[Float64Array]
 ) -> tuple[str, ...]:
-    """Return a remark where cameras, at positions (3,) in metres, are inside a
-    solid.
+    """Return a remark where cameras are inside a solid of the place; empty if none is.
+
+    `eyes` are their positions (3,) in metres, at least one.
     """
     solid_names = list[str]()
     for eye in eyes:

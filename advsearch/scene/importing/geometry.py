@@ -179,8 +179,8 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
     # Imported late, as in `parts`.
     from scipy.spatial import cKDTree
 
-    # Equal vertices first, then near ones: chains of near points become one cluster, and
-    # its first point stands for all.
+    # Equal vertices first, then near ones: chains of near points become one cluster,
+    # and its first point stands for all.
     points, point_of_vertex = np.unique(vertices, axis=0, return_inverse=True)
     point_of_vertex = point_of_vertex.reshape(-1)
     pairs = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
@@ -351,8 +351,8 @@ def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
     component = find_components(2 * len(area), starts, ends)
     as_is = component[0::2]
     turned = component[1::2]
-    # The area that each choice leaves as it is. A face is turned if more area is left by
-    # the reverse choice; of equal areas, the first face's winding is kept.
+    # The area that each choice leaves as it is. A face is turned if more area is left
+    # by the reverse choice; of equal areas, the first face's winding is kept.
     component_area = np.bincount(
         as_is, weights=area, minlength=int(component.max()) + 1
     )
@@ -519,8 +519,8 @@ def compute_smooth_normals(soup: Soup) -> Float64Array:
         axis=1,
     )
     smooth_normals = normalize_vectors(normal_sums)[smoothing_group].reshape(-1, 3, 3)
-    # The face's own normal where the mean is not on its front. False also for NaN, where
-    # normals cancel.
+    # The face's own normal where the mean is not on its front. False also for NaN,
+    # where normals cancel.
     is_valid = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True) > 0.0
     return np.where(is_valid, smooth_normals, face_normals[:, None])
 
@@ -859,7 +859,7 @@ def _find_dents(flat: Float64Array, area: Float64Array) -> tuple[IntArray, BoolA
     is_dent = (
         _compute_doubled_areas(previous, flat, following) <= _MIN_AREA * area[:, None]
     )
-    # sorting False (a dent) before True puts the dents first; the rest fills up the rows
+    # False (a dent) is sorted before True; what is no dent fills up the rows
     max_dents = int(is_dent.sum(axis=1).max())
     dent = np.argsort(~is_dent, axis=1, kind="stable")[:, :max_dents]
     return dent, np.take_along_axis(is_dent, dent, axis=1)

@@ -467,6 +467,7 @@ class GltfSurfaces:
         name = "(embedded)" if is_embedded else str(entry.uri)
 
         def load_content() -> bytes:
+            """Return the bytes of the image's file; empty if it has none."""
             if entry.uri is not None:
                 return self.file.load_uri(entry.uri)
             if entry.bufferView is None:

@@ -438,6 +438,7 @@ class _Properties:
     notes: Notes
 
     def __post_init__(self) -> None:
+        """Record all properties, so that those that are never read are noted."""
         for element in self.elements.values():
             if element.name in ("vertex", "face", "tristrips"):
                 for name in element.types:

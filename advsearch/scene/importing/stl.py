@@ -126,6 +126,7 @@ def _read_colors(
     magics_position = head.find(b"COLOR=")
     channels = [(attributes >> shift) & 31 for shift in (10, 5, 0)]
     colors = np.stack(channels, axis=1).astype(np.float32) / np.float32(31.0)
+    # up to 70: so that the four bytes after it are in the header of 80
     if 0 <= magics_position <= 70:
         if b"MATERIAL=" in head:
             notes.record("header entry", "MATERIAL")

@@ -386,8 +386,8 @@ def _read_colors(
     """Return the linear color (V, 3) of every vertex, or None if the file has none.
 
     A ``v`` line has three coordinates, then perhaps a weight, or a color, or a color
-    and its opacity; ZBrush writes colors into comments. Colors are sRGB, in [0, 1] or in
-    [0, 255]. Vertices without a color are neutral grey in a file with colors.
+    and its opacity; ZBrush writes colors into comments. Colors are sRGB, in [0, 1] or
+    in [0, 255]. Vertices without a color are neutral grey in a file with colors.
 
     Args:
         lines: of the file.

@@ -483,8 +483,8 @@ def _with_finish(
     is_plain = part.opacity is None and part.normal_map is None
     if coat.clearcoatFactor == 0.0 or not is_plain:
         return part
-    # Mitsuba's width of the lobe goes from `DULL_COAT` at gloss 0 to `GLOSSY_COAT` at 1;
-    # glTF's is the square of the roughness
+    # Mitsuba's width of the lobe goes from `DULL_COAT` at gloss 0 to `GLOSSY_COAT` at
+    # 1; glTF's is the square of the roughness
     gloss = (DULL_COAT - coat.clearcoatRoughnessFactor**2) / (DULL_COAT - GLOSSY_COAT)
     principled = {
         "type": "principled",
