@@ -274,6 +274,7 @@ def compute_irradiance(scene: SceneDescription, normals: Float64Array) -> Float6
     """
     vertices = scene.base_vertices
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    # of each direction: radiance times solid angle, which the cosine makes irradiance
     directions, power = _compute_distant_light(scene, center)
     cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
     # no BLAS, whose last bits depend on its threads

@@ -278,7 +278,7 @@ class BeamLamp(ScenePart):
         # the position in the lamp's axes: x to the table's right, y up, z ahead
         x, y, z = -to_lamp @ self.to_world[:3, :3]
         height, width = self.table.shape
-        # tangents from -1 to 1 over the width; texels are square, rows count from the top
+        # tangents from -1 to 1 over the width; texels are square, row 0 is on top
         column = math.floor((x / max(z, 1e-9) + 1.0) / 2.0 * width)
         row = math.floor((1.0 - y / max(z, 1e-9) * width / height) / 2.0 * height)
         if z <= 0.0 or not (0 <= column < width and 0 <= row < height):

@@ -94,9 +94,9 @@ def read_place_file(path: Path) -> PlaceFile:
 
 
 def resolve_sibling_path(path: Path, name: str) -> Path:
-    """Return a file that the file of a place names.
+    """Return the path of a file that the file of a place names.
 
-    Raises FileFormatError: it leads out of the folder.
+    Raises FileFormatError: it leads out of the folder of the place's file, `path`.
     """
     sibling = path.parent / name
     if "\0" in name or not is_inside(sibling, path.parent):

@@ -229,6 +229,7 @@ class _LayerCheck:
             )
         if inner:
             try:
+                # only to check that it is there
                 read_packaged(Ar.JoinPackageRelativePath(str(layer_file), inner))
             except KeyError:
                 raise errors.FileFormatError(
