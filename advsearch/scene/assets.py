@@ -363,7 +363,11 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     cluster_size = np.bincount(cluster_of)
 
     def simplify(full: Mesh) -> Mesh:
-        """Return a mesh with the same vertices elsewhere, simplified in the same way."""
+        """Return a mesh with the same vertices elsewhere, simplified in the same way.
+
+        A new vertex is at the mean of its cluster's vertices, and has the normal and the
+        texture coordinates of one of them.
+        """
         sums = [np.bincount(cluster_of, full.vertices[:, axis]) for axis in range(3)]
         mean = np.stack([total / cluster_size for total in sums], axis=1)
         return Mesh(
@@ -576,12 +580,14 @@ def describe_size_doubts(
         if is_unknown and needs_metres
         else "",
     ]
+    # the example is the geometric mean of what is usual
     remedy = f"give its longest side in metres, such as `size={(min_size * max_size) ** 0.5:.2g}`"
     if fitting_units:
         remedy += (
             f", or `unit={fitting_units[0]}`, which makes it "
             f"{format_rounded(extent * METRES_PER_UNIT[fitting_units[0]])} m"
         )
+    # the remedy's first letter is replaced by what begins the sentence
     return (
         f"{asset.name}: {'; '.join(filter(None, clauses))}. "
         f"{'If that is wrong, g' if is_unusual else 'G'}{remedy[1:]}",

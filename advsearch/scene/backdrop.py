@@ -160,7 +160,11 @@ class BackdropPhotograph:
 
 
 def _resample_image(image: Float32Array, resolution: tuple[int, int]) -> Tensor:
-    """Average an image (H, W, C) down to (height, width) pixels, or interpolate it."""
+    """Resample an image (H, W, C) to (height, width) pixels.
+
+    Along an axis with more pixels it is averaged down, along one with fewer it is then
+    interpolated.
+    """
     height, width = image.shape[:2]
     averaged = average_area(
         image, min(height, resolution[0]), min(width, resolution[1])

@@ -284,10 +284,20 @@ def _read_numbers(
 def _translate_kitti(
     path: str, camera_name: str, data: Mapping[str, Any], cameras: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Translate a camera of KITTI: a raw one with distortion, or a rectified one
-    without.
+    """Translate a camera of KITTI: a raw one with distortion, or a rectified one.
 
-    Raises FileFormatError if the file has no size of the image.
+    A raw one has K_nn (3, 3), D_nn (5 coefficients) and S_nn (the size of the image).
+    A rectified one has P_rect_nn or Pn, a projection (3, 4) without distortion, and
+    perhaps S_rect_nn. Other entries of KITTI are left out.
+
+    Args:
+        path: the file, for messages.
+        camera_name: "" if none is named.
+        data: all entries of the file.
+        cameras: names of the matrices of its cameras, by the cameras' names.
+
+    Raises:
+        FileFormatError: the file has no size of the image, or numbers are missing.
     """
     matrix_name = select_camera(path, camera_name, cameras)
     entries = {

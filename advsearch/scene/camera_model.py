@@ -553,7 +553,11 @@ def _project_to_panorama(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
 
 
 def _compute_panorama_directions(u: Tensor, v: Tensor) -> Tensor:
-    """Return unit vectors (N, 3) at image coordinates of an equirectangular image."""
+    """Return unit vectors (N, 3) at image coordinates of an equirectangular image.
+
+    Coordinates (N,) are fractions of its width and height; the middle is straight
+    ahead. Vectors are to the right, down and ahead.
+    """
     longitude = (u - 0.5) * (2.0 * torch.pi)
     latitude = (v - 0.5) * torch.pi
     level = latitude.cos()

@@ -100,8 +100,9 @@ class ImageFormation:
             )
 
     def display(self, radiance: Tensor) -> Tensor:
-        """Map linear radiance (..., 3) to display-referred sRGB in [0, 1].
+        """Map linear radiance (..., 3) to display-referred values in [0, 1].
 
+        By `gain`, and the curve of `transfer`; "linear" has no curve and does not clip.
         It is differentiable, and flat where it is clipped.
         """
         if self.transfer == "linear":

@@ -130,11 +130,13 @@ def _compute_edge_tangents(
 def compute_framing_distance(
     description: SceneDescription, fov: Tensor, aspect: float
 ) -> Tensor:
-    """Return the distance () of the camera to the middle of a scene's object; see
-    above.
+    """Return the distance () of the camera to the middle of a scene's object.
 
-    In object sizes, float64; differentiable in the field of view. With a lens of the
-    user's, the field of view does not count.
+    It is the smallest at which the object fills the image by no more than `FRAME_FILL`
+    from the default direction, is in the image from every azimuth, and at which the
+    camera stays outside of the sphere around it; see above. In object sizes, float64;
+    differentiable in the field of view. With a lens of the user's, the field of view
+    does not count.
 
     Args:
         description: the scene.
@@ -368,10 +370,12 @@ def camera_to_world(
     height = description.values.get("camera.height")
     if height is not None:
         center_height = float(compute_center(description)[2])
+        # from the middle of the object at this distance to the height
         sine = (height / description.metres - center_height) / distance
         sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
         elevation = math.degrees(math.asin(sine))
     azimuth = description.azimuth_zero + get_number("camera.azimuth")
+    # left, up, and from the object to the camera, which looks the other way
     axes = compute_camera_axes(azimuth, elevation, get_number("camera.roll"))
     return make_pose(
         np.stack([axes[0], axes[1], -axes[2]], axis=1),

@@ -261,9 +261,9 @@ PLACE_BY_GROUND_KIND: Mapping[str, tuple[str, str | None]] = {
 def find_ground_kind(scene: SceneDescription) -> str | None:
     """Return the kind of ground that a scene's environment and its settings ask for.
 
-    A setting wins over the environment; the environment's does not count where a
-    setting of the table is used, and no ground of size 0 has a kind. None where neither
-    names one.
+    None where the ground has a size of 0. Otherwise the setting `ground.kind` wins, and
+    then the environment's own kind, which does not count where settings describe a
+    table. None where neither names one.
     """
     requested = scene.values.get("ground.kind")
     if scene.number("ground.size") <= 0.0:

@@ -227,11 +227,12 @@ def _make_lamps(
     Args:
         scene: in which they shine.
         carrier: the mesh that carries them, or `CAMERA`.
-        kind: "low" or "high".
+        kind: beam, "low" or "high".
         radiance_unit: luminance of a radiance of 1, cd/m2.
         weight: of each beam, see `BeamLamp`.
     """
     if carrier == CAMERA:
+        # in the coordinates of the camera's car, see `compute_car_pose`
         left_position = np.array(EGO_LAMP_POSITION)
         positions = [
             left_position / scene.metres,
@@ -251,6 +252,8 @@ def _make_lamps(
         yield headlamp_glass
         yield _make_glass(part, "taillamps", -1.0, units_per_metre, rear_power)
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
+    # candela to the light's unit; lengths are in object sizes, and intensity is
+    # radiance times squared length
     red, green, blue = map(float, WHITE / (radiance_unit * scene.metres**2))
     for name, position in zip(("left", "right"), positions, strict=True):
         yield BeamLamp(

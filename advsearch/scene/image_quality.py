@@ -89,7 +89,8 @@ def make_noise(sigma: Float64Array, size: tuple[int, int], seed: int) -> Tensor:
 def measure_blur(image: Float32Array) -> float:
     """Return by how much an image is blurred beyond a rendered one, in pixels.
 
-    It is the standard deviation of a normal blur, 0 where there are too few edges.
+    It is the standard deviation of a normal blur, 0 where there are too few edges. What
+    is measured on edges is looked up among measurements of edges with known blurs.
 
     Args:
         image: (H, W) linear luminance.

@@ -140,6 +140,7 @@ def _project_faces(
     vertices = renderer.scene.assembly.get_vertices(name, inputs)
     default_camera = torch.from_numpy(camera_to_world(description, width / height))
     camera = inputs.get("camera.to_world", default_camera).detach().double().cpu()
+    # in the camera's coordinates: left, up and ahead
     points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
     positions, is_before = project_points(
         description, _select_camera_inputs(inputs), points, size

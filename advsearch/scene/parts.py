@@ -102,8 +102,9 @@ class LampGlass(MeshPart):
 def make_mesh_part(
     name: str, shape: Shape, to_world: Float64Array, material: Material
 ) -> MeshPart:
-    """Return a shape in a scene: with a name and material of its own, under a pose (4,
-    4).
+    """Return a shape as a part of a scene.
+
+    Name and material replace the shape's own; `to_world` (4, 4) is its base pose.
     """
     shape_fields = {
         shape_field.name: getattr(shape, shape_field.name)

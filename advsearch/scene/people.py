@@ -562,11 +562,14 @@ def compute_contact(phase: Tensor) -> Tensor:
 def skin_points(
     points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor
 ) -> Tensor:
-    """Return points moved with bones: linear blend skinning.
+    """Return points (P, 3) moved with bones: linear blend skinning.
+
+    A point moves by the weighted mean of the maps of all bones, `rotation @ p +
+    translation`.
 
     Args:
         points: (P, 3).
-        weights: (P, J).
+        weights: (P, J) of the bones, which sum to 1 for each point.
         rotations: (J, 3, 3) of the bones.
         translations: (J, 3).
     """

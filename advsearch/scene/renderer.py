@@ -232,8 +232,9 @@ class Renderer:
     def crop_to(self, window: Window, u: Tensor, seed: int, spp: int) -> Renderer:
         """Return a renderer that renders a window alone.
 
-        The rest of its images is that of u (d,), which is rendered now: arguments as
-        for a call. It does not count as a render.
+        Around the window, all of its images show what the image of u (d,) shows there.
+        That is rendered now, with arguments as for a call, and does not count as a
+        render.
         """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
@@ -519,7 +520,11 @@ class Renderer:
     ) -> dict[str, Tensor]:
         """Return the scene inputs of u for a camera of a rig, or for the only one.
 
-        They are those of the time when it takes its image, or of another `space`.
+        Args:
+            mount: the camera of the rig; None for the only one.
+            u: (d,) configuration.
+            space: maps u to scene inputs; None: the renderer's, at the time when the
+                camera takes its image.
         """
         if space is None:
             space = self.space

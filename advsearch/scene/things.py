@@ -105,6 +105,7 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
                 f"things: {part}: another thing of the scene is called "
                 f"{thing.name}; choose another name"
             )
+        # car, car-2, car-3: the number before is taken off again
         suffix = 2
         while thing.name in reserved:
             thing = replace(

@@ -286,8 +286,9 @@ def find_unread_extensions(entry: Entry) -> list[str]:
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     """Check the accessors of a primitive; raise FileFormatError if one is wrong.
 
-    Their types, that attributes have as many values as positions, and that indices are
-    unsigned integers. Numbers that only an unsupported extension has are an error too.
+    Types have to be those of the format, attributes need as many values as positions,
+    and indices are unsigned integers. An accessor without numbers is an error if an
+    extension that is not supported may have them, compressed.
     """
     accessors = {
         name: header.accessors[index] for name, index in primitive.attributes.items()

@@ -72,7 +72,8 @@ def iterate_poses(header: Header) -> Iterator[tuple[int, Float64Array]]:
 def compute_matrix(node: Node) -> Float64Array:
     """Return the matrix (4, 4) from a node to its parent.
 
-    It is the node's own matrix, or else translation, rotation (normalised) and scale.
+    It is the node's own matrix, which the file stores by columns; or else its scale,
+    then its rotation (normalised), then its translation.
     """
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)

@@ -722,6 +722,7 @@ def convert_normals(
     old_bitangent = np.cross(normal, old_tangent) * handedness
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)
     in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent
+    # along the renderer's tangent and bitangent, which is normal x tangent
     new_x = (in_plane * new_tangent).sum(axis=1)
     new_y = (in_plane * np.cross(normal, new_tangent)).sum(axis=1)
     bumps = np.stack([new_x, new_y, z], axis=1)

@@ -508,6 +508,7 @@ class ObjLines:
             table = values.reshape(len(rows), -1)[:, :columns]
             n_missing = columns - table.shape[1]
             return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
+        # Otherwise each number goes to its line's row, and its place in the line.
         first_of_line = np.cumsum(counts) - counts
         column = np.arange(len(values)) - np.repeat(first_of_line, counts)
         row = np.repeat(np.arange(len(rows)), counts)
@@ -575,7 +576,12 @@ class ObjLines:
         return corners - 1, sizes, rows
 
     def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:
-        """Raise FileFormatError for a last face cut short, or faces over a limit."""
+        """Raise FileFormatError for a last face cut short, or faces over a limit.
+
+        A face of fewer than 3 corners counts as cut short only where the file ends in
+        its line without a line break. `rows` (P,) are the rows of the faces' lines, and
+        `sizes` (P,) their numbers of corners.
+        """
         is_last_line = rows[-1] == len(self.starts) - 1
         if sizes[-1] < 3 and self.is_unended and is_last_line:
             ((line_number, words),) = self._iterate_words(rows[-1:])
@@ -628,15 +634,16 @@ class ObjLines:
         return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
 
     def _select_lines(self, kind: str) -> tuple[IntArray, Bytes]:
-        """Return the rows of the lines of a kind, and their bytes.
+        """Return the rows of the lines of a kind, and their bytes, one after the other.
 
-        Keywords and comments are blanked out or removed, so that only the arguments
-        and one line break for each row are left.
+        Keywords become blanks, and comments are removed: only the arguments and one
+        line break for each line are left.
         """
         is_selected = self.kind == KINDS.index(kind)
         lengths = self.ends - self.starts + 1
         rows = np.flatnonzero(is_selected)
         line_bytes = self.bytes[np.repeat(is_selected, lengths)]
+        # where each selected line begins in `line_bytes`
         starts = np.cumsum(lengths[rows]) - lengths[rows]
         for offset in range(len(kind)):
             line_bytes[starts + offset] = ord(" ")

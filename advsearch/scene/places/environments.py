@@ -30,7 +30,7 @@ from advsearch.trust.stored_files import track_opened_files
 def import_place(spec: str) -> EnvironmentAsset:
     """Read a place with its light, the first in its file or the one that is named.
 
-    `spec` is the place's file, with the light behind it, ``place.yaml#night``. A bundled
+    `spec` is the place's file, and perhaps a light, ``place.yaml#night``. A bundled
     environment wins over a file of the light's name. If the light has lux, they are the
     illuminance of level ground under the open sky: the luminance of a radiance of 1,
     `candelas`, follows from that.

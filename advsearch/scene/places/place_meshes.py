@@ -498,8 +498,8 @@ def _with_finish(
 def _join(members: Sequence[ImportedPart]) -> Mesh:
     """Join parts of a file to one mesh, z up, its front along +x.
 
-    Texture coordinates that are missing are 0; normals that are missing are those of
-    faces.
+    Parts have glTF's axes. Texture coordinates that are missing are 0; normals that are
+    missing are those of faces. Normals become unit vectors.
     """
     rotation = compute_rotation("y", "+z")  # from glTF's axes
     vertices = list[Float64Array]()

@@ -205,6 +205,10 @@ class _LayerCheck:
     def _find_layer(self, path: Path, name: str) -> Path:
         """Return the file that a layer names; of a file in a package, the package.
 
+        Args:
+            path: the layer, relative to which the name is.
+            name: as it stands there, perhaps with a path in a package.
+
         Raises:
             FileFormatError: it is missing, or not in the folder.
         """
