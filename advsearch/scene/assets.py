@@ -365,8 +365,8 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     def simplify(full: Mesh) -> Mesh:
         """Return a mesh with the same vertices elsewhere, simplified in the same way.
 
-        A new vertex is at the mean of its cluster's vertices, and has the normal and the
-        texture coordinates of one of them.
+        A new vertex is at the mean of its cluster's vertices, and has the normal and
+        the texture coordinates of one of them.
         """
         sums = [np.bincount(cluster_of, full.vertices[:, axis]) for axis in range(3)]
         mean = np.stack([total / cluster_size for total in sums], axis=1)

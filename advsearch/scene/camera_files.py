@@ -462,8 +462,17 @@ def _compute_focal_length(path: str, angle: object, side: float) -> float:
 def _read_kalibr(
     spec: str, entries: Entries, unread: Sequence[str] = ()
 ) -> CameraModel:
-    """Return the model of a camera of Kalibr; `unread` are other entries of its
-    file.
+    """Return the model of a camera of Kalibr.
+
+    Principal points count from the center of the first pixel there, hence the half.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        entries: those of the camera.
+        unread: further entries of the file that are to be noted.
+
+    Raises:
+        FileFormatError: it is no pinhole, or lacks numbers.
     """
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")

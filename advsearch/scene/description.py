@@ -322,7 +322,18 @@ class SceneDescription:
         return replace(scene, camera=camera)
 
     def _with_lens(self, camera: str) -> SceneDescription:
-        """Return the scene with the lens of a camera file or a bundled camera model."""
+        """Return the scene with the lens of a camera file or a bundled camera model.
+
+        A file with several cameras makes it a rig, whose first camera is the scene's.
+
+        Args:
+            camera: path of the file, or name of the model.
+
+        Raises:
+            FileFormatError: the file cannot be used.
+            InputError: a field of view was requested, and the lens has its own.
+            UnknownNameError: there is no such model.
+        """
         if not is_path(camera) and camera not in make_bundled_models():
             known = (ORBIT_CAMERA, *self.cameras, *make_bundled_models(), *PRESETS)
             raise UnknownNameError(
@@ -449,7 +460,10 @@ class SceneDescription:
         ) or self._has_plugin("normalmap", "bumpmap")
 
     def _has_plugin(self, *kinds: str) -> bool:
-        """Return whether a Mitsuba plugin of one of these kinds is in the scene."""
+        """Return whether a Mitsuba plugin of one of these kinds is in the scene.
+
+        Plugins within others count, of surfaces in Mitsuba's words too.
+        """
         surfaces = [
             mesh.surface for mesh in self.meshes.values() if mesh.surface is not None
         ]
@@ -474,7 +488,11 @@ class SceneDescription:
         }
 
     def get_positioned_part(self, part: ScenePart) -> Any:
-        """Return one of the parts as the settings and the camera have it."""
+        """Return one of the parts as the settings and the camera have it.
+
+        A mesh has the pose and the material of its settings. A beam stands where its
+        carrier, a mesh or the camera's car, takes it. Other parts are as they are.
+        """
         if not isinstance(part, BeamLamp):
             return self.meshes.get(part.name, part)
         if part.carrier == CAMERA:
@@ -623,8 +641,10 @@ class SceneDescription:
 
     @property
     def requested_values(self) -> dict[str, float | str]:
-        """The settings that were requested, as users write them: a choice by its
-        name.
+        """The settings that were requested and have a value, by name.
+
+        Values are as users write them: of a choice the name of the option, not its
+        index.
         """
         requested: dict[str, float | str] = {}
         for name in self.requested & self.values.keys():

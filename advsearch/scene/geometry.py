@@ -80,9 +80,11 @@ class Frame:
             shift: of the image to the right in its widths and downwards in its heights:
                 what it shows moves the other way.
         """
+        # of the larger side; the other one is smaller by the aspect
         half_tangent = math.tan(math.radians(fov) / 2.0)
         half_width = half_tangent * min(1.0, aspect)
         half_height = half_tangent * min(1.0, 1.0 / aspect)
+        # shifts are fractions of the full width and height, and heights count upwards
         right_shift = 2.0 * half_width * shift[0]
         down_shift = 2.0 * half_height * shift[1]
         return Frame(
@@ -472,6 +474,7 @@ def compute_real_harmonics(height: int, width: int) -> Tensor:
     """
     theta = (torch.arange(height) + 0.5) * math.pi / height
     phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
+    # (height, width) unit vectors: theta is the angle from +z
     x = theta.sin()[:, None] * phi.cos()[None]
     y = theta.sin()[:, None] * phi.sin()[None]
     z = theta.cos()[:, None].expand(height, width)
@@ -519,6 +522,7 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
     angle = torch.sqrt(
         torch.where(is_small, torch.ones_like(squared_angle), squared_angle)
     )
+    # sin a / a and (1 - cos a) / a^2, by their first two terms where a is small
     sine_factor = torch.where(
         is_small, 1.0 - squared_angle / 6.0, torch.sin(angle) / angle
     )
@@ -527,6 +531,7 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
     )
     x, y, z = vector
     zero = torch.zeros_like(x)
+    # the matrix of the cross product with the vector
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     return (
         torch.eye(3).to(degrees) + sine_factor * cross + cosine_factor * (cross @ cross)

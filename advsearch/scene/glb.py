@@ -232,7 +232,11 @@ def _make_document(
 
 
 def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
-    """Add the mesh of a shape to a buffer, and return its primitive."""
+    """Add the mesh of a shape to a buffer, and return its primitive.
+
+    Axes are turned to glTF's, and v is turned over, since glTF's is 0 at the top. A
+    normal of length 0 becomes upright. Indices have 16 bits where these suffice.
+    """
     mesh = shape.mesh
     lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
     # The format requires unit normals.
@@ -257,8 +261,13 @@ def _add_material(
     shape: Shape,
     encode_image: Callable[[ByteImage], bytes],
 ) -> dict[str, Any]:
-    """Return the material of a shape, whose images are added to the buffer and the
-    document.
+    """Return the material of a shape; its images go to the buffer and the document.
+
+    Args:
+        document: gets entries of images and textures.
+        buffer: gets the image files.
+        shape: whose surface it is.
+        encode_image: encodes an image (H, W, 3); one with opacity is always PNG.
     """
     color = _to_bytes(shape.base_color)
     if shape.opacity is None:

@@ -186,9 +186,10 @@ def add_lamps(scene: SceneDescription) -> SceneDescription:
 
 
 def _check_units(scene: SceneDescription, carrier: str) -> float:
-    """Return the luminance of a radiance of 1, cd/m2.
+    """Return the luminance of a radiance of 1, cd/m2, in the scene's environment.
 
-    Raises InputError: there is none, or metres are not known.
+    `carrier` is what has lamps, for the message. Raises InputError: the environment has
+    no unit, or the object's size in metres is not known.
     """
     settings = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}
     setting = settings.get(carrier, "things: lamps")

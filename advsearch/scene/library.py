@@ -179,8 +179,10 @@ def _read_mesh(
     Args:
         name: of the object, for messages.
         directory: of its files.
-        material_runs: names of materials, each with how many faces in a row have it.
+        material_runs: names of materials, each with how many faces in a row have it;
+            empty: the mesh has no materials by name.
     """
+    # (F,) name of each face's material
     material_of_face = np.repeat(
         [material for material, _ in material_runs],
         [count for _, count in material_runs],

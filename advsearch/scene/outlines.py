@@ -59,7 +59,8 @@ def find_visible_meshes(
 ) -> list[VisibleMesh]:
     """Return the meshes that the image of a configuration (d,) shows.
 
-    With `names` only those are considered.
+    A mesh counts if it is seen first in a pixel. With `names` only those are
+    considered.
     """
     description = renderer.scene.definition[0]
     surfaces = renderer.surfaces(u)

@@ -188,7 +188,11 @@ class Person:
         data: Mapping[str, np.ndarray],
         defaults: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        """Convert the arrays to tensors, and pose the person at its defaults."""
+        """Convert the arrays to tensors, and pose the person at its defaults.
+
+        Lengths become metres. Weights, which are stored as integers, are divided so
+        that those of a point sum to 1.
+        """
         default_by_name = {
             parameter.name: float(parameter.default) for parameter in PARAMETERS
         }

@@ -278,7 +278,8 @@ class Charts:
     def compute_areas(self) -> Float32Array:
         """Return the surface area (h, w) of each texel, in squared mesh units.
 
-        It is 0 where no chart is.
+        It is the area of the texel's face over the number of texels that the face has
+        on the texture; 0 where no chart is.
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         face_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
@@ -394,6 +395,7 @@ def look_up_texture(
     top = np.floor(y)
     fx = (x - left).astype(np.float32)[..., None]
     fy = (y - top).astype(np.float32)[..., None]
+    # beyond an edge the texture begins again
     column0 = (left % width).astype(np.int64)
     column1 = ((left + 1) % width).astype(np.int64)
     row0 = (top % height).astype(np.int64)
@@ -411,7 +413,10 @@ class MeshSurface:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Compute boxes and normals of the faces, and which faces are neighbours."""
+        """Compute boxes and normals of the faces, and which faces are neighbours.
+
+        Neighbours have an edge in common, by the positions of its ends.
+        """
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)

@@ -155,8 +155,10 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
 
 
 def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
-    """Raise FileFormatError unless cameras are few, unique, and the first is in
-    place.
+    """Raise FileFormatError unless cameras of a rig fit together.
+
+    They are 2 to `MAX_CAMERAS`, have names of their own, and the first, which is the
+    scene's camera, has no pose, azimuth or delay.
     """
     if not 2 <= len(mounts) <= MAX_CAMERAS:
         raise FileFormatError(
@@ -429,7 +431,11 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
 
 
 def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> list[str]:
-    """Return the names of cameras in a list with commas, or raise FileFormatError."""
+    """Return the names of cameras in a list with commas.
+
+    Raises FileFormatError unless they are 2 to `MAX_CAMERAS` different ones of
+    `known_names`.
+    """
     names = list(map(str.strip, listing_text.split(",")))
     if not 2 <= len(names) <= MAX_CAMERAS or len(set(names)) < len(names):
         raise FileFormatError(

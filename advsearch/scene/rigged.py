@@ -53,8 +53,9 @@ MAX_ARC_COSINE = 1.0 - 1e-9
 
 
 def find_rig_parameter(name: str) -> Parameter | None:
-    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`, or
-    None.
+    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`.
+
+    None for other names. Whether there is such a joint or target is not asked.
     """
     owner, dot, component = name.rpartition(".")
     if not (owner and dot and component in (*AXES, WEIGHT)):
@@ -121,12 +122,15 @@ class SkeletonRig:
     def __init__(
         self, parts: Sequence[Movable], vertices: IntArray, to_mesh: Float64Array
     ) -> None:
-        """Bring the arrays of all parts into the order of the mesh's vertices, as
-        tensors.
+        """Bring the arrays of all parts into the order of the mesh's vertices.
+
+        They become tensors. Joints of a part are rows of its own nodes; here they are
+        rows of the nodes of all parts, one after the other. Arguments are those of the
+        class.
         """
         self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
-        # without the scale
+        # without the scale, the cube root of the determinant
         self._rotation_to_mesh = torch.from_numpy(
             to_mesh / np.cbrt(np.linalg.det(to_mesh))
         )

@@ -98,7 +98,16 @@ def _make_grid_uvs(count: int) -> Float64Array:
 
 
 def _generate_atlas(soup: Soup, groups: Sequence[IntArray]) -> xatlas.Atlas:
-    """Unwrap groups of faces into one atlas, of `ATLAS_SIZE` if they fit into it."""
+    """Unwrap groups of faces into one atlas, of `ATLAS_SIZE` if they fit into it.
+
+    Each group is a mesh of its own for xatlas, with the vertices that it uses, so that
+    no chart has faces of two groups. xatlas makes several atlases of the size where one
+    is too small; then it is run again for one of any size.
+
+    Args:
+        soup: the faces.
+        groups: for each the indices of its faces.
+    """
     for resolution in (ATLAS_SIZE, 0):  # 0: one atlas, however large
         atlas = xatlas.Atlas()
         for group in groups:
@@ -257,7 +266,11 @@ class SurfaceParts:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Rasterise the map, and find the center of each cell and of each face."""
+        """Rasterise the map, and find the center of each cell and of each face.
+
+        Parts are the cells, row by row, and then the faces, unless there are more than
+        `MAX_FACES`: then the faces are left out.
+        """
         self.mesh = mesh
         self._mesh_uvs = mesh.uvs[mesh.faces].astype(np.float64)
         self.is_unwrapped = not _has_unique_uvs(mesh, self._mesh_uvs)
@@ -273,6 +286,7 @@ class SurfaceParts:
             [charts.compute_positions().reshape(-1, 3), face_centers]
         )
         self.centers = centers.astype(np.float64)
+        # the middle of each cell; row 0 is at v = 1
         row, column = np.divmod(np.arange(MAP_SIZE * MAP_SIZE), MAP_SIZE)
         cell_uvs = np.stack(
             [(column + 0.5) / MAP_SIZE, 1.0 - (row + 0.5) / MAP_SIZE], axis=1

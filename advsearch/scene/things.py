@@ -228,7 +228,9 @@ def _make_thing(
 ) -> tuple[ThingPart, list[str]]:
     """Return a thing that stands in a scene, and remarks on it.
 
-    Arguments and errors are as for `add_things`.
+    Remarks are those of its file, doubts about its size, and where there are lanes a
+    guess of its front. `thing` is what was asked for; other arguments and errors are as
+    for `add_things`.
     """
     object_spec = thing.object_spec
     name = thing.name

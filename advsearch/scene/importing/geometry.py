@@ -102,8 +102,9 @@ def compute_rotation(up: str, front: str) -> Float64Array:
 def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -> Soup:
     """Join parts into one soup of unit extent with welded points.
 
-    The lowest corner of its box becomes the origin before it is turned. Vertices that
-    no face has count neither for the extent nor for the corner.
+    A vertex v becomes turn (v - low) / extent, with low the lowest corner of the
+    bounding box and extent its largest side. Vertices that no face has count for
+    neither. Normals are turned likewise, and become unit vectors.
 
     Args:
         parts: at least one.
@@ -768,10 +769,14 @@ class _EarCutter:
     def step(self, budget: int) -> None:
         """Try the tip of every active polygon; cut it off if it is an ear.
 
+        Then the next corner is the tip. Polygons with all their triangles are no longer
+        active.
+
         Args:
             budget: limit of the comparisons; then all ears are cut off untested.
         """
         active = self.active
+        # (active,) the tip b of each, and its neighbours a and c
         b = self.tip[active]
         a = self.previous_corner[active, b]
         c = self.next_corner[active, b]

@@ -71,7 +71,11 @@ def read_header(path: Path, data: bytes) -> Header:
 
 
 def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
-    """Parse the JSON of a header, which must have an asset."""
+    """Parse the JSON of a header, which must have an asset.
+
+    It is checked before that it is not too large: commas and brackets are counted as an
+    upper bound of its values. Raises FileFormatError.
+    """
     text = decode_text(chunk)
     check_most(
         path,

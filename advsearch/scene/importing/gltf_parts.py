@@ -913,6 +913,9 @@ def _pose_parts(
 ) -> list[ImportedPart]:
     """Return the primitives that nodes draw, in the pose of each node.
 
+    One with a skin is posed by its joints alone; others by their node. A mesh that
+    several nodes draw is there several times.
+
     Args:
         file: the glTF file.
         instances: node, mesh and pose of everything that is drawn.

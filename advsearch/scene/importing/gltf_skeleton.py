@@ -528,7 +528,11 @@ def _count_numbers(count: int) -> str:
 
 
 def _read_times(file: GltfFile, index: int) -> Float64Array:
-    """Return the times (K,) in seconds of the keys of a clip, which must rise."""
+    """Return the times (K,) in seconds of the keys of a clip, which must rise.
+
+    `index` is that of their accessor. Raises FileFormatError: it is of another type, or
+    times do not rise from 0 or later.
+    """
     path = file.path
     accessor = file.header.accessors[index]
     is_float32 = accessor.componentType == 5126

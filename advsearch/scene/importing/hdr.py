@@ -133,7 +133,11 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
 def _read_layer(
     file: Path, data: bytes
 ) -> tuple[dict[str, Any], dict[str, Plane], list[str]]:
-    """Return the header, the planes and the notes of the layer that is the image."""
+    """Return the header, the planes and the notes of the layer that is the image.
+
+    Planes are by `CHANNEL_NAMES`. The file is opened twice: first its header alone, to
+    check its size before pixels are read. Raises ValueError if channels are missing.
+    """
     with OpenEXR.File(
         io.BytesIO(data), separate_channels=True, header_only=True
     ) as exr_file:

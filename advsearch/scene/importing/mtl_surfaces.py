@@ -256,8 +256,10 @@ class MtlReader:
     def _drop_other_layouts(
         self, material: MtlMaterial, uses: dict[str, MapUse], first_use: MapUse
     ) -> None:
-        """Remove the maps whose scale and offset differ from those of the first, in
-        place.
+        """Remove maps whose texture coordinates differ from those of the first.
+
+        A surface has one layout, by scale and offset. Those removed are noted. `uses`
+        are the maps by keyword, which is changed.
         """
         for key in [key for key in UV_MAPS if key in uses]:
             if (uses[key].scale, uses[key].offset) != (

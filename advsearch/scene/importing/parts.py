@@ -269,7 +269,10 @@ def select_visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
 
 
 def transform_part(part: ImportedPart, matrix: Float64Array) -> ImportedPart:
-    """Return a part transformed by an affine matrix (4, 4)."""
+    """Return a part transformed by an affine matrix (4, 4).
+
+    One that mirrors keeps the fronts of its faces outside.
+    """
     if np.array_equal(matrix, np.eye(4)):
         return part
     linear = matrix[:3, :3]

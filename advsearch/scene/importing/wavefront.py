@@ -127,7 +127,8 @@ def _note_repetition(uvs: Float64Array, notes: Notes) -> None:
 def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an OBJ file and the material files that it names.
 
-    Each material becomes one part, and its faces without texture coordinates another.
+    Faces with the same material, smoothing and UDIM square become one part, and those
+    among them without texture coordinates another.
 
     Raises:
         FileFormatError: the file is of another kind, is cut short, refers to geometry
@@ -446,7 +447,11 @@ class ObjLines:
     """
 
     def __init__(self, data: bytes, notes: Notes) -> None:
-        """Find the lines of a file, and the kind of each by its first bytes."""
+        """Find the lines of a file, and the kind of each by its first bytes.
+
+        All lines at once: arrays of their first, second and third bytes are compared
+        with the keywords.
+        """
         if b"\x00" in data:
             raise notes.damaged(EXPECTED, data)
         text = _normalize_lines(data)
@@ -457,6 +462,7 @@ class ObjLines:
         self.bytes = np.frombuffer(text, dtype=np.uint8)
         self.ends = np.flatnonzero(self.bytes == _NEWLINE)
         self.starts = np.concatenate([[0], self.ends[:-1] + 1])
+        # a last line may be shorter than three bytes
         padded = np.concatenate([self.bytes, np.full(3, _NEWLINE, np.uint8)])
         first_byte, second_byte, third_byte = (
             padded[self.starts + offset] for offset in range(3)

@@ -239,7 +239,10 @@ def _find_variant(path: Path, header: Header, variant: str) -> int:
 def _select_material(
     path: Path, header: Header, primitive: Primitive, variant: int | None
 ) -> int | None:
-    """Return the index of the material that a primitive has in a variant."""
+    """Return the index of the material that a primitive has in a variant.
+
+    It is the primitive's own where the variant does not change it, or is None.
+    """
     extension = _get_extension(primitive, VARIANTS)
     if variant is None or extension is None:
         return primitive.material

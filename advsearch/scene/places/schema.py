@@ -70,7 +70,11 @@ class SolidEntry(_Entry):
 
     @model_validator(mode="after")
     def _check_form(self) -> SolidEntry:
-        """Check that an entry has one convex outline, or a radius and positions."""
+        """Check that an entry has one convex outline, or a radius and positions.
+
+        Raises ValueError, which pydantic reports: both or neither, heights that do not
+        rise, an outline that is not convex, or a name that is no line of text.
+        """
         has_positions = self.at is not None
         has_radius = self.radius is not None
         has_outline = self.outline is not None

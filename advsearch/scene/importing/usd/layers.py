@@ -172,7 +172,11 @@ class _LayerCheck:
         self._folder = self.file.parent.resolve()
 
     def run(self) -> list[Path]:
-        """Return the files of all layers and packages, the file itself first."""
+        """Return the files of all layers and packages, the file itself first.
+
+        What a layer names is followed; a package is checked with all that is in it.
+        Raises FileFormatError as `check_layers`.
+        """
         pending = [self.file.resolve()]
         checked_files = dict[Path, None]()
         while pending:

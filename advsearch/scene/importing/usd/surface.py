@@ -245,7 +245,10 @@ class UsdSurfaces:
         return self._materials[path]
 
     def _make_default_material(self) -> BoundMaterial:
-        """Add the material of prims without one, whose color is their display color."""
+        """Add the material of prims without one, whose color is their display color.
+
+        That is a primvar of each mesh, so that faces are tinted later.
+        """
         surface = {
             "baseColorFactor": [*DEFAULT_COLOR, 1.0],
             "metallicFactor": 0.0,
