@@ -367,13 +367,13 @@ def compute_level_irradiance(description: SceneDescription) -> Float64Array:
     if environment is None:
         return np.zeros(len(CHANNELS))
     rows = environment.radiance.shape[0]
-    edges = np.cos(np.arange(rows + 1) * math.pi / rows)
-    # Cosines of the angle from straight up at each row's edges; 0 below the horizon.
-    # The integral of cosine times solid angle over a row is pi (upper^2 - lower^2).
-    upper = np.maximum(edges[:-1], 0.0)
-    lower = np.maximum(edges[1:], 0.0)
+    edge_cosines = np.cos(np.arange(rows + 1) * math.pi / rows)
+    # Of the angle from straight up at each row's two edges; 0 below the horizon. The
+    # integral of cosine times solid angle over a row is pi (upper^2 - lower^2).
+    upper_cosines = np.maximum(edge_cosines[:-1], 0.0)
+    lower_cosines = np.maximum(edge_cosines[1:], 0.0)
     row_means = environment.radiance.mean(axis=1, dtype=np.float64)
-    weights = math.pi * (upper**2 - lower**2)
+    weights = math.pi * (upper_cosines**2 - lower_cosines**2)
     # no BLAS, whose last bits depend on its threads
     return np.asarray((weights[:, None] * row_means).sum(axis=0))
 

@@ -344,6 +344,7 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     is_zero = isinstance(coefficients, list) and not any(coefficients)
     if kind in ("kannala_brandt4", "kannala_brandt"):
         kind = "kannala_brandt"
+        # the model has four; the list may be longer
         entries["coeffs"] = (
             coefficients[:4] if isinstance(coefficients, list) else coefficients
         )

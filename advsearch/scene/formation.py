@@ -239,10 +239,10 @@ METERED_DEFAULTS = ("camera.", "pose.", "environment.")
 
 @lru_cache(maxsize=8)
 def compute_metered_gain(scene: SceneDescription) -> float:
-    """Return the factor on radiance that gives the metered white card
-    `CARD_DISPLAY_VALUE`.
+    """Return the factor on radiance by which a white card is `CARD_DISPLAY_VALUE`.
 
-    Where the camera sees nothing of the object, the card lies on the ground; where no
+    The card, of `CARD_REFLECTANCE`, is laid against all of the object that the camera
+    sees, with camera, pose and environment as they are by default. Where the camera sees nothing of the object, the card lies on the ground; where no
     light arrives the factor is 1.
     """
     default = {
@@ -369,11 +369,11 @@ def _compute_emitted_light(
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
     # (F, 3) mean radiance at ten points of each face
-    mean = look_up_texture(emission, column, row).mean(axis=1)
+    mean_radiance = look_up_texture(emission, column, row).mean(axis=1)
     projected_area = np.maximum(-(area * direction).sum(axis=1), 0.0)
     # irradiance = radiance * area / (distance^2 + area / pi)
-    disk = squared_distance + np.linalg.norm(area, axis=1) / math.pi
-    return direction, mean * (projected_area / disk)[:, None]
+    disk_divisor = squared_distance + np.linalg.norm(area, axis=1) / math.pi
+    return direction, mean_radiance * (projected_area / disk_divisor)[:, None]
 
 
 def _choose_metering_shape(frame: Frame) -> tuple[float, tuple[int, int]]:
@@ -463,9 +463,9 @@ def _compute_unrotated_light(
     solid_angle = -np.diff(np.cos(polar)) * (2.0 * math.pi / width)
     # a fourth channel of ones sums up the solid angles
     ones = np.ones((height, width, 1))
-    fine = np.concatenate([environment.radiance, ones], axis=2)
-    fine = fine * solid_angle[:, None, None]
-    row_sums = np.add.reduceat(fine, rows, axis=0)
+    weighted_texels = np.concatenate([environment.radiance, ones], axis=2)
+    weighted_texels = weighted_texels * solid_angle[:, None, None]
+    row_sums = np.add.reduceat(weighted_texels, rows, axis=0)
     sums = np.add.reduceat(row_sums, columns, axis=1).reshape(-1, 4)
 
     directions = _compute_block_directions(rows, columns, (height, width))

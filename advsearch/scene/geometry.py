@@ -574,8 +574,8 @@ def compute_footprint(points: Float64Array) -> Footprint:
 def is_overlapping(first: Footprint, second: Footprint) -> bool:
     """Return whether two footprints overlap from above, at heights that both have."""
     # any direction will do: they overlap if they do so at a shift of 0
-    start, end = find_overlap_interval(first, second, np.array([1.0, 0.0]))
-    return start < 0.0 < end
+    first_shift, last_shift = find_overlap_interval(first, second, np.array([1.0, 0.0]))
+    return first_shift < 0.0 < last_shift
 
 
 def find_overlap_interval(
@@ -608,7 +608,7 @@ def find_overlap_interval(
     # corners along each axis, (corners, k); and how far a shift of 1 moves along it
     moving_range = first.outline @ normals.T
     fixed_range = second.outline @ normals.T
-    speed = normals @ direction
+    shift_speeds = normals @ direction
     # (2, k): how far the first has to move along each axis until it overlaps the
     # second, and until it no longer does
     separations = np.stack(
@@ -619,11 +619,14 @@ def find_overlap_interval(
     )
     # The shift does not move it along such an axis: they are apart always or never.
     # Apart means that 0 is not within their separations.
-    is_parallel = speed == 0.0
+    is_parallel = shift_speeds == 0.0
     if (is_parallel & ((separations[0] >= 0.0) | (separations[1] <= 0.0))).any():
         return math.inf, -math.inf
-    # sorted, since a negative speed swaps begin and end
-    intervals = np.sort(separations[:, ~is_parallel] / speed[~is_parallel], axis=0)
+    # divided: the shifts at which it begins and ends; sorted, since a negative speed
+    # swaps the two
+    intervals = np.sort(
+        separations[:, ~is_parallel] / shift_speeds[~is_parallel], axis=0
+    )
     start = float(intervals[0].max())
     end = float(intervals[1].min())
     return (start, end) if start < end else (math.inf, -math.inf)

@@ -178,7 +178,10 @@ class SpotLamp(_Point):
 
     @property
     def to_world(self) -> Float64Array:
-        """(4, 4) pose of the lamp, which shines along its own +z."""
+        """(4, 4) pose of the lamp, which shines along its own +z.
+
+        How it is turned about that axis does not matter.
+        """
         forward = (
             np.array(self.direction)
             if any(self.direction)

@@ -393,16 +393,24 @@ def look_up_texture(
     # The four texels around each point, and how far (0 to 1) it is from the first.
     left = np.floor(x)
     top = np.floor(y)
-    fx = (x - left).astype(np.float32)[..., None]
-    fy = (y - top).astype(np.float32)[..., None]
+    column_fraction = (x - left).astype(np.float32)[..., None]
+    row_fraction = (y - top).astype(np.float32)[..., None]
     # beyond an edge the texture begins again
     column0 = (left % width).astype(np.int64)
     column1 = ((left + 1) % width).astype(np.int64)
     row0 = (top % height).astype(np.int64)
     row1 = ((top + 1) % height).astype(np.int64)
-    upper = texels[row0, column0] * (1 - fx) + texels[row0, column1] * fx
-    lower = texels[row1, column0] * (1 - fx) + texels[row1, column1] * fx
-    return np.asarray(upper * (1 - fy) + lower * fy, dtype=np.float32)
+    upper = (
+        texels[row0, column0] * (1 - column_fraction)
+        + texels[row0, column1] * column_fraction
+    )
+    lower = (
+        texels[row1, column0] * (1 - column_fraction)
+        + texels[row1, column1] * column_fraction
+    )
+    return np.asarray(
+        upper * (1 - row_fraction) + lower * row_fraction, dtype=np.float32
+    )
 
 
 class MeshSurface:

@@ -793,9 +793,10 @@ class Renderer:
 
 @lru_cache(maxsize=4)
 def _base_pose_and_center(description: SceneDescription) -> tuple[Tensor, Tensor]:
-    """Return the camera's pose (4, 4) and the object's center (3,) by default.
+    """Return the camera's pose (4, 4) and the object's center (3,) in a scene.
 
-    They are cached, since the center takes all vertices.
+    They are those without inputs of a configuration, and cached, since the center takes
+    all vertices.
     """
     pose = camera_to_world(description)
     center = compute_center(description)

@@ -84,7 +84,8 @@ def _make_grid_uvs(count: int) -> Float64Array:
     """Return texture coordinates (count, 3, 2): two faces in each cell of a grid.
 
     Faces 0 and 1 are the lower left and the upper right half of the first cell, and so
-    on. The grid has as many columns as rows, at least, and fills the unit square.
+    on, row by row from the bottom. The grid is the smallest with as many rows as
+    columns that has a place for all.
     """
     n_columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
     face = np.arange(count)

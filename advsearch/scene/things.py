@@ -365,7 +365,10 @@ def find_overlapping_solid(scene: SceneDescription, footprint: Footprint) -> str
 
 
 def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with a remark on its object and each thing inside a solid."""
+    """Return the scene with a remark on its object and each thing inside a solid.
+
+    Solids are those of the place around it; without any the scene is returned as it is.
+    """
     if not any(part.solids for part in scene.surrounding_meshes.values()):
         return scene
     footprints = {"the object": compute_footprint(scene.base_vertices)}

@@ -384,15 +384,15 @@ def _compute_file_to_mesh(
 ) -> Float64Array:
     """Return the map (4, 4) from the file's coordinates to the normalised mesh's.
 
-    `join_parts` maps a vertex v to turn (v - low) / extent, and `normalise_mesh` that
-    point p to (p - origin) / size; this is the one after the other. `turn` (3, 3) leads
-    from the file's axes to ours.
+    `join_parts` maps a vertex v to turn (v - lowest corner) / extent, and
+    `normalise_mesh` that point p to (p - origin) / size; this is the one after the
+    other. `turn` (3, 3) leads from the file's axes to ours.
     """
-    used = [part.vertices[np.unique(part.faces)] for part in parts]
-    low = np.min([points.min(axis=0) for points in used], axis=0)
+    used_points = [part.vertices[np.unique(part.faces)] for part in parts]
+    lowest_corner = np.min([points.min(axis=0) for points in used_points], axis=0)
     origin, size = find_footing(soup.points[np.unique(soup.faces)])
     linear = turn / (compute_extent(parts) * size)
-    return make_pose(linear, -linear @ low - origin / size)
+    return make_pose(linear, -linear @ lowest_corner - origin / size)
 
 
 def _compute_emitted(

@@ -254,6 +254,7 @@ def _read_rows(
 
     if not element.count or not scalar_widths:
         return position
+    # At least the scalars and counts have to be there, before memory is taken for rows.
     check_end(position + element.count * sum(scalar_widths.values()))
     # All rows are assumed to be as long as the first.
     first_starts, first_end = walk_rows(1)
@@ -280,9 +281,10 @@ def _store_values(
 
     Args:
         element: its scalars and lists are set.
-        starts: the byte at which each property begins, in each row.
-        values: the numbers of each property's type that begin at each byte.
-        counts: those of the type of the count; only of lists.
+        starts: by property, the bytes (rows,) at which it begins in each row.
+        values: by property, the number of its type that begins at each byte.
+        counts: by property that is a list, the count that begins at each byte. A list
+            is its count and then its values.
     """
     for name, property_starts in starts.items():
         if name in counts:

@@ -783,5 +783,6 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     line_ends = np.flatnonzero(data == _NEWLINE)
     sizes = np.diff(np.searchsorted(corner_starts, line_ends), prepend=0)
     corners = np.zeros((len(corner_starts), 3), dtype=np.int64)
+    # the corner of each number is how many began up to it, less 1
     corners[np.cumsum(is_first) - 1, column] = values
     return corners, sizes
