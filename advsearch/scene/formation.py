@@ -242,8 +242,9 @@ def compute_metered_gain(scene: SceneDescription) -> float:
     """Return the factor on radiance by which a white card is `CARD_DISPLAY_VALUE`.
 
     The card, of `CARD_REFLECTANCE`, is laid against all of the object that the camera
-    sees, with camera, pose and environment as they are by default. Where the camera sees nothing of the object, the card lies on the ground; where no
-    light arrives the factor is 1.
+    sees, with camera, pose and environment as they are by default. Where the camera
+    sees nothing of the object, the card lies on the ground; where no light arrives the
+    factor is 1.
     """
     default = {
         name: value

@@ -385,7 +385,7 @@ class Person:
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
-        # (G, A, W); and heights (H,) of bodies so mixed, of the three extremes of height
+        # (G, A, W); and heights (H,) of bodies so mixed, at the three extremes
         mixture = torch.einsum(
             "g,a,w->gaw", gender_weights, age_weights, weight_weights
         )
