@@ -131,7 +131,8 @@ class Material:
     def with_values(self, values: Mapping[str, float | None], prefix: str) -> Material:
         """Return the material with some settings over it.
 
-        Their names are `prefix` and the attribute's.
+        Their names are `prefix` and the attribute's, such as ``material.roughness``.
+        Others, and None, change nothing.
         """
         new_values = {name: values.get(prefix + name) for name in vars(self)}
         replaced = {

@@ -772,6 +772,8 @@ def _decompose_rotation(rotation: Float64Array) -> dict[str, float]:
 
     It is taken apart as `Rz(yaw) Ry(pitch) Rx(roll)`.
     """
+    # the entry (2, 0) is -sin pitch; (0, 0), (1, 0) and (2, 1), (2, 2) are cosines and
+    # sines of yaw and roll times cos pitch
     pitch = math.asin(min(max(-float(rotation[2, 0]), -1.0), 1.0))
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     roll = math.atan2(rotation[2, 1], rotation[2, 2])

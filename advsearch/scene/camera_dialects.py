@@ -203,7 +203,10 @@ def translate_entries(
 
 
 def _translate_stella(camera: Mapping[str, Any]) -> dict[str, Any]:
-    """Translate a camera of stella_vslam; entries not about the lens are left out."""
+    """Translate a camera of stella_vslam: its names, and the name of its model.
+
+    Entries that are not about the lens are left out; they are as in ORB-SLAM's files.
+    """
     entries = {
         STELLA_NAMES.get(str(name), str(name)): value for name, value in camera.items()
     }

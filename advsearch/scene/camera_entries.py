@@ -186,6 +186,11 @@ class Entries:
 def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> Any:
     """Return the camera of a name out of those of a file, or the only one.
 
+    Args:
+        path: the file, for messages.
+        camera_name: "" if none is named.
+        cameras: at least one, by name.
+
     Raises:
         FileFormatError: there is none of that name, or there are several and none is
             named.

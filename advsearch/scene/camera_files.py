@@ -413,6 +413,15 @@ def _read_focal_lengths(
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
+    A length wins. fy is fx where the file has neither its length nor its angle.
+
+    Args:
+        path: the file, for messages.
+        data: all entries of the file, which have the angles, radians.
+        entries: those of the camera, which have the lengths.
+        width: of the image in pixels.
+        height: likewise.
+
     Raises:
         FileFormatError: the two contradict each other.
     """
@@ -542,7 +551,11 @@ def _read_opencv(spec: str, entries: Entries) -> CameraModel:
 
 
 def _find_opencv_kind(path: str, entries: Entries) -> str:
-    """Return the kind of model that a camera of OpenCV or ROS states."""
+    """Return the kind of model that a camera of OpenCV or ROS states.
+
+    Without an entry that states it, it is Brown's and Conrady's. Raises
+    FileFormatError: two entries contradict each other, or the model is not one of ours.
+    """
     keys = ("distortionmodel", "cameramodel", "modeltype")
     models = [entries.get(key) for key in keys]
     kinds = {_find_kind(path, model) for model in models if model is not None}

@@ -99,7 +99,7 @@ class CameraModel:
     # ---- Projection and rays ----
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points (N, 3) to the image.
+        """Project points (N, 3), to the right, down and ahead, to the image.
 
         Returns:
             Coordinates (N, 2) float64 in image widths and heights, which may be outside

@@ -419,7 +419,8 @@ class SceneDescription:
     def meshes(self) -> Mapping[str, MeshPart]:
         """Every mesh by name, as the settings have it.
 
-        The one under test is `OBJECT`.
+        The one under test is `OBJECT`. The glass of lamps has the pose of what carries
+        it.
         """
         around = {
             name: geometry.apply_settings(part, self.values)

@@ -397,7 +397,8 @@ def _find_nearest(
     """
     order = np.argsort(nearness, kind="stable")
     front = np.full(shape, -1)
-    front[row[order], column[order]] = order  # the nearest comes last
+    # of several samples in a pixel, the one written last stays: the nearest
+    front[row[order], column[order]] = order
     return np.asarray(front[front >= 0])
 
 

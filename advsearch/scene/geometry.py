@@ -238,7 +238,11 @@ def _compute_framing_distance_all_around(
 
 
 def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
-    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix."""
+    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix.
+
+    That is first a turn about x by the roll, then about y, then about z.
+    """
+    # cosine and sine of each
     (cz, sz), (cy, sy), (cx, sx) = (
         (math.cos(math.radians(a)), math.sin(math.radians(a)))
         for a in (yaw, pitch, roll)

@@ -449,10 +449,11 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
 def find_surroundings(scene: SceneDescription) -> Surroundings | None:
     """Return what is known of the place in a scene's environment.
 
-    In metres. A place whose picture the environment shows has the picture's limits; a
-    photograph over a ground has those of its camera's height and its empty radius;
-    otherwise only the end of a paved ground counts. None where nothing of it has to fit
-    a ground.
+    In metres; the first of these that holds. If the scene has a place as geometry and
+    the environment shows the picture of one, the picture's limits hold. A photographed
+    environment over a ground has the limits of its camera's height and of its empty
+    radius. Otherwise only the end of a paved ground counts. None where there is none,
+    or nothing of the environment's picture has to fit it.
     """
     environment = scene.environment
     # what encloses the object is geometry, true from everywhere
@@ -487,7 +488,7 @@ def find_surroundings(scene: SceneDescription) -> Surroundings | None:
 
 
 def bound_ground(place: Place) -> Box:
-    """Return the bounds of the ground of a place in x and in y, metres."""
+    """Return the bounds of the ground of a place, metres: x from, to, y from, to."""
     vertices = np.concatenate(
         [part.mesh.vertices for part in place.parts if part.is_ground]
     )

@@ -364,12 +364,12 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 def _resize_map(
     read_rows: Callable[[int, int], Float32Array], size: tuple[int, int]
 ) -> Float32Array:
-    """Average a map down to at most `MAX_MAP_SIZE`, or repeat texels up to
-    `MIN_MAP_SIZE`.
+    """Bring a map to a size from `MIN_MAP_SIZE` to `MAX_MAP_SIZE`.
 
-    Both sides shrink by the same factor. A new texel is the mean of those that it
-    covers, weighted by their solid angles, which go by the sine of the polar angle of
-    their row: the weighted texels are averaged, and divided by the averaged weights.
+    A larger one is averaged down, of a smaller one texels are repeated. Both sides
+    shrink by the same factor. A new texel is the mean of those that it covers, weighted
+    by their solid angles, which go by the sine of the polar angle of their row: the
+    weighted texels are averaged, and divided by the averaged weights.
     `read_rows` and `size` are as in `LightImage`.
     """
     height, width = size

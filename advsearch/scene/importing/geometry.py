@@ -172,7 +172,7 @@ def _check_finite(vertices: Float64Array, source: str) -> None:
 
 
 def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
-    """Merge vertices (V, 3) that are closer than `WELD_DISTANCE`.
+    """Merge vertices (V, 3) that are closer than `WELD_DISTANCE` into one point.
 
     Returns:
         The points (P, 3), and the point of each vertex (V,).

@@ -427,6 +427,11 @@ def _read_clips(
     That is what sets the transform of a node with a mesh, of a joint or of an ancestor
     of one, and the weights of morph targets. A clip without any such channel is left
     out.
+
+    Args:
+        file: the glTF file.
+        target_counts: the nodes with a mesh, and their number of morph targets.
+        skins: indices of the skins of these nodes.
     """
     header = file.header
     joints = (joint for skin in skins for joint in header.skins[skin].joints)

@@ -85,8 +85,9 @@ class MtlReader:
     def read_library(self, name: str) -> None:
         """Read a material file; of materials with the same name, the first counts.
 
-        A file that is missing is noted, and so is a second material of a name in one
-        file, unless its statements are the same.
+        Its materials are kept by name for `get_surface`. A file that is missing is
+        noted, and so is a second material of a name in one file, unless its statements
+        are the same. Statements before the first material are recorded as left out.
         """
         try:
             text = decode_text(self.references.get(name))
@@ -569,8 +570,8 @@ class MtlReader:
 def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """Return the values (H, W) of an image for a map of numbers.
 
-    They are the channel that ``-imfchan`` names, or else the alpha, or the mean of the
-    colors if it has no alpha.
+    They are the channel that ``-imfchan`` names; or else the alpha, if it is not opaque
+    everywhere; or else the mean of the colors, also for an alpha that is not there.
     """
     channel = CHANNELS.get(use.options.get("imfchan", "").lower())
     has_alpha = picture.shape[2] == 4

@@ -259,6 +259,13 @@ def _make_surrounding_mesh(
 
     The shape is normalised as an object is; its pose puts it back to where it was, with
     the size that it had relative to the object.
+
+    Args:
+        path: the file, for messages.
+        name: of the part.
+        parts: what the node draws.
+        front: the axis of the file that is the front.
+        object_frame: that of the object.
     """
     frame = _compute_frame(parts, object_frame.turn)
     shape = make_object(parts, notes=[], file=path, name=name, up="y", front=front)

@@ -54,6 +54,7 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         colors = _read_colors(data[:80], facets["attribute"], notes)
         if colors is not None:
             corner_colors = np.repeat(colors[:, None], 3, axis=1)
+            # white, which the colors of facets multiply
             surface = ImportedSurface(color=np.ones(3, np.float32))
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         points = _parse_text(data, notes)

@@ -586,6 +586,7 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     j = grid_j.reshape(-1)
     is_up = i + j < steps
     is_down = i + j < steps - 1
+    # of the second and the third corner: steps along the two sides, as fractions
     weight_b, weight_c = (
         np.concatenate([index[is_up] + 1.0 / 3.0, index[is_down] + 2.0 / 3.0]) / steps
         for index in (i, j)

@@ -128,7 +128,10 @@ class _Mappings(_Extension):
 
 
 def _read_extension(path: Path, model: type[M], content: object) -> M:
-    """Return an extension, checked; the default for None. Raises FileFormatError."""
+    """Return an extension of the file as a model; with defaults where it is None.
+
+    Raises FileFormatError: it has other types than the model.
+    """
     try:
         return model.model_validate({} if content is None else content)
     except ValidationError as error:
