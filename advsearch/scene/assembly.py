@@ -71,29 +71,34 @@ class MovingMesh:
         matrix = self.to_world.to(device) if to_world is None else to_world
         vertices = self.vertices.to(device)
         normals = self.normals.to(device)
-        # The author's normals turn by as much as those that follow from the faces.
+        # The author's normals need not be those of the faces: they change by as much as
+        # the faces' normals do.
         if offsets is not None:
             original = self._original_area_normals.to(device)
             change = self._compute_area_normals(vertices + offsets) - original
             vertices = vertices + offsets
             normals = normals + change
         world_vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        # a row times the inverse: normals go by the inverse transpose
         world_normals = normals @ torch.linalg.inv(matrix[:3, :3])
         lengths = world_normals.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return world_vertices, world_normals / lengths
 
     def _compute_area_normals(self, vertices: Tensor) -> Tensor:
-        """Return area-weighted normals (V, 3).
+        """Return the unit normals (V, 3) that follow from the faces, weighted by area.
 
-        Vertices that share position and normal share the average, so that creases stay
-        creases.
+        Vertices at one position with one normal (a UV seam splits them) share the mean
+        of all their faces; those with different normals do not, so that creases stay
+        creases. `vertices` are (V, 3) positions of the mesh's vertices.
         """
         faces, groups = (indices.to(vertices.device) for indices in self._shared_groups)
         first, second, third = (
             vertices.index_select(0, faces[:, corner]) for corner in range(3)
         )
+        # as long as twice the face's area: the sum weights faces by area
         normals = torch.linalg.cross(second - first, third - first)
         sums = vertices.new_zeros(int(groups.max()) + 1, 3)
+        # all first corners, then all second and third ones, as `repeat` has the normals
         group_of_corner = groups[faces].T.reshape(-1)
         sums = sums.index_add(0, group_of_corner, normals.repeat(3, 1))[groups]
         return sums / (sums.square().sum(dim=1, keepdim=True) + 1e-24).sqrt()
@@ -104,7 +109,11 @@ class MovingMesh:
 
     @cached_property
     def _shared_groups(self) -> tuple[Tensor, Tensor]:
-        """The faces (F, 3), and the group (V,) of vertices that share a normal."""
+        """The faces (F, 3), and for each vertex (V,) its group that shares a normal.
+
+        Vertices are in one group if their positions and their normals are the same, the
+        positions to 1e-5 of the mesh's unit and the normals to 1e-3.
+        """
         rounded = np.round(
             np.concatenate(
                 [self._mesh.vertices * 1e5, self._mesh.normals * 1e3], axis=1
@@ -176,6 +185,7 @@ class Assembly:
         description: SceneDescription,
         resolution: tuple[int, int] | None = None,
     ) -> None:
+        """Keep the scene's meshes, its carried lamps and what its photograph adds."""
         self.meshes = {
             name: MovingMesh(part.mesh, part.to_world)
             for name, part in description.meshes.items()
@@ -193,6 +203,9 @@ class Assembly:
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
 
+        `NAME.to_world` and `NAME.offsets` become `NAME.vertices` and `NAME.normals`;
+        `camera.shift` (2,) becomes two numbers; `environment.data` (H, W, 3) becomes a
+        map that is padded at its seam, and the reflectance of a photographed ground.
         All are differentiable torch operations.
         """
         if self.is_object_hidden:
@@ -220,6 +233,7 @@ class Assembly:
                 parameters["ground.reflectance"] = self._photograph.compute_reflectance(
                     data
                 )
+            # a column of the other side at each, so that interpolation has no seam
             parameters["environment.padded"] = torch.cat(
                 [data[:, -1:], data, data[:, :1]], dim=1
             )
@@ -241,7 +255,15 @@ class Assembly:
 def _move_carried(
     part: BeamLamp | LampGlass, inputs: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
-    """Return the inputs of a lamp that is moved with what carries it."""
+    """Return the inputs of a lamp that is moved with what carries it.
+
+    Glass is deformed with the vertices of its carrier that it lies on, and has the same
+    pose; a beam stays where it is on its carrier. Empty if nothing moves the carrier.
+
+    Args:
+        part: the beam or the glass.
+        inputs: of the scene, with the carrier's `to_world` and `offsets` if it moves.
+    """
     moved_inputs: dict[str, Tensor] = {}
     pose = inputs.get(f"{part.carrier}.to_world")
     offsets = inputs.get(f"{part.carrier}.offsets")
@@ -265,7 +287,10 @@ ScalarFunction = Callable[[Tensor], Tensor]
 def write_central_differences(
     value: ScalarFunction, group: Group, u: Tensor, derivative: Tensor
 ) -> None:
-    """Write the central differences of a function into a derivative.
+    """Write the central differences of a function into a derivative, in place.
+
+    Each is the rise of the function between two points, divided by their distance: at
+    the border of the box that is less than twice the step.
 
     Args:
         value: from a configuration (d,) to a number.
@@ -328,12 +353,14 @@ class Motion:
         resolution: tuple[int, int],
         assembly: Assembly,
     ) -> None:
+        """Choose the points that are followed; arguments are those of the class."""
         self._description = description
         self._resolution = resolution
         self._assembly = assembly
         aspect = resolution[1] / resolution[0]
         pose = camera_to_world(description, aspect)
         self._camera = torch.from_numpy(pose).double()
+        # `_ground` is half the side of the ground square, `_edge` (n, 3) points on it.
         if description.photograph is None:
             self._ground = description.number("ground.size") / 2.0
             self._edge = _sample_square_edge(self._ground)
@@ -352,6 +379,9 @@ class Motion:
     def project_points(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return where the followed points lie in the image.
 
+        In the order of the meshes' vertices, the edge of the ground, the environment.
+        `inputs` are assembled ones.
+
         Returns:
             (N, 2) pixels from the center, and (N,) whether each is in or near the
             frame.
@@ -368,6 +398,7 @@ class Motion:
         positions, is_visible = project_points(
             self._description, inputs, relative, self._resolution
         )
+        # The ground hides points of the environment; nothing else hides any.
         n_near = len(is_visible) - len(self._far)
         is_visible[n_near:] &= ~self._hidden_by_ground(eye)
         half_size = torch.tensor(self._resolution[::-1], dtype=torch.float64) / 2.0
@@ -377,6 +408,7 @@ class Motion:
     def _hidden_by_ground(self, eye: Tensor) -> Tensor:
         """Return which of the far points the ground plane hides from the eye."""
         directions = self._far - eye
+        # where the line of sight meets z = 0; only downward ones count below
         distance = -eye[2] / directions[:, 2].clamp_max(-1e-9)
         hit = eye + distance[:, None] * directions
         on_ground = (hit[:, :2].abs() <= self._ground).all(dim=1)
@@ -403,6 +435,7 @@ class Motion:
             for coordinate in coordinates:
                 for size in NUDGES:
                     nudged = u.clone()
+                    # backwards at the upper border of the box
                     sign = 1.0 if float(u[coordinate]) + size <= 1.0 else -1.0
                     nudged[coordinate] += sign * size
                     new_positions, still_visible = self.project_points(inputs(nudged))
@@ -426,7 +459,11 @@ def _sample_square_edge(half_width: float) -> Tensor:
 
 
 def _sample_sphere(count: int) -> Tensor:
-    """Return (count, 3) directions evenly spread over the sphere (Fibonacci spiral)."""
+    """Return (count, 3) directions evenly spread over the sphere (Fibonacci spiral).
+
+    From one to the next the azimuth turns by the golden angle, pi (3 - sqrt 5). `count`
+    is `N_DIRECTIONS`, or 0 for none.
+    """
     index = torch.arange(count, dtype=torch.float64)
     z = 1.0 - (2.0 * index + 1.0) / N_DIRECTIONS
     azimuth = index * torch.pi * (3.0 - 5.0**0.5)

@@ -131,7 +131,8 @@ class Material:
     def with_values(self, values: Mapping[str, float | None], prefix: str) -> Material:
         """Return the material with some settings over it.
 
-        Their names are `prefix` and the attribute's.
+        Their names are `prefix` and the attribute's, such as ``material.roughness``.
+        Others, and None, change nothing.
         """
         new_values = {name: values.get(prefix + name) for name in vars(self)}
         replaced = {
@@ -279,7 +280,11 @@ def make_pose(linear: npt.ArrayLike, translation: npt.ArrayLike) -> Float64Array
 
 
 def find_footing(points: Float64Array) -> tuple[Float64Array, float]:
-    """Return the point (3,) in the middle below points (N, 3), and their extent."""
+    """Return where points (N, 3) stand, and their extent.
+
+    That is the point (3,) in the middle of their bounding box in x and y and at its
+    lowest z; and the largest side of the box.
+    """
     lower = points.min(axis=0)
     upper = points.max(axis=0)
     return np.array([*(lower[:2] + upper[:2]) / 2.0, lower[2]]), float(
@@ -341,7 +346,7 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     )
     for grid in SIMPLIFICATION_GRIDS:
         cluster_of = _cluster_vertices(mesh, grid)
-        # vertices of a cluster in different parts of the texture stay apart
+        # A new vertex for each cluster, and for each part of the texture in it.
         cluster_and_chart = _encode_rows(np.column_stack([cluster_of, texture_cell]))
         _, representative, new_vertex = np.unique(
             cluster_and_chart, return_index=True, return_inverse=True
@@ -359,7 +364,11 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     cluster_size = np.bincount(cluster_of)
 
     def simplify(full: Mesh) -> Mesh:
-        """Return a mesh with the same vertices elsewhere, simplified in the same way."""
+        """Return a mesh with the same vertices elsewhere, simplified in the same way.
+
+        A new vertex is at the mean of its cluster's vertices, and has the normal and
+        the texture coordinates of one of them.
+        """
         sums = [np.bincount(cluster_of, full.vertices[:, axis]) for axis in range(3)]
         mean = np.stack([total / cluster_size for total in sums], axis=1)
         return Mesh(
@@ -381,6 +390,7 @@ def _cluster_vertices(mesh: Mesh, grid: int) -> IntArray:
     """
     lower = mesh.vertices.min(axis=0)
     extent = max(float((mesh.vertices.max(axis=0) - lower).max()), 1e-12)
+    # along each axis the lowest point is in the middle of the first cell
     scaled = (mesh.vertices - lower) / extent * (grid - 1)
     cells = np.floor(scaled + 0.5).astype(np.int64)
     return np.unique(_encode_rows(cells), return_inverse=True)[1].reshape(-1)
@@ -530,10 +540,10 @@ def describe_size_doubts(
 ) -> tuple[str, ...]:
     """Return a remark where an object's size is unusual for its name, or unknown.
 
-    The last word of the name that `USUAL_SIZES` has counts; without one a size is
-    unusual only from 5 mm down and from 100 m up. A size that is unknown matters if
-    something is in metres, or if the name and the file's extent tell which unit would
-    fit. The user's own size is never doubted.
+    The last word of the object's name that `USUAL_SIZES` has says what is usual;
+    without one a size is unusual only below 5 mm and above 100 m. A size that is
+    unknown matters if something is in metres, or if the name and the file's extent tell
+    which unit would fit. The user's own size is never doubted. Empty, or one remark.
 
     Args:
         asset: the object.
@@ -571,12 +581,14 @@ def describe_size_doubts(
         if is_unknown and needs_metres
         else "",
     ]
+    # the example is the geometric mean of what is usual
     remedy = f"give its longest side in metres, such as `size={(min_size * max_size) ** 0.5:.2g}`"
     if fitting_units:
         remedy += (
             f", or `unit={fitting_units[0]}`, which makes it "
             f"{format_rounded(extent * METRES_PER_UNIT[fitting_units[0]])} m"
         )
+    # the remedy's first letter is replaced by what begins the sentence
     return (
         f"{asset.name}: {'; '.join(filter(None, clauses))}. "
         f"{'If that is wrong, g' if is_unusual else 'G'}{remedy[1:]}",

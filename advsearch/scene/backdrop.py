@@ -160,7 +160,11 @@ class BackdropPhotograph:
 
 
 def _resample_image(image: Float32Array, resolution: tuple[int, int]) -> Tensor:
-    """Average an image (H, W, C) down to (height, width) pixels, or interpolate it."""
+    """Resample an image (H, W, C) to (height, width) pixels.
+
+    Along an axis with more pixels it is averaged down, along one with fewer it is then
+    interpolated.
+    """
     height, width = image.shape[:2]
     averaged = average_area(
         image, min(height, resolution[0]), min(width, resolution[1])
@@ -337,8 +341,8 @@ def compute_photograph_gain(
 ) -> float:
     """Return the factor from radiance to display-linear values of a photograph.
 
-    A level surface with the mean reflectance of what photographs show is as bright as
-    the photograph is on average. 1 where no environment lights the scene.
+    By it a level surface of reflectance `GREY_CARD`, lit by the environment, gets the
+    mean luminance of the photograph. 1 where no environment lights the scene.
     """
     irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
     if not irradiance > 0.0:
@@ -350,6 +354,7 @@ def compute_photograph_gain(
     decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
     means = np.array([np.average(decoded, weights=count) for count in counts])
     mean = max(float(means @ LUMINANCE), 1e-3)
+    # a matt surface has the radiance reflectance * irradiance / pi
     return mean * math.pi / (GREY_CARD * irradiance)
 
 
@@ -362,12 +367,13 @@ def compute_level_irradiance(description: SceneDescription) -> Float64Array:
     if environment is None:
         return np.zeros(len(CHANNELS))
     rows = environment.radiance.shape[0]
-    edges = np.cos(np.arange(rows + 1) * math.pi / rows)
-    # of each row the integral of cosine and solid angle, where it lies above
-    upper = np.maximum(edges[:-1], 0.0)
-    lower = np.maximum(edges[1:], 0.0)
+    edge_cosines = np.cos(np.arange(rows + 1) * math.pi / rows)
+    # Of the angle from straight up at each row's two edges; 0 below the horizon. The
+    # integral of cosine times solid angle over a row is pi (upper^2 - lower^2).
+    upper_cosines = np.maximum(edge_cosines[:-1], 0.0)
+    lower_cosines = np.maximum(edge_cosines[1:], 0.0)
     row_means = environment.radiance.mean(axis=1, dtype=np.float64)
-    weights = math.pi * (upper**2 - lower**2)
+    weights = math.pi * (upper_cosines**2 - lower_cosines**2)
     # no BLAS, whose last bits depend on its threads
     return np.asarray((weights[:, None] * row_means).sum(axis=0))
 
@@ -404,8 +410,9 @@ def measure_plane_color(
 ) -> dict[str, float]:
     """Return the settings of the plane's color, sRGB, measured around the object.
 
-    They follow from the median color of the photograph there and its light; empty if
-    the user stated a color, or none of it is in the photograph.
+    The albedo is the median of the photograph there, divided by what a white plane
+    would show. Empty if the user stated a color, the scene has no plane, or the
+    photograph shows none of it.
 
     Args:
         description: the scene, with the camera of the full photograph.
@@ -418,6 +425,7 @@ def measure_plane_color(
     if not len(levels):
         return {}
     display = levels.astype(np.float32) / np.float32(255.0)
+    # (3,) display-linear values of a plane with an albedo of 1
     light = description.gain * compute_level_irradiance(description) / math.pi
     albedo = np.median(srgb_to_linear(display), axis=0) / light
     color = linear_to_srgb(np.clip(albedo, *ALBEDO_RANGE).astype(np.float32))
@@ -425,7 +433,10 @@ def measure_plane_color(
 
 
 def _sample_ring(description: SceneDescription) -> Float64Array:
-    """Return points (N, 3) of the plane around the object."""
+    """Return random points (N, 3) of the ground plane in a ring around the object.
+
+    Its radii are `CONTACT_RING`. The seed is fixed: every call returns the same points.
+    """
     rng = np.random.default_rng(0)
     angle = rng.uniform(0.0, 2.0 * math.pi, N_CONTACT_POINTS)
     radius = rng.uniform(*CONTACT_RING, N_CONTACT_POINTS)
@@ -439,12 +450,14 @@ def _sample_ring(description: SceneDescription) -> Float64Array:
 def _look_up_levels(
     description: SceneDescription, photograph: BackdropPhotograph, points: Float64Array
 ) -> npt.NDArray[np.uint8]:
-    """Return the levels (M, 3) of a photograph at those of points (N, 3) that it shows.
+    """Return the levels (M, 3) of the pixels of a photograph that show points (N, 3).
 
-    The scene has the camera of the full photograph.
+    The points are in world space; those outside of the photograph are left out, so that
+    M is at most N. The scene has the camera of the full photograph, not of a part.
     """
     height, width = photograph.full_size
     camera = camera_to_world(description, width / height)
+    # in the camera's coordinates: left, up and ahead
     relative = (points - camera[:3, 3]) @ camera[:3, :3]
     positions, is_visible = project_points(
         replace(description, aspect=width / height),
@@ -453,6 +466,7 @@ def _look_up_levels(
         (height, width),
     )
     size = np.array([width, height])
+    # positions are counted from the middle of the image, pixels from its top left
     pixels = np.floor(positions.numpy() + size / 2.0).astype(int)
     is_inside = is_visible.numpy() & ((pixels >= 0) & (pixels < size)).all(axis=1)
     inside: npt.NDArray[np.intp] = pixels[is_inside]
@@ -488,6 +502,8 @@ def make_matrix_camera(
             f"pixels, got {matrix.tolist()}"
         )
     height, width = size
+    # The order of `LINEAR_PARAMETERS`, as fractions of the image. Half a pixel is added
+    # since our (0, 0) is the corner of the first pixel, not its center.
     linear = (
         matrix[0, 0] / width,
         matrix[1, 1] / height,
@@ -541,6 +557,8 @@ def fit_to_photograph(
 def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraModel:
     """Return the camera that sees the used part of a photograph.
 
+    Focal lengths, skew and center are fractions of the image's width or height, so that
+    they grow as the image shrinks; the center moves by the part's top left corner too.
     `model` is the camera of the full photograph. Raises InputError: it is a panorama.
     """
     if model.kind == EQUIRECTANGULAR:
@@ -561,15 +579,22 @@ def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraMod
 
 
 def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> None:
-    """Raise InputError if a film has another shape than the photograph.
+    """Raise InputError if a film has another ratio of sides than the photograph.
 
-    Its sides may be rounded to pixels.
+    Sides that differ by less than a pixel of the film are accepted, as they come from
+    rounding. The message suggests the largest part of the photograph that would fit.
+
+    Args:
+        photograph: its used part counts.
+        resolution: height and width of the film, pixels.
     """
     height, width = photograph.size
     film_height, film_width = resolution
+    # photograph pixels in one pixel of the film
     rounding = max(width / film_width, height / film_height)
     if abs(film_width / film_height * height - width) <= rounding:
         return
+    # the largest part of the film's shape, in the middle of the used part
     scale = min(width / film_width, height / film_height)
     part_width = int(film_width * scale)
     part_height = int(film_height * scale)
@@ -633,6 +658,7 @@ def compute_view_settings(
     mesh_to_camera = _compute_mesh_to_camera(asset, object_to_camera)
     vertices = asset.mesh.vertices.astype(np.float64)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    # of the object, in the camera's coordinates: its z is the depth
     center = mesh_to_camera[:3, :3] @ middle + mesh_to_camera[:3, 3]
     distance = float(center[2])
     if distance <= 0.0:
@@ -660,6 +686,9 @@ def _compute_mesh_to_camera(
 ) -> Float64Array:
     """Return the map (4, 4) from a mesh to camera coordinates, both in object sizes.
 
+    `object_to_camera` is in the unit of the object's file, hence the division by the
+    size of the object in that unit.
+
     Raises InputError as `compute_view_settings`.
     """
     pose = _check_rigid(object_to_camera)
@@ -669,6 +698,7 @@ def _compute_mesh_to_camera(
             "be seen in a measured pose; give `unit`, such as unit=mm"
         )
     mesh_to_file = np.linalg.inv(asset.file_to_mesh)
+    # the scale of a map of uniform scale is the cube root of its determinant
     object_size = float(np.cbrt(np.linalg.det(mesh_to_file[:3, :3])))
     mesh_to_camera: Float64Array = pose @ mesh_to_file
     mesh_to_camera[:3] /= object_size
@@ -678,8 +708,9 @@ def _compute_mesh_to_camera(
 def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     """Return the settings of a camera on an orbit, by world axes (3, 3).
 
-    They are rows in the camera's coordinates. Raises InputError: it looks straight up
-    or down.
+    The rows are the axes x, y and z of the world in the camera's coordinates (x right,
+    y down, z ahead). Angles in degrees. Raises InputError: it looks straight up or
+    down.
     """
     outwards = -world_axes[:, 2]  # from the object to the camera
     elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
@@ -691,6 +722,7 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
         )
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
+    # Roll is the angle of the camera's left against that of a camera without roll.
     upright = np.cross(-outwards, level_left)
     left = -world_axes[:, 0]
     return {
@@ -736,11 +768,17 @@ def _make_world_axes(up: Float64Array) -> Float64Array:
 
 
 def _decompose_rotation(rotation: Float64Array) -> dict[str, float]:
-    """Return the settings of `Rz(yaw) Ry(pitch) Rx(roll)`, degrees."""
+    """Return the settings that make a rotation (3, 3), degrees.
+
+    It is taken apart as `Rz(yaw) Ry(pitch) Rx(roll)`.
+    """
+    # the entry (2, 0) is -sin pitch; (0, 0), (1, 0) and (2, 1), (2, 2) are cosines and
+    # sines of yaw and roll times cos pitch
     pitch = math.asin(min(max(-float(rotation[2, 0]), -1.0), 1.0))
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     roll = math.atan2(rotation[2, 1], rotation[2, 2])
-    if abs(rotation[2, 0]) > 1.0 - 1e-9:  # yaw and roll turn about one axis
+    # At a pitch of 90 degrees yaw and roll turn about one axis: all goes to the yaw.
+    if abs(rotation[2, 0]) > 1.0 - 1e-9:
         yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
         roll = 0.0
     return {

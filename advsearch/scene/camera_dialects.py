@@ -203,7 +203,10 @@ def translate_entries(
 
 
 def _translate_stella(camera: Mapping[str, Any]) -> dict[str, Any]:
-    """Translate a camera of stella_vslam; entries not about the lens are left out."""
+    """Translate a camera of stella_vslam: its names, and the name of its model.
+
+    Entries that are not about the lens are left out; they are as in ORB-SLAM's files.
+    """
     entries = {
         STELLA_NAMES.get(str(name), str(name)): value for name, value in camera.items()
     }
@@ -284,10 +287,20 @@ def _read_numbers(
 def _translate_kitti(
     path: str, camera_name: str, data: Mapping[str, Any], cameras: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Translate a camera of KITTI: a raw one with distortion, or a rectified one
-    without.
+    """Translate a camera of KITTI: a raw one with distortion, or a rectified one.
 
-    Raises FileFormatError if the file has no size of the image.
+    A raw one has K_nn (3, 3), D_nn (5 coefficients) and S_nn (the size of the image).
+    A rectified one has P_rect_nn or Pn, a projection (3, 4) without distortion, and
+    perhaps S_rect_nn. Other entries of KITTI are left out.
+
+    Args:
+        path: the file, for messages.
+        camera_name: "" if none is named.
+        data: all entries of the file.
+        cameras: names of the matrices of its cameras, by the cameras' names.
+
+    Raises:
+        FileFormatError: the file has no size of the image, or numbers are missing.
     """
     matrix_name = select_camera(path, camera_name, cameras)
     entries = {
@@ -321,7 +334,8 @@ def _translate_kitti(
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate the intrinsics of RealSense.
 
-    Models without our equivalent are none where all coefficients are 0.
+    Two models that we do not have count as "none" where all coefficients are 0: there
+    they are the same as a pinhole.
     """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
     kind = re.sub(
@@ -333,6 +347,7 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     is_zero = isinstance(coefficients, list) and not any(coefficients)
     if kind in ("kannala_brandt4", "kannala_brandt"):
         kind = "kannala_brandt"
+        # the model has four; the list may be longer
         entries["coeffs"] = (
             coefficients[:4] if isinstance(coefficients, list) else coefficients
         )
@@ -346,9 +361,10 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of OpenSfM, whose lengths are fractions of the larger side.
 
-    The principal point counts from the middle of the image; here from the center of the
-    first pixel. `focal` is that of both axes unless they have their own. A camera of an
-    unknown kind, or a panorama, keeps only its kind and size.
+    The principal point counts from the middle of the image there, and here from the
+    center of the first pixel, which is (side - 1) / 2 before the middle. `focal` is
+    that of both axes unless they have their own. For a camera of an unknown kind, or a
+    panorama, no lengths are translated.
     """
     stated_type = str(camera["projection_type"])
     entries = {
@@ -392,9 +408,17 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
 def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of Agisoft Metashape (manual, appendix "Camera models").
 
-    The focal lengths are f + b1 along x and f along y, and b2 is the skew. Offsets are
-    from the center of the image, p1 and p2 are swapped against OpenCV, and k4 is the
-    fourth coefficient of a polynomial.
+    The focal lengths are f + b1 along x and f along y, and b2 is the skew, in pixels.
+    cx and cy count from the center of the image, which is (side - 1) / 2 from the
+    center of the first pixel. p1 and p2 are swapped against OpenCV. k4 is the fourth
+    coefficient of the radial polynomial, which only a fisheye of OpenCV has.
+
+    Args:
+        path: the file, for messages.
+        data: its entries; those of numbers are 0 if they are missing.
+
+    Raises:
+        FileFormatError: it has a k4 and is no fisheye, or no size.
     """
     stated_type = str(data.get("projection", "frame"))
     value_by_name = {

@@ -66,6 +66,7 @@ class Entries:
     """
 
     def __init__(self, path: str, values: Mapping[str, Any]) -> None:
+        """Keep the entries by plain names; raises as the class says."""
         self.path = path
         self._keys: TrackedKeys[Any] = TrackedKeys(values, fold=normalize_key)
         for key in self._keys.repeated:
@@ -159,6 +160,7 @@ class Entries:
             value = self._keys.peek(name)
             is_matrix = isinstance(value, (list, Mapping))
             is_coefficient = name in COEFFICIENTS and not is_matrix
+            # an entry such as M2 beside M1, of a stereo pair; k2 is no such entry
             is_of_second_camera = (
                 name.endswith("2")
                 and f"{name[:-1]}1" in self._keys
@@ -184,6 +186,11 @@ class Entries:
 def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> Any:
     """Return the camera of a name out of those of a file, or the only one.
 
+    Args:
+        path: the file, for messages.
+        camera_name: "" if none is named.
+        cameras: at least one, by name.
+
     Raises:
         FileFormatError: there is none of that name, or there are several and none is
             named.
@@ -207,7 +214,10 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
 
 
 def is_neutral(value: object) -> bool:
-    """Return whether a value changes nothing: it is zero, empty or none."""
+    """Return whether a value changes nothing: it is zero, empty or none.
+
+    Of a matrix, a list or a mapping all values have to be.
+    """
     if isinstance(value, Mapping):
         value = value.get("data", list(value.values()))
     return all(

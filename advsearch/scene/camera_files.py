@@ -413,6 +413,15 @@ def _read_focal_lengths(
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
+    A length wins. fy is fx where the file has neither its length nor its angle.
+
+    Args:
+        path: the file, for messages.
+        data: all entries of the file, which have the angles, radians.
+        entries: those of the camera, which have the lengths.
+        width: of the image in pixels.
+        height: likewise.
+
     Raises:
         FileFormatError: the two contradict each other.
     """
@@ -430,10 +439,19 @@ def _read_focal_lengths(
 def _select_lens(
     path: str, camera_name: str, frames: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Return the entries about the lens of a frame, or those that all frames share."""
+    """Return the entries about the lens of a frame, or those that all frames share.
+
+    Args:
+        path: the file, for messages.
+        camera_name: index of the frame, as text; "" if none is named.
+        frames: of the file.
+
+    Raises:
+        FileFormatError: there is no such frame, or none is named and lenses differ.
+    """
     lenses = [
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
-    ] or [{}]
+    ] or [{}]  # without frames, all is said once for the file
     first_lens: dict[str, Any] = lenses[0]
     if not camera_name and all(lens == first_lens for lens in lenses):
         return first_lens
@@ -453,8 +471,17 @@ def _compute_focal_length(path: str, angle: object, side: float) -> float:
 def _read_kalibr(
     spec: str, entries: Entries, unread: Sequence[str] = ()
 ) -> CameraModel:
-    """Return the model of a camera of Kalibr; `unread` are other entries of its
-    file.
+    """Return the model of a camera of Kalibr.
+
+    Principal points count from the center of the first pixel there, hence the half.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        entries: those of the camera.
+        unread: further entries of the file that are to be noted.
+
+    Raises:
+        FileFormatError: it is no pinhole, or lacks numbers.
     """
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")
@@ -524,7 +551,11 @@ def _read_opencv(spec: str, entries: Entries) -> CameraModel:
 
 
 def _find_opencv_kind(path: str, entries: Entries) -> str:
-    """Return the kind of model that a camera of OpenCV or ROS states."""
+    """Return the kind of model that a camera of OpenCV or ROS states.
+
+    Without an entry that states it, it is Brown's and Conrady's. Raises
+    FileFormatError: two entries contradict each other, or the model is not one of ours.
+    """
     keys = ("distortionmodel", "cameramodel", "modeltype")
     models = [entries.get(key) for key in keys]
     kinds = {_find_kind(path, model) for model in models if model is not None}
@@ -540,8 +571,11 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
 def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
     """Return the camera matrix, nine numbers row by row.
 
-    It is made of fx, fy, cx and cy if only these are there; one that is written column
-    by column is transposed.
+    It is made of fx, fy, cx and cy if only these are there. One that is written column
+    by column, with cx and cy in its last row, is transposed.
+
+    Raises:
+        FileFormatError: it is missing, all zeros, or no camera matrix.
     """
     if entries.get(*CAMERA_MATRIX_KEYS) is None and entries.get("fx") is not None:
         fx, fy, cx, cy = (entries.get_number(name) for name in ("fx", "fy", "cx", "cy"))
@@ -556,6 +590,7 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
             "as ROS says of one that is not "
             "calibrated; calibrate it, and give the file that this writes"
         )
+    # skew, cx and cy are 0, and the last row is not
     is_by_columns = not any(matrix[index] for index in (1, 2, 5)) and any(matrix[6:8])
     if is_by_columns:  # as Open3D and ARKit write it
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
@@ -601,7 +636,8 @@ def _read_coefficients(entries: Entries, names: Sequence[str]) -> dict[str, floa
 def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
     """Return the names of matrices of rectified images that differ from the camera's.
 
-    Unrectified, the rotation is 1 and the projection is the camera matrix.
+    Such a matrix changes nothing if its rotation is 1, or if its projection is the
+    camera matrix beside a column of zeros. `matrix` is the camera's, row by row.
     """
     fx, skew, cx, _, fy, cy = matrix[:6]
     differing_names = []
@@ -624,7 +660,13 @@ def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
 def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     """Check that a region of interest of ROS is the full image.
 
-    Returns the entries of the region that were not read.
+    Zeros mean the full image too. `size` is its height and width in pixels.
+
+    Returns:
+        The entries of the region that were not read.
+
+    Raises:
+        FileFormatError: the region is a part of the image.
     """
     value = entries.get("roi")
     if not isinstance(value, Mapping):
@@ -632,7 +674,7 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     roi = Entries(entries.path, {str(key): value[key] for key in value})
     numbers = _read_coefficients(roi, ("x_offset", "y_offset", "height", "width"))
     x, y, height, width = numbers.values()
-    roi.get("dorectify")
+    roi.get("dorectify")  # counts as read: it changes nothing in a full image
     if (x, y) != (0.0, 0.0) or (height, width) not in ((0.0, 0.0), size):
         raise FileFormatError(
             f"{entries.path}: expected a camera_info of whole pictures, got one of a "

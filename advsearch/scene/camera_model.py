@@ -99,7 +99,7 @@ class CameraModel:
     # ---- Projection and rays ----
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Project points (N, 3) to the image.
+        """Project points (N, 3), to the right, down and ahead, to the image.
 
         Returns:
             Coordinates (N, 2) float64 in image widths and heights, which may be outside
@@ -210,7 +210,8 @@ class CameraModel:
     def _invert_radial(self, target: Tensor, max_value: float) -> tuple[Tensor, Tensor]:
         """Solve radial(x) = target for x within [0, max_value], where radial grows.
 
-        Newton's method, with bisection if a step leaves the bracket.
+        By Newton's method. Each solution has a bracket, which every step narrows; a
+        step that would leave it is replaced by the bracket's middle.
 
         Args:
             target: (N,) distorted radii.
@@ -229,6 +230,7 @@ class CameraModel:
         upper = torch.full_like(target, bound)
         radius = torch.minimum(target, upper)
         for _ in range(MAX_STEPS):
+            # `radial` as a function with one component for each point
             values, (slope,) = _evaluate_with_jacobian(
                 lambda radii: self._distort_radius(radii)[..., None], radius
             )
@@ -242,6 +244,7 @@ class CameraModel:
             is_within = (newton_radius > lower) & (newton_radius < upper)
             radius = torch.where(is_within, newton_radius, (lower + upper) / 2.0)
         residual = (self._distort_radius(radius) - target).abs()
+        # wider than in the loop, where a narrow bracket counts as solved too
         return radius, residual <= 1e3 * TOLERANCE * (1.0 + target)
 
     def _invert_distortion(
@@ -265,6 +268,7 @@ class CameraModel:
             values, jacobian_rows = _evaluate_with_jacobian(self._distort, undistorted)
             residual = values - distorted
             step, determinant = _solve_two_by_two(jacobian_rows, residual)
+            # the determinant of the distortion's derivative is 0 where the lens folds
             is_inside = (determinant > 0.0) & (undistorted.norm(dim=-1) < max_radius)
             converged = is_inside & (
                 residual.norm(dim=-1) <= TOLERANCE * (1.0 + distorted.norm(dim=-1))
@@ -272,6 +276,7 @@ class CameraModel:
             if bool(converged.all()):
                 break
             updated = undistorted - step
+            # scaled back to the circle if it is outside
             radius = updated.norm(dim=-1, keepdim=True)
             updated = torch.where(
                 torch.isfinite(radius),
@@ -298,7 +303,9 @@ class CameraModel:
         It is infinite if it never does. Beyond it two directions have one image point,
         so that no image tells them apart.
         """
-        # The numerator of the derivative of radial(r), as a polynomial in r^2.
+        # radial(r) = r n(s) / d(s) with s = r^2. The numerator of its derivative, as a
+        # polynomial in s, is (n + 2 s n') d - 2 s n d'. It folds at the smallest root
+        # of that, or at a pole.
         numerator, denominator = self._polynomials
         double_square = Polynomial([0.0, 2.0])  # 2 r^2
         slope = (
@@ -335,12 +342,16 @@ class CameraModel:
         return radius * self._compute_radial_scale(radius * radius)
 
     def _distort(self, undistorted: Tensor) -> Tensor:
-        """Return distorted points of undistorted ones (N, 2)."""
+        """Return distorted points (N, 2) of undistorted ones, in focal lengths."""
         scale = self._compute_radial_scale(undistorted.square().sum(dim=-1))
         return undistorted * scale[..., None] + self._compute_decentering(undistorted)
 
     def _compute_decentering(self, undistorted: Tensor) -> Tensor:
-        """Return the tangential and thin prism distortion of points (N, 2)."""
+        """Return the shifts (N, 2) of undistorted points that are not radial.
+
+        They are the tangential distortion (p1 and p2: the lens stands off the axis) and
+        that of a thin prism (s1 to s4), in focal lengths; see the formulas above.
+        """
         (p1, p2, s1, s2, s3, s4) = self.numbers[NUMBER_NAMES.index("p1") :]
         (x, y) = undistorted.unbind(dim=-1)
         square = x * x + y * y
@@ -358,11 +369,12 @@ class CameraModel:
     def visible_tangents(self) -> tuple[float, float]:
         """Half the sides, as tangents, of a rectangle around the axis inside the image.
 
-        It is the largest fraction, in steps of 2 %, of the rectangle of
-        `_compute_edge_tangents` whose border is completely visible; 2 % of it if none
-        is.
+        It is the rectangle of `_compute_edge_tangents`, shrunk in steps of 2 % until
+        all of its border is visible and in the image; if it never is, 2 % of it. A lens
+        bends the border, so that the corners may be outside at first.
         """
         edges = self._compute_edge_tangents()
+        # 17 points on each side of the rectangle
         grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
         ones = torch.ones_like(grid)
         border = torch.stack(
@@ -388,12 +400,14 @@ class CameraModel:
     def _compute_edge_tangents(self) -> list[float]:
         """Return the tangents at which the image ends along x and along y.
 
-        Along the row and the column through the axis, the nearer of both edges counts,
-        at most `MAX_TANGENT`; an edge beyond the view counts as where the view ends.
+        A tangent is that of the angle to the axis. It is found on the row and the
+        column of pixels through the axis: of both edges the nearer one counts, at most
+        `MAX_TANGENT`. Where the view ends before the edge, that is the edge.
         """
         center, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
         edge_tangents = []
         for axis in (0, 1):
+            # 512 points from the axis to one edge, then to the other
             line_points = center.repeat(512, 1)
             border_tangents = []
             for border in (0.0, 1.0):
@@ -504,7 +518,7 @@ def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
 
 
 def _solve_two_by_two(rows: Sequence[Tensor], right: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve linear systems of two equations by Cramer's rule.
+    """Solve N linear systems of two equations by Cramer's rule.
 
     Args:
         rows: the two rows (N, 2) of the matrices.
@@ -539,7 +553,11 @@ def _project_to_panorama(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
 
 
 def _compute_panorama_directions(u: Tensor, v: Tensor) -> Tensor:
-    """Return unit vectors (N, 3) at image coordinates of an equirectangular image."""
+    """Return unit vectors (N, 3) at image coordinates of an equirectangular image.
+
+    Coordinates (N,) are fractions of its width and height; the middle is straight
+    ahead. Vectors are to the right, down and ahead.
+    """
     longitude = (u - 0.5) * (2.0 * torch.pi)
     latitude = (v - 0.5) * torch.pi
     level = latitude.cos()
@@ -561,6 +579,9 @@ def _evaluate_with_jacobian(
 ) -> tuple[Tensor, list[Tensor]]:
     """Evaluate a function that maps each of N points separately, and differentiate it.
 
+    As no value depends on another point, the derivative of the sum over all points has
+    the derivative of each.
+
     Args:
         function: from points to values (N, k).
         at: the points, (N, ...).
@@ -579,9 +600,10 @@ def _evaluate_with_jacobian(
 
 
 def _clip_margin(margin: Tensor, converged: Tensor) -> Tensor:
-    """Return margins clipped to 1, below zero if an inversion has not converged.
+    """Return margins (N,) in [-1, 1], below zero if an inversion has not converged.
 
-    A margin that is negative already stays, so that it changes its sign continuously.
+    Positive is inside the view. A margin that is negative already stays, so that it
+    changes its sign continuously; another without convergence becomes a tiny negative.
     """
     return torch.where(
         converged | (margin <= 0.0), margin, torch.full_like(margin, -1e-6)

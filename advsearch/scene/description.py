@@ -322,7 +322,18 @@ class SceneDescription:
         return replace(scene, camera=camera)
 
     def _with_lens(self, camera: str) -> SceneDescription:
-        """Return the scene with the lens of a camera file or a bundled camera model."""
+        """Return the scene with the lens of a camera file or a bundled camera model.
+
+        A file with several cameras makes it a rig, whose first camera is the scene's.
+
+        Args:
+            camera: path of the file, or name of the model.
+
+        Raises:
+            FileFormatError: the file cannot be used.
+            InputError: a field of view was requested, and the lens has its own.
+            UnknownNameError: there is no such model.
+        """
         if not is_path(camera) and camera not in make_bundled_models():
             known = (ORBIT_CAMERA, *self.cameras, *make_bundled_models(), *PRESETS)
             raise UnknownNameError(
@@ -348,7 +359,11 @@ class SceneDescription:
         return replace(scene, camera_model=model)
 
     def _with_mounted_camera(self, name: str) -> SceneDescription:
-        """Return the scene as a mounted camera sees it, by its name.
+        """Return the scene as a mounted camera sees it, by its name in `PRESETS`.
+
+        Its height counts from the floor: that of the place, or the floor that a table
+        with a small object stands on. Settings that were requested stay. The camera
+        stands at the preset's distance, or farther if the object would not fit.
 
         Raises InputError: the object's size in metres is not known.
         """
@@ -404,7 +419,8 @@ class SceneDescription:
     def meshes(self) -> Mapping[str, MeshPart]:
         """Every mesh by name, as the settings have it.
 
-        The one under test is `OBJECT`.
+        The one under test is `OBJECT`. The glass of lamps has the pose of what carries
+        it.
         """
         around = {
             name: geometry.apply_settings(part, self.values)
@@ -445,7 +461,10 @@ class SceneDescription:
         ) or self._has_plugin("normalmap", "bumpmap")
 
     def _has_plugin(self, *kinds: str) -> bool:
-        """Return whether a Mitsuba plugin of one of these kinds is in the scene."""
+        """Return whether a Mitsuba plugin of one of these kinds is in the scene.
+
+        Plugins within others count, of surfaces in Mitsuba's words too.
+        """
         surfaces = [
             mesh.surface for mesh in self.meshes.values() if mesh.surface is not None
         ]
@@ -470,7 +489,11 @@ class SceneDescription:
         }
 
     def get_positioned_part(self, part: ScenePart) -> Any:
-        """Return one of the parts as the settings and the camera have it."""
+        """Return one of the parts as the settings and the camera have it.
+
+        A mesh has the pose and the material of its settings. A beam stands where its
+        carrier, a mesh or the camera's car, takes it. Other parts are as they are.
+        """
         if not isinstance(part, BeamLamp):
             return self.meshes.get(part.name, part)
         if part.carrier == CAMERA:
@@ -619,8 +642,10 @@ class SceneDescription:
 
     @property
     def requested_values(self) -> dict[str, float | str]:
-        """The settings that were requested, as users write them: a choice by its
-        name.
+        """The settings that were requested and have a value, by name.
+
+        Values are as users write them: of a choice the name of the option, not its
+        index.
         """
         requested: dict[str, float | str] = {}
         for name in self.requested & self.values.keys():
@@ -681,7 +706,9 @@ class SceneDescription:
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values.
 
-        The metered exposure times `camera.exposure`.
+        2 to the power of `camera.exposure`, times the exposure: by `camera.ev`, where
+        it is set; else that of the photograph that the scene is rendered into; else the
+        metered one, or 1 where exposure is not metered.
         """
         stops = self.values.get("camera.ev")
         unit = None if self.environment is None else self.environment.candelas

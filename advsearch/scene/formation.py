@@ -83,6 +83,7 @@ class ImageFormation:
     quick: bool = False
 
     def __post_init__(self) -> None:
+        """Check the fields; raises InputError for one that is not possible."""
         if self.denoiser not in DENOISERS:
             raise InputError(
                 f"denoise: expected one of {', '.join(DENOISERS)}, got "
@@ -99,8 +100,9 @@ class ImageFormation:
             )
 
     def display(self, radiance: Tensor) -> Tensor:
-        """Map linear radiance (..., 3) to display-referred sRGB in [0, 1].
+        """Map linear radiance (..., 3) to display-referred values in [0, 1].
 
+        By `gain`, and the curve of `transfer`; "linear" has no curve and does not clip.
         It is differentiable, and flat where it is clipped.
         """
         if self.transfer == "linear":
@@ -132,6 +134,11 @@ class _SrgbDisplay(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor, None]:
+        """Return the derivative with respect to the radiance; none for the gain.
+
+        The curve is 12.92 x in the dark and 1.055 x^(1 / 2.4) - 0.055 above; where it
+        is clipped the derivative is 0.
+        """
         (radiance,) = ctx.saved_tensors
         if torch.is_grad_enabled():  # for a second derivative
             image = linear_to_srgb(radiance * ctx.gain)
@@ -155,6 +162,7 @@ def round_sample_count(sampler: str, samples: float) -> int:
     ones in products of two near numbers, orthogonal arrays in squares of primes, the
     low-discrepancy sequence in powers of four.
     """
+    # 1e-9: rounding must not add a sample
     count = max(1, math.ceil(samples - 1e-9))
     root = math.isqrt(count - 1) + 1  # rounded up
     if sampler == "stratified":
@@ -231,11 +239,12 @@ METERED_DEFAULTS = ("camera.", "pose.", "environment.")
 
 @lru_cache(maxsize=8)
 def compute_metered_gain(scene: SceneDescription) -> float:
-    """Return the factor on radiance that gives the metered white card
-    `CARD_DISPLAY_VALUE`.
+    """Return the factor on radiance by which a white card is `CARD_DISPLAY_VALUE`.
 
-    Where the camera sees nothing of the object, the card lies on the ground; where no
-    light arrives the factor is 1.
+    The card, of `CARD_REFLECTANCE`, is laid against all of the object that the camera
+    sees, with camera, pose and environment as they are by default. Where the camera
+    sees nothing of the object, the card lies on the ground; where no light arrives the
+    factor is 1.
     """
     default = {
         name: value
@@ -267,6 +276,7 @@ def compute_irradiance(scene: SceneDescription, normals: Float64Array) -> Float6
     """
     vertices = scene.base_vertices
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    # of each direction: radiance times solid angle, which the cosine makes irradiance
     directions, power = _compute_distant_light(scene, center)
     cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
     # no BLAS, whose last bits depend on its threads
@@ -290,16 +300,26 @@ def compute_irradiance(scene: SceneDescription, normals: Float64Array) -> Float6
 def _compute_distant_light(
     scene: SceneDescription, center: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Return directions (N, 3) to the light of environment and ground.
+    """Return the light that arrives at a point from environment and ground.
 
-    The second value (N, 3) is its radiance times the solid angle. Directions that hit
-    the ground have the light that it reflects.
+    The ground is a matt square at height 0, lit by the upper half of the environment:
+    from directions that hit it comes what it reflects, instead of the environment.
+
+    Args:
+        scene: the scene.
+        center: (3,) where the light arrives.
+
+    Returns:
+        Unit directions (N, 3) to the light, and its radiance times solid angle (N, 3).
     """
     directions, solid_angle, power = compute_environment_light(scene)
     is_up = directions[:, 2] > 0.0
+    # irradiance of level ground; the cosine is the direction's z
     on_ground = (power[is_up] * directions[is_up, 2:]).sum(axis=0)
     albedo = srgb_to_linear(np.array(scene.ground_color, np.float32))
     reflected = albedo * on_ground / math.pi
+    # Where a direction meets the height 0, from the middle of the ground. For
+    # directions that point up it means nothing, and they are left out below.
     distance = center[2] / np.maximum(-directions[:, 2:], 1e-9)
     offset = np.abs(center[:2] + directions[:, :2] * distance)
     # otherwise the map has what comes from below
@@ -328,7 +348,13 @@ def _compute_emitted_light(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the light that arrives at a point (3,) from the faces of a mesh.
 
-    A face is taken for a disk of its mean radiance.
+    A face is taken for a disk of its mean radiance and its area, which shines on its
+    front alone. The form factor of a disk stays below 1 however near the point is.
+
+    Args:
+        part: the mesh, in its base pose.
+        emission: (H, W, 3) radiance map of its texture coordinates.
+        point: (3,) in world space.
 
     Returns:
         Unit directions (F, 3) to the faces, and the irradiance (F, 3) of a surface that
@@ -343,10 +369,12 @@ def _compute_emitted_light(
     height, width = emission.shape[:2]
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
-    mean = look_up_texture(emission, column, row).mean(axis=1)
+    # (F, 3) mean radiance at ten points of each face
+    mean_radiance = look_up_texture(emission, column, row).mean(axis=1)
     projected_area = np.maximum(-(area * direction).sum(axis=1), 0.0)
-    disk = squared_distance + np.linalg.norm(area, axis=1) / math.pi
-    return direction, mean * (projected_area / disk)[:, None]
+    # irradiance = radiance * area / (distance^2 + area / pi)
+    disk_divisor = squared_distance + np.linalg.norm(area, axis=1) / math.pi
+    return direction, mean_radiance * (projected_area / disk_divisor)[:, None]
 
 
 def _choose_metering_shape(frame: Frame) -> tuple[float, tuple[int, int]]:
@@ -360,17 +388,26 @@ def _choose_metering_shape(frame: Frame) -> tuple[float, tuple[int, int]]:
 def _find_nearest(
     nearness: Float64Array, row: IntArray, column: IntArray, shape: tuple[int, int]
 ) -> IntArray:
-    """Return the index of the nearest sample in each pixel that has one."""
+    """Return the index of the nearest sample in each pixel that has one.
+
+    Args:
+        nearness: (S,) of each sample, larger for nearer ones.
+        row, column: (S,) the pixel of each sample.
+        shape: height and width of the image.
+    """
     order = np.argsort(nearness, kind="stable")
     front = np.full(shape, -1)
-    front[row[order], column[order]] = order  # the nearest comes last
+    # of several samples in a pixel, the one written last stays: the nearest
+    front[row[order], column[order]] = order
     return np.asarray(front[front >= 0])
 
 
 def compute_visible_normals(scene: SceneDescription) -> Float64Array:
-    """Return the unit normals (N, 3) of the object in the pixels of a small image.
+    """Return the object's unit normals (N, 3) in the pixels of a small image.
 
-    They point towards the camera.
+    N is the number of pixels that show the object, each by its nearest face; other
+    things do not hide it. Normals are in world space, turned to point towards the
+    camera. The image has `METERING_SIZE` pixels along its longer side.
     """
     camera = camera_to_world(scene)
     points = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
@@ -382,7 +419,7 @@ def compute_visible_normals(scene: SceneDescription) -> Float64Array:
     face, row, column, weights = rasterize_triangles(
         (tangents - (frame.left, frame.low)) / pixel - 0.5, shape
     )
-    # 1 / depth is linear in the image
+    # 1 / depth, unlike depth, may be interpolated linearly over the image
     nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)
     visible = _find_nearest(nearness, row, column, shape)
 
@@ -415,7 +452,8 @@ def _compute_unrotated_light(
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return an environment's light without its rotation; z is up.
 
-    The results are those of `compute_environment_light`.
+    The map is divided into blocks of texels, and the light of each block is summed up.
+    The results are those of `compute_environment_light`, one for each block.
     """
     if environment is None:
         return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
@@ -425,10 +463,11 @@ def _compute_unrotated_light(
     # rows 0 and -1 are the poles
     polar = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0.0, 1.0) * math.pi
     solid_angle = -np.diff(np.cos(polar)) * (2.0 * math.pi / width)
+    # a fourth channel of ones sums up the solid angles
     ones = np.ones((height, width, 1))
-    fine = np.concatenate([environment.radiance, ones], axis=2)
-    fine = fine * solid_angle[:, None, None]
-    row_sums = np.add.reduceat(fine, rows, axis=0)
+    weighted_texels = np.concatenate([environment.radiance, ones], axis=2)
+    weighted_texels = weighted_texels * solid_angle[:, None, None]
+    row_sums = np.add.reduceat(weighted_texels, rows, axis=0)
     sums = np.add.reduceat(row_sums, columns, axis=1).reshape(-1, 4)
 
     directions = _compute_block_directions(rows, columns, (height, width))
@@ -443,11 +482,12 @@ def _compute_block_directions(
     Args:
         rows: the first row of each block.
         columns: the first column of each block.
-        shape: rows and columns of the map.
+        shape: rows and columns of the map, whose first and last row are the poles.
     """
     height, width = shape
     row_ends = np.append(rows[1:], height)
     column_ends = np.append(columns[1:], width)
+    # middle row (first + last) / 2 and middle column, as angles
     theta = (rows + row_ends - 1)[:, None] * (0.5 * math.pi / (height - 1))
     azimuth = 0.5 * math.pi - (columns + column_ends) * (math.pi / width)
     z = np.broadcast_to(np.cos(theta), (len(rows), len(columns)))
@@ -502,6 +542,10 @@ def divide_exposure(
 ) -> tuple[Tensor, Tensor, float]:
     """Divide an exposure into moments.
 
+    The exposure lasts from the first row's opening to the last row's closing, shutter +
+    rolling seconds, and is cut into moments of equal length. A row takes of each moment
+    the fraction that overlaps with its own exposure.
+
     Args:
         shutter: seconds for which each row is exposed, at least 0.
         rolling: seconds within which rows are read, from the bottom if below 0.
@@ -518,6 +562,7 @@ def divide_exposure(
     rolling = abs(rolling)
     duration = (shutter + rolling) / count
     starts = torch.arange(count, dtype=torch.float64) * duration
+    # (H,) when each row opens
     opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height
     if shutter < duration:  # a row lies within one moment
         nearest = ((opens + shutter / 2.0) / duration).long().clamp_max(count - 1)
@@ -528,6 +573,7 @@ def divide_exposure(
     fractions = fractions / fractions.sum(dim=0)
     if is_from_bottom:
         fractions = fractions.flip(1)
+    # middle of each moment, from the middle of the exposure
     offsets = starts + duration / 2.0 - (shutter + rolling) / 2.0
     samples = min(1.0, duration / shutter if shutter else 1.0)
     return offsets, fractions.float(), samples
@@ -597,7 +643,7 @@ class Surfaces:
 
         Args:
             aovs: names from `AOVS`.
-            mask: the shape whose mask is a layer.
+            mask: the shape whose mask is the layer "mask".
         """
         channels: dict[str, Tensor] = {}
         for name in aovs:

@@ -80,9 +80,11 @@ class Frame:
             shift: of the image to the right in its widths and downwards in its heights:
                 what it shows moves the other way.
         """
+        # of the larger side; the other one is smaller by the aspect
         half_tangent = math.tan(math.radians(fov) / 2.0)
         half_width = half_tangent * min(1.0, aspect)
         half_height = half_tangent * min(1.0, 1.0 / aspect)
+        # shifts are fractions of the full width and height, and heights count upwards
         right_shift = 2.0 * half_width * shift[0]
         down_shift = 2.0 * half_height * shift[1]
         return Frame(
@@ -104,14 +106,21 @@ class Frame:
 def _compute_edge_tangents(
     description: SceneDescription, fov: Tensor, aspect: float
 ) -> Tensor:
-    """Return the tangents (2,) of the angles from the middle of an image to its
-    edges.
+    """Return the tangents (2,) of the angles from the middle of an image to its edges.
+
+    The first is to the side, the second to the top.
+
+    Args:
+        description: the scene; a lens of the user's wins over `fov`.
+        fov: () field of view along the larger side of the image, degrees.
+        aspect: width over height.
     """
     model = description.camera_model
     if model is not None and model.name:  # of what it shows, a rectangle
         return torch.tensor(
             model.visible_tangents, dtype=torch.float64, device=fov.device
         )
+    # half-width and half-height, as fractions of half the larger side
     shape = torch.tensor(
         [min(1.0, aspect), min(1.0, 1.0 / aspect)],
         dtype=torch.float64,
@@ -123,11 +132,13 @@ def _compute_edge_tangents(
 def compute_framing_distance(
     description: SceneDescription, fov: Tensor, aspect: float
 ) -> Tensor:
-    """Return the distance () of the camera to the middle of a scene's object; see
-    above.
+    """Return the distance () of the camera to the middle of a scene's object.
 
-    In object sizes, float64; differentiable in the field of view. With a lens of the
-    user's, the field of view does not count.
+    It is the smallest at which the object fills the image by no more than `FRAME_FILL`
+    from the default direction, is in the image from every azimuth, and at which the
+    camera stays outside of the sphere around it; see above. In object sizes, float64;
+    differentiable in the field of view. With a lens of the user's, the field of view
+    does not count.
 
     Args:
         description: the scene.
@@ -145,6 +156,8 @@ def compute_framing_distance(
     axes = torch.from_numpy(compute_camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
     (half_width, half_height) = edge_tangents * FRAME_FILL
+    # A vertex is in the image from the distance at which its tangent, which is left /
+    # (distance - outwards), is no more than the edge's.
     from_default_view = (
         outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
     ).max()
@@ -195,9 +208,11 @@ def _compute_framing_distance_all_around(
 ) -> Tensor:
     """Return the distance at which every vertex is in the image from every azimuth.
 
-    Seen from all around, a vertex runs through a circle of radius rho at height z: what
-    it needs is a sine of the azimuth plus a constant for each edge of the image, whose
-    largest value is known in closed form.
+    Seen from all around, a vertex runs through a circle of radius rho at height z. For
+    each edge of the image, the distance that it needs is a constant plus a sine of the
+    azimuth: `A sin + B cos` is at most `sqrt(A^2 + B^2)`, so that the largest distance
+    is known in closed form. The result is the largest over all vertices and edges, in
+    the unit of the offsets.
 
     Args:
         offsets: (V, 3) of the vertices from the middle of the object.
@@ -210,7 +225,9 @@ def _compute_framing_distance_all_around(
     sine = math.sin(math.radians(elevation))
     inverse_width = 1.0 / tangents[0]
     inverse_height = 1.0 / tangents[1]
+    # outwards = rho cosine cos(a) + z sine, left = rho sin(a)
     for_sides = rho * torch.sqrt(inverse_width**2 + cosine**2) + z * sine
+    # up = z cosine - rho sine cos(a), and its negative for the bottom edge
     for_top = rho * (cosine - sine * inverse_height).abs() + z * (
         sine + cosine * inverse_height
     )
@@ -221,7 +238,11 @@ def _compute_framing_distance_all_around(
 
 
 def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
-    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix."""
+    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix.
+
+    That is first a turn about x by the roll, then about y, then about z.
+    """
+    # cosine and sine of each
     (cz, sz), (cy, sy), (cx, sx) = (
         (math.cos(math.radians(a)), math.sin(math.radians(a)))
         for a in (yaw, pitch, roll)
@@ -295,21 +316,28 @@ def compute_base_vertices(part: MeshPart) -> Float64Array:
 def _compute_pose(
     positions: Float64Array, floor: float, parameters: Mapping[str, float]
 ) -> Float64Array:
-    """Return the pose (4, 4) by parameters of `settings.POSE`.
+    """Return the pose (4, 4) that parameters of `settings.POSE` give to vertices.
 
-    Scale and rotate positions (V, 3) about the middle of their bounding box, put the
-    lowest at `floor`, and shift. The middle stays above the same point before the
-    shift.
+    It scales and rotates about the middle of their bounding box, puts the lowest at the
+    height `floor`, and then shifts by x, y and z. Without the shift the middle stays
+    above the same point of the ground.
+
+    Args:
+        positions: (V, 3) of the vertices.
+        floor: height of what they stand on.
+        parameters: by name; angles in degrees.
     """
     center = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
     linear = parameters["scale"] * make_rotation(
         parameters["yaw"], parameters["pitch"], parameters["roll"]
     )
     lowest = float(((positions - center) @ linear.T)[:, 2].min())
+    # `- linear @ center` moves the middle to the origin
     translation = (
         np.array([parameters["x"], parameters["y"], floor + parameters["z"] - lowest])
         - linear @ center
     )
+    # back above the same point; the height follows from the floor instead
     translation[:2] += center[:2]
     return make_pose(linear, translation)
 
@@ -348,10 +376,12 @@ def camera_to_world(
     height = description.values.get("camera.height")
     if height is not None:
         center_height = float(compute_center(description)[2])
+        # from the middle of the object at this distance to the height
         sine = (height / description.metres - center_height) / distance
         sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
         elevation = math.degrees(math.asin(sine))
     azimuth = description.azimuth_zero + get_number("camera.azimuth")
+    # left, up, and from the object to the camera, which looks the other way
     axes = compute_camera_axes(azimuth, elevation, get_number("camera.roll"))
     return make_pose(
         np.stack([axes[0], axes[1], -axes[2]], axis=1),
@@ -394,6 +424,7 @@ def project_points(
         .double()
         .reshape(())
     )
+    # in pixels; the field of view is that of the larger side
     focal = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0)
     depth = points[:, 2]
     positions = focal * points[:, :2] / depth.clamp_min(MIN_DEPTH)[:, None]
@@ -404,13 +435,16 @@ def project_points(
 
 
 def compute_carried_pose(carrier: Tensor, pose_on_carrier: Tensor) -> Tensor:
-    """Return the rigid pose (4, 4) of what is fixed to a carrier.
+    """Return the pose (4, 4) of what is fixed to a carrier, without a scale.
+
+    Its position is scaled with the carrier, its axes are only turned.
 
     Args:
         carrier: (4, 4) pose of the carrier, which may be scaled: what it carries keeps
             its size.
         pose_on_carrier: (4, 4) pose in the carrier's coordinates.
     """
+    # the scale of a uniformly scaled rotation is the cube root of its determinant
     scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
     return make_affine(
         carrier[:3, :3] / scale @ pose_on_carrier[:3, :3],
@@ -421,7 +455,8 @@ def compute_carried_pose(carrier: Tensor, pose_on_carrier: Tensor) -> Tensor:
 def compute_car_pose(camera: Tensor) -> Tensor:
     """Return the pose (4, 4) of a car that a camera (4, 4) looks ahead from.
 
-    It is level, with its +x ahead, on the ground below the camera; differentiable.
+    It is level, with its +x ahead and +z up, at the height 0 below the camera;
+    differentiable. A camera looks along its own +z, the third column of its pose.
     """
     forward = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
     zero = torch.zeros_like(forward[0])
@@ -436,11 +471,14 @@ def compute_car_pose(camera: Tensor) -> Tensor:
 def compute_real_harmonics(height: int, width: int) -> Tensor:
     """Return the nine real spherical harmonics of degrees 0 to 2: (height, width, 9).
 
-    Over a map of equal angles. Each has root mean square 1 over the sphere (Ramamoorthi
-    and Hanrahan 2001, section 3).
+    They are evaluated at the texel centers of an equirectangular map: row 0 is around
+    +z, and columns go round from +x to +y. Each has root mean square 1 over the sphere,
+    which is sqrt(4 pi) times the factors of Ramamoorthi and Hanrahan 2001, section 3.
+    The last axis has the degrees 0 (one), 1 (y, z, x) and 2 (five).
     """
     theta = (torch.arange(height) + 0.5) * math.pi / height
     phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
+    # (height, width) unit vectors: theta is the angle from +z
     x = theta.sin()[:, None] * phi.cos()[None]
     y = theta.sin()[:, None] * phi.sin()[None]
     z = theta.cos()[:, None].expand(height, width)
@@ -488,6 +526,7 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
     angle = torch.sqrt(
         torch.where(is_small, torch.ones_like(squared_angle), squared_angle)
     )
+    # sin a / a and (1 - cos a) / a^2, by their first two terms where a is small
     sine_factor = torch.where(
         is_small, 1.0 - squared_angle / 6.0, torch.sin(angle) / angle
     )
@@ -496,6 +535,7 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
     )
     x, y, z = vector
     zero = torch.zeros_like(x)
+    # the matrix of the cross product with the vector
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     return (
         torch.eye(3).to(degrees) + sine_factor * cross + cosine_factor * (cross @ cross)
@@ -528,6 +568,7 @@ def make_hidden_pose(camera: Tensor) -> Tensor:
 
 def compute_footprint(points: Float64Array) -> Footprint:
     """Return the convex outline from above and the height range of points (N, 3)."""
+    # QJ jogs the input: points on one line have a (thin) hull too
     corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
     return Footprint(
         points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max())
@@ -536,14 +577,15 @@ def compute_footprint(points: Float64Array) -> Footprint:
 
 def is_overlapping(first: Footprint, second: Footprint) -> bool:
     """Return whether two footprints overlap from above, at heights that both have."""
-    start, end = find_overlap_interval(first, second, np.array([1.0, 0.0]))
-    return start < 0.0 < end
+    # any direction will do: they overlap if they do so at a shift of 0
+    first_shift, last_shift = find_overlap_interval(first, second, np.array([1.0, 0.0]))
+    return first_shift < 0.0 < last_shift
 
 
 def find_overlap_interval(
     first: Footprint, second: Footprint, direction: Float64Array
 ) -> tuple[float, float]:
-    """Return over which interval of a shift one footprint overlaps another.
+    """Return between which shifts along a direction one footprint overlaps another.
 
     By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1): on
     the normal of each edge both footprints are intervals, which overlap for an interval
@@ -552,10 +594,10 @@ def find_overlap_interval(
     Args:
         first: the footprint that is shifted.
         second: the footprint that stays.
-        direction: (2,) of the shift; the interval is in its length.
+        direction: (2,) a shift of t moves the first footprint by t times this.
 
     Returns:
-        Begin and end; (inf, -inf) where they never overlap.
+        The first and the last t; (inf, -inf) where they never overlap.
     """
     if min(first.upper, second.upper) <= max(first.lower, second.lower):
         return math.inf, -math.inf
@@ -567,9 +609,12 @@ def find_overlap_interval(
     )
     # (k, 2); corners at the same point have no edge
     normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
+    # corners along each axis, (corners, k); and how far a shift of 1 moves along it
     moving_range = first.outline @ normals.T
     fixed_range = second.outline @ normals.T
-    speed = normals @ direction
+    shift_speeds = normals @ direction
+    # (2, k): how far the first has to move along each axis until it overlaps the
+    # second, and until it no longer does
     separations = np.stack(
         [
             fixed_range.min(axis=0) - moving_range.max(axis=0),
@@ -577,10 +622,15 @@ def find_overlap_interval(
         ]
     )
     # The shift does not move it along such an axis: they are apart always or never.
-    is_parallel = speed == 0.0
+    # Apart means that 0 is not within their separations.
+    is_parallel = shift_speeds == 0.0
     if (is_parallel & ((separations[0] >= 0.0) | (separations[1] <= 0.0))).any():
         return math.inf, -math.inf
-    intervals = np.sort(separations[:, ~is_parallel] / speed[~is_parallel], axis=0)
+    # divided: the shifts at which it begins and ends; sorted, since a negative speed
+    # swaps the two
+    intervals = np.sort(
+        separations[:, ~is_parallel] / shift_speeds[~is_parallel], axis=0
+    )
     start = float(intervals[0].max())
     end = float(intervals[1].min())
     return (start, end) if start < end else (math.inf, -math.inf)

@@ -57,7 +57,11 @@ class GlbBuffer:
         self.accessors: list[dict[str, Any]] = []
 
     def add_view(self, data: bytes, target: int | None = None) -> int:
-        """Append bytes, padded to four, and return the index of their view."""
+        """Append bytes, padded to four, and return the index of their view.
+
+        Bytes that were added before with the same target keep their view. `target` is
+        one of the two above; None for what is no geometry, such as an image.
+        """
         key = (data, target)
         if key in self._view_of_data:
             return self._view_of_data[key]
@@ -228,7 +232,11 @@ def _make_document(
 
 
 def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
-    """Add the mesh of a shape to a buffer, and return its primitive."""
+    """Add the mesh of a shape to a buffer, and return its primitive.
+
+    Axes are turned to glTF's, and v is turned over, since glTF's is 0 at the top. A
+    normal of length 0 becomes upright. Indices have 16 bits where these suffice.
+    """
     mesh = shape.mesh
     lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
     # The format requires unit normals.
@@ -253,8 +261,13 @@ def _add_material(
     shape: Shape,
     encode_image: Callable[[ByteImage], bytes],
 ) -> dict[str, Any]:
-    """Return the material of a shape, whose images are added to the buffer and the
-    document.
+    """Return the material of a shape; its images go to the buffer and the document.
+
+    Args:
+        document: gets entries of images and textures.
+        buffer: gets the image files.
+        shape: whose surface it is.
+        encode_image: encodes an image (H, W, 3); one with opacity is always PNG.
     """
     color = _to_bytes(shape.base_color)
     if shape.opacity is None:
@@ -280,7 +293,10 @@ def _add_material(
 def _add_texture(
     document: dict[str, Any], buffer: GlbBuffer, image_file: bytes
 ) -> dict[str, int]:
-    """Add an image file as a texture, and return the reference to it."""
+    """Add an image file as a texture, and return the reference to it.
+
+    Each texture has an entry and an image of its own, with the same index.
+    """
     document["images"].append(
         {
             "mimeType": find_mime_type(image_file),
@@ -295,7 +311,8 @@ def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
     """Return the material of a shape with a texture of its base color.
 
     An opacity of 0 and 1 alone is a mask; another one is blended. Extensions are
-    written only where the surface differs from glTF's default.
+    written only where the surface differs from glTF's default; a specular above
+    `DEFAULT_SPECULAR` is cut to it, since glTF's factor is at most 1.
     """
     surface = shape.material
     material: dict[str, Any] = {"name": shape.name, "doubleSided": True}

@@ -227,7 +227,8 @@ class GradientPlan:
     def restore(self, stored: Mapping[str, Any]) -> GradientPlan:
         """Return the plan with the choices of another plan for the same space.
 
-        `stored` is what its `to_dict` has returned.
+        Each group gets the other's `RESTORED_FIELDS` and measurements, and the plan its
+        samples per pixel. `stored` is what the other's `to_dict` has returned.
         """
         changes: dict[str, dict[str, Any]] = {}
         for group in stored["groups"]:
@@ -312,8 +313,10 @@ def _plan_group(
     the image. An estimator forced for the group wins over one for its control, and that
     over one for all groups, which holds only where it is valid.
     """
+    # the smallest: no coordinate of the group moves an outline by more than a pixel
     pixel_step = float(steps[group.coordinates].min()) if group.size else 0.0
     step = pixel_step
+    # both estimators are right only for what moves no outline
     moves_outlines = not {"adjoint", "image"} & {*group.valid}
     if group.size == 1 and moves_outlines:
         step = max(
@@ -339,6 +342,8 @@ def _plan_group(
             reason="forced by name",
             is_forced=True,
         )
+    # "*" may also name an estimator that is always valid, but leaves what is
+    # differentiated on the picture, without a render, as it is.
     forced_for_all = forced.get("*", "")
     has_alternative = (
         forced_for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid

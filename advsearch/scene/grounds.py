@@ -81,9 +81,14 @@ class Photograph:
     def _make_mesh(self, height: float, rotation: float) -> Mesh:
         """Make rings of faces around the point below the camera.
 
-        Radii are in heights of the camera: a ring at radius r is atan(r) away from
-        straight down, and that angle is its row in the map. Texture coordinates are
-        those of the lower half of the map, from its column (0 to 1) and its row.
+        Radii are in heights of the camera: a ring at radius r is seen atan(r) away from
+        straight down, and that angle is its row in the map. The plane's texture is the
+        lower half of the map, `compute_reflectance`; texture coordinates are a point's
+        column and row in it.
+
+        Args:
+            height: of the camera, object sizes.
+            rotation: of the map about the vertical, degrees.
         """
         radii = np.concatenate(
             [[0.0], np.geomspace(MIN_RING_RADIUS, MAX_RING_RADIUS, N_RINGS)]
@@ -95,8 +100,10 @@ class Photograph:
             [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
             axis=-1,
         )
+        # from straight up
         polar = math.pi - np.arctan(radius)
         n_rows = self._map_rows - self._horizon_row
+        # counted from the horizon; the map's first and last row are the poles
         lower_row = polar / math.pi * (self._map_rows - 1) - self._horizon_row
         uvs = np.stack([map_column, 1.0 - (lower_row + 0.5) / n_rows], axis=-1)
         normals = np.tile(
@@ -110,11 +117,13 @@ class Photograph:
         )
 
     def compute_reflectance(self, radiance: Tensor) -> Tensor:
-        """Return the plane's texture (h, W, 3) for a map of any size.
+        """Return the plane's texture (h, W, 3) for a map (H, W, 3) of any size.
 
         Row 0 is the horizon, the last one is straight down, and columns are those of
-        the map; h is always that of the map the plane was made of, between whose rows
-        it interpolates. 0 where no light comes from above. Differentiable.
+        the map. The height h is that of the lower half of the map that the plane was
+        made of: a map of another size is interpolated to these rows. A reflectance is
+        pi times radiance over irradiance, and 0 where no light comes from above.
+        Differentiable.
         """
         rows = radiance.shape[0]
         map_row = torch.arange(
@@ -132,15 +141,17 @@ class Photograph:
 
 
 def _make_ring_faces() -> npt.NDArray[np.uint32]:
-    """Return the faces (F, 3) of the rings; the innermost are single triangles.
+    """Return the faces (F, 3) of the rings around the point below the camera.
 
-    Vertices lie ring by ring, each of `N_SECTORS` + 1, the last at the position of the
-    first; the innermost ring is the one point below the camera.
+    Between two rings each sector is two triangles. Vertices lie ring by ring, each of
+    `N_SECTORS` + 1, the last at the position of the first. The first ring has a radius
+    of 0, so that its sectors are one triangle each: the other would have no area.
     """
     ring_starts = np.arange(N_RINGS)[:, None] * (N_SECTORS + 1)
     inner = (ring_starts + np.arange(N_SECTORS)).ravel()
     outer = inner + N_SECTORS + 1
     outer_triangles = np.stack([outer, inner, outer + 1], axis=1)
+    # without those of the first ring
     inner_triangles = np.stack([inner, inner + 1, outer + 1], axis=1)[N_SECTORS:]
     return np.concatenate([outer_triangles, inner_triangles]).astype(np.uint32)
 
@@ -155,13 +166,17 @@ def get_photograph(
 def compute_irradiance(radiance: Tensor) -> Tensor:
     """Return the irradiance (3,) of a map (H, W, 3) on unshadowed level ground.
 
-    Differentiable.
+    It is the integral of radiance times the cosine of the angle from straight up, over
+    the upper half. Row 0 is straight up, the last one straight down. Differentiable.
     """
     rows, columns = radiance.shape[:2]
+    # Angles from straight up at which rows begin and end. The first and the last row
+    # are half as high as the others, since their middle is a pole.
     row_bounds = (
         torch.arange(rows + 1, device=radiance.device, dtype=torch.float64) - 0.5
     ) * (math.pi / (rows - 1))
-    # Integral of cos sin over the angle from straight up; none from below the horizon.
+    # Integral of cos sin (sin is the length of a row) over the angle from straight up;
+    # clamped, as nothing comes from below the horizon.
     antiderivative = row_bounds.clamp(0.0, math.pi / 2.0).sin().square() / 2.0
     weights = (antiderivative.diff() * (2.0 * math.pi / columns)).to(radiance.dtype)
     return (radiance.sum(dim=1) * weights[:, None]).sum(dim=0)
@@ -188,8 +203,9 @@ MAX_CAR_CAMERA_HEIGHT = 2.5
 def is_against_traffic(scene: SceneDescription, camera: Float64Array) -> bool:
     """Return whether a camera (4, 4) drives in the object's lane towards its front.
 
-    That is before the object, at most half a lane aside and no higher than a car's
-    camera; the object has to be one that drives, and stand in a lane.
+    It does if it is before the object, at most half a lane aside and no higher than a
+    car's camera, if the object is one that drives and stands in a lane. Lanes run along
+    x, and the object faces +x.
     """
     if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
         return False
@@ -245,9 +261,9 @@ PLACE_BY_GROUND_KIND: Mapping[str, tuple[str, str | None]] = {
 def find_ground_kind(scene: SceneDescription) -> str | None:
     """Return the kind of ground that a scene's environment and its settings ask for.
 
-    A setting wins over the environment; the environment's does not count where a
-    setting of the table is used, and no ground of size 0 has a kind. None where neither
-    names one.
+    None where the ground has a size of 0. Otherwise the setting `ground.kind` wins, and
+    then the environment's own kind, which does not count where settings describe a
+    table. None where neither names one.
     """
     requested = scene.values.get("ground.kind")
     if scene.number("ground.size") <= 0.0:
@@ -395,8 +411,11 @@ def find_valid_range(
 ) -> tuple[float, float]:
     """Return up to which distance and height an environment's picture fits a camera.
 
-    In the lengths of `surroundings`, infinite without a bound, 0 where it fits nowhere;
-    see above. The camera's own distance does not count.
+    In the lengths of `surroundings`, infinite without a bound; 0 and 0 where the
+    picture is turned against the ground, so that it fits nowhere. The distance has two
+    bounds, as said above: what stands around becomes too large, or the end of the
+    ground comes into sight. The camera's own distance does not count, its height and
+    angles do.
     """
     if abs((surroundings.rotation + 180.0) % 360.0 - 180.0) > MAX_MAP_ROTATION:
         return 0.0, 0.0
@@ -416,7 +435,8 @@ def find_valid_range(
 def _reach_of_area(area: Box | float, azimuth: float) -> float:
     """Return how far an area reaches from the object in a direction, by its azimuth.
 
-    `area` is a box, or a number: the same in all directions.
+    `area` is a box around the object, or a number: the same in all directions. The
+    azimuth is in degrees. A ray leaves a box where it first passes one of the sides.
     """
     if isinstance(area, float):
         return area
@@ -429,10 +449,11 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
 def find_surroundings(scene: SceneDescription) -> Surroundings | None:
     """Return what is known of the place in a scene's environment.
 
-    In metres. A place whose picture the environment shows has the picture's limits; a
-    photograph over a ground has those of its camera's height and its empty radius;
-    otherwise only the end of a paved ground counts. None where nothing of it has to fit
-    a ground.
+    In metres; the first of these that holds. If the scene has a place as geometry and
+    the environment shows the picture of one, the picture's limits hold. A photographed
+    environment over a ground has the limits of its camera's height and of its empty
+    radius. Otherwise only the end of a paved ground counts. None where there is none,
+    or nothing of the environment's picture has to fit it.
     """
     environment = scene.environment
     # what encloses the object is geometry, true from everywhere
@@ -467,7 +488,7 @@ def find_surroundings(scene: SceneDescription) -> Surroundings | None:
 
 
 def bound_ground(place: Place) -> Box:
-    """Return the bounds of the ground of a place in x and in y, metres."""
+    """Return the bounds of the ground of a place, metres: x from, to, y from, to."""
     vertices = np.concatenate(
         [part.mesh.vertices for part in place.parts if part.is_ground]
     )
@@ -483,8 +504,13 @@ def make_camera_view(
 ) -> CameraView:
     """Return how a scene is looked at, in metres.
 
-    By its own camera, or by one with another pose (4, 4) or field of view (degrees). A
-    camera that looks straight down counts as looking to the object.
+    That is by its own camera, or by one with another pose. A camera that looks straight
+    down counts as looking to the object.
+
+    Args:
+        scene: the scene.
+        to_world: (4, 4) pose of the camera; None: the scene's.
+        fov: field of view along the larger side, degrees; None: the scene's.
     """
     pose = camera_to_world(scene) if to_world is None else to_world
     x, y, z = pose[:3, 3] * scene.metres
@@ -505,6 +531,7 @@ def make_camera_view(
         if level_length > 1e-6
         else azimuth + 180.0
     )
+    # half the picture's angle, minus how far above the horizon its middle is
     lower_angle = half_height_angle - math.degrees(
         math.asin(float(np.clip(forward[2], -1.0, 1.0)))
     )

@@ -88,8 +88,14 @@ GLASS_OFFSET = 0.004  # how far glass stands out from what it lies on, metres
 def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array:
     """Return the luminous intensity of one headlamp, "low" or "high"; see above.
 
-    `h` and `v` are degrees aside and up, of any shape; the high beam has the low one in
-    it.
+    In candela. The low beam is a narrow and a wide Gaussian to the sides, which fade
+    from the cut-off downwards, times a sigmoid that darkens what is above the cut-off.
+    The high beam adds a Gaussian around straight ahead.
+
+    Args:
+        kind: "low" or "high".
+        h: degrees aside, of any shape.
+        v: degrees above the horizon, of the same shape.
     """
     below_cut_off = CUT_OFF - v
     narrow_beam = 14500.0 * np.exp(
@@ -114,7 +120,9 @@ def compute_candela(kind: str, h: Float64Array, v: Float64Array) -> Float64Array
 def make_candela_table(kind: str) -> Float32Array:
     """Return the intensities (ROWS, COLUMNS) of one headlamp on a plane before it.
 
-    In candela; row 0 on top. Over the outer tenth at each border they fade to zero.
+    In candela; row 0 on top. The plane is at a distance of 1: a texel's position on it
+    is the tangent of its angle, up to `TABLE_HALF_WIDTH` to the side. Over the outer
+    tenth at each border they fade to zero.
     """
     half_height = TABLE_HALF_WIDTH * ROWS / COLUMNS
     side_tangent, up_tangent = np.meshgrid(
@@ -126,6 +134,7 @@ def make_candela_table(kind: str) -> Float32Array:
         np.degrees(np.arctan(side_tangent)),
         np.degrees(np.arctan2(up_tangent, np.hypot(1.0, side_tangent))),
     )
+    # 0.2 of half the width is a tenth of the width
     fade = np.minimum(
         (TABLE_HALF_WIDTH - np.abs(side_tangent)) / (0.2 * TABLE_HALF_WIDTH),
         (half_height - np.abs(up_tangent)) / (0.2 * half_height),
@@ -162,7 +171,7 @@ def add_lamps(scene: SceneDescription) -> SceneDescription:
         return replace(scene, parts=other_parts)
     unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
     scene = replace(scene, parts=other_parts)
-    # Two beams of each car; all of them are sampled as often as the environment.
+    # Two beams of each car: together they are sampled as often as the environment.
     weight = 1.0 / (2 * len(kind_by_lit_carrier))
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
@@ -177,9 +186,10 @@ def add_lamps(scene: SceneDescription) -> SceneDescription:
 
 
 def _check_units(scene: SceneDescription, carrier: str) -> float:
-    """Return the luminance of a radiance of 1, cd/m2.
+    """Return the luminance of a radiance of 1, cd/m2, in the scene's environment.
 
-    Raises InputError: there is none, or metres are not known.
+    `carrier` is what has lamps, for the message. Raises InputError: the environment has
+    no unit, or the object's size in metres is not known.
     """
     settings = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}
     setting = settings.get(carrier, "things: lamps")
@@ -218,11 +228,12 @@ def _make_lamps(
     Args:
         scene: in which they shine.
         carrier: the mesh that carries them, or `CAMERA`.
-        kind: "low" or "high".
+        kind: beam, "low" or "high".
         radiance_unit: luminance of a radiance of 1, cd/m2.
         weight: of each beam, see `BeamLamp`.
     """
     if carrier == CAMERA:
+        # in the coordinates of the camera's car, see `compute_car_pose`
         left_position = np.array(EGO_LAMP_POSITION)
         positions = [
             left_position / scene.metres,
@@ -242,6 +253,8 @@ def _make_lamps(
         yield headlamp_glass
         yield _make_glass(part, "taillamps", -1.0, units_per_metre, rear_power)
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
+    # candela to the light's unit; lengths are in object sizes, and intensity is
+    # radiance times squared length
     red, green, blue = map(float, WHITE / (radiance_unit * scene.metres**2))
     for name, position in zip(("left", "right"), positions, strict=True):
         yield BeamLamp(
@@ -333,6 +346,7 @@ def _make_glass(
     )
     # the color of the light, not quite as bright as a base color may be
     glass_color = (0.8 * power / power.max()).astype(np.float32)
+    # two lamps send the power over the area of both
     radiance = 2.0 * power / max(float(facing_area.clip(0.0).sum()), 1e-9)
     return LampGlass(
         name=f"{part.name}-{lamp_type}",
@@ -351,7 +365,8 @@ def _make_disks(
 ) -> tuple[Float64Array, IntArray]:
     """Make two disks before what is foremost of a car, for lamps without a material.
 
-    They lie at the height and to the sides that `LAMP_HEIGHTS` and `LAMP_OFFSET` have.
+    They lie at the height and to the sides that `LAMP_HEIGHTS` and `LAMP_OFFSET` have,
+    and stand out from the car by `GLASS_OFFSET`. The first is that on the left (+y).
 
     Args:
         mesh: of the car.
@@ -368,6 +383,7 @@ def _make_disks(
     upper = corners.max(axis=(0, 1))
     height, height_fraction = LAMP_HEIGHTS[lamp_type]
     width = upper[1] - lower[1]
+    # a disk takes at most a fifth of a narrow car's width
     rim_offsets = min(LAMP_RADIUS * units_per_metre, 0.1 * width) * _make_circle(facing)
     vertices = list[Float64Array]()
     for side in (1.0, -1.0):
@@ -377,12 +393,14 @@ def _make_disks(
             height * units_per_metre, height_fraction * (upper[2] - lower[2])
         )
         disk_vertices = np.concatenate([[center], center + rim_offsets])
+        # in mirrored coordinates until here: `facing` brings tail lamps back
         disk_vertices[:, 0] = facing * (
             _find_foremost(corners, disk_vertices, upper[0])
             + GLASS_OFFSET * units_per_metre
         )
         vertices.append(disk_vertices)
     disk_faces = _make_disk_faces()
+    # a disk has its center and `N_SPOKES` vertices on the rim
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     return np.concatenate(vertices), faces
 
@@ -403,11 +421,16 @@ def _make_disk_faces() -> IntArray:
 
 
 def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) -> float:
-    """Return the largest x of triangles (F, 3, 3) where a disk (V, 3) covers them.
+    """Return the largest x of triangles where a disk covers them, seen along x.
 
-    It is taken at the disk's vertices; `default` where none of them has a triangle
-    behind it.
+    Only the disk's vertices are looked at, by their y and z; their x does not count.
+
+    Args:
+        corners: (F, 3, 3) of the triangles.
+        disk: (V, 3) vertices of the disk.
+        default: returned where none of them has a triangle before or behind it.
     """
+    # (F, 3): per axis, whether the boxes of triangle and disk lie apart; x is not used
     is_disjoint = (corners.min(axis=1) > disk.max(axis=0)) | (
         corners.max(axis=1) < disk.min(axis=0)
     )

@@ -49,6 +49,7 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
     sigmas = []
     for channel in range(levels.shape[2]):
         values = levels[..., channel].astype(np.float64)
+        # `RESIDUAL` has a norm of 1, so that it leaves the deviation of noise as it is
         residual = np.abs(ndimage.convolve(values, RESIDUAL)[1:-1, 1:-1])
         is_clipped = ((values == 0.0) | (values == 255.0))[1:-1, 1:-1]
         by_block = _split_blocks(residual)
@@ -58,12 +59,17 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
         if len(usable):
             medians = np.median(usable, axis=1)
             sigma = MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
+        # without what rounding to levels adds
         sigmas.append(np.sqrt(max(0.0, sigma**2 - ROUNDING_VARIANCE)))
     return np.array(sigmas)
 
 
 def _split_blocks(image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
-    """Return the blocks of an image (H, W) as rows; one block if it is small."""
+    """Return the blocks of an image (H, W) as rows (blocks, pixels).
+
+    Blocks are squares of `BLOCK` pixels; what is left at the right and the bottom is
+    cut off. A smaller image is one block.
+    """
     rows = image.shape[0] // BLOCK
     columns = image.shape[1] // BLOCK
     if rows == 0 or columns == 0:
@@ -83,7 +89,8 @@ def make_noise(sigma: Float64Array, size: tuple[int, int], seed: int) -> Tensor:
 def measure_blur(image: Float32Array) -> float:
     """Return by how much an image is blurred beyond a rendered one, in pixels.
 
-    It is the standard deviation of a normal blur, 0 where there are too few edges.
+    It is the standard deviation of a normal blur, 0 where there are too few edges. What
+    is measured on edges is looked up among measurements of edges with known blurs.
 
     Args:
         image: (H, W) linear luminance.
@@ -96,7 +103,11 @@ def measure_blur(image: Float32Array) -> float:
 
 
 def _measure_edges(image: Float64Array) -> float | None:
-    """Return the blur of the sharper edges of an image; None if it has too few."""
+    """Return the blur of the sharper edges of an image (H, W); None if it has too few.
+
+    In pixels, a standard deviation, by the ratio of an edge's slopes in two copies that
+    are blurred by `NARROW` and `WIDE`: the sharper an edge is, the more it loses.
+    """
     row_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(1, 0)))
     column_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(0, 1)))
     narrow = np.hypot(row_slope, column_slope)
@@ -116,14 +127,18 @@ def _measure_edges(image: Float64Array) -> float | None:
     ratio = (narrow[is_edge] / np.maximum(wide[is_edge], 1e-12)) ** 2
     # 1.01: so blurred that both copies are alike; the upper end: not blurred at all
     ratio = np.clip(ratio, 1.01, (WIDE / NARROW) ** 2)
-    # s^2 of the formula above, solved for
+    # s^2 = (b^2 - R^2 a^2) / (R^2 - 1), the formula at the top solved for s^2
     squared_blur = (WIDE**2 - ratio * NARROW**2) / (ratio - 1.0)
     return float(np.sqrt(np.quantile(squared_blur, SHARP_FRACTION)))
 
 
 @lru_cache(maxsize=1)
 def _calibrate() -> tuple[Float64Array, Float64Array]:
-    """Return blurs (N,), and what is measured on edges that are blurred so."""
+    """Return blurs (N,), and what is measured on edges that are blurred so, pixels.
+
+    The edges are straight, at several angles, and averaged over pixels as a renderer
+    does: what is measured on an edge without further blur is not 0.
+    """
     oversampling = 8
     size = CALIBRATION_SIZE
     grid = (np.arange(size * oversampling) + 0.5) / oversampling - size / 2.0
@@ -139,12 +154,16 @@ def _calibrate() -> tuple[Float64Array, Float64Array]:
             measured_blurs[index] += (_measure_edges(image) or 0.0) / len(
                 CALIBRATION_ANGLES
             )
-    # Rising, as an interpolation needs it.
+    # Strictly rising, as an interpolation needs it.
     return blurs, np.maximum.accumulate(measured_blurs + 1e-9 * np.arange(len(blurs)))
 
 
 def blur_image(image: Tensor, sigma: float) -> Tensor:
-    """Return an image (H, W, C) blurred by a normal distribution; differentiable."""
+    """Return an image (H, W, C) blurred by a normal distribution; differentiable.
+
+    `sigma` is its standard deviation in pixels. The image's edges are repeated beyond
+    it. One pass along columns and one along rows are the blur in two dimensions.
+    """
     radius = int(np.ceil(3.0 * sigma))
     offsets = torch.arange(-radius, radius + 1, dtype=torch.float32)
     kernel = torch.exp(-0.5 * (offsets / sigma) ** 2)

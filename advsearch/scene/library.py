@@ -179,8 +179,10 @@ def _read_mesh(
     Args:
         name: of the object, for messages.
         directory: of its files.
-        material_runs: names of materials, each with how many faces in a row have it.
+        material_runs: names of materials, each with how many faces in a row have it;
+            empty: the mesh has no materials by name.
     """
+    # (F,) name of each face's material
     material_of_face = np.repeat(
         [material for material, _ in material_runs],
         [count for _, count in material_runs],
@@ -278,8 +280,10 @@ class LightImage:
 def read_light(path: Path, label: str = "environment") -> LightImage:
     """Read an ``.hdr`` or ``.exr`` image of any shape.
 
-    Errors are those of `import_environment`; radiance that is not finite, or negative,
-    is one, of which the message names the first texel.
+    Its rows become floats only when they are read, so that a large one takes less
+    memory. Errors are those of `import_environment`; radiance that is not finite, or
+    negative, is one, of which the message names the first texel. `label` is what the
+    image is, for messages.
     """
     data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":
@@ -290,6 +294,7 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
             tuple(notes),
         )
     planes, notes = read_exr(path, data)
+    # RGBE cannot hold such values, so that only these files are checked.
     kinds: tuple[tuple[str, Callable[[Plane], BoolArray], str], ...] = (
         ("NaN", np.isnan, "paint them over"),
         (
@@ -359,11 +364,13 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 def _resize_map(
     read_rows: Callable[[int, int], Float32Array], size: tuple[int, int]
 ) -> Float32Array:
-    """Average a map down to at most `MAX_MAP_SIZE`, or repeat texels up to
-    `MIN_MAP_SIZE`.
+    """Bring a map to a size from `MIN_MAP_SIZE` to `MAX_MAP_SIZE`.
 
-    Both sides shrink by the same factor. Texels are weighted by their solid angles, the
-    sine of the polar angle of their row. `read_rows` and `size` are as in `LightImage`.
+    A larger one is averaged down, of a smaller one texels are repeated. Both sides
+    shrink by the same factor. A new texel is the mean of those that it covers, weighted
+    by their solid angles, which go by the sine of the polar angle of their row: the
+    weighted texels are averaged, and divided by the averaged weights.
+    `read_rows` and `size` are as in `LightImage`.
     """
     height, width = size
     shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
@@ -384,6 +391,7 @@ def _resize_map(
             )
             / mean_weight
         )
+    # rounded up; 1 for a map that is large enough
     repeat_rows, repeat_columns = (
         -(-smallest // extent)
         for smallest, extent in zip(MIN_MAP_SIZE, texels.shape[:2], strict=True)

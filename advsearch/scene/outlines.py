@@ -59,7 +59,8 @@ def find_visible_meshes(
 ) -> list[VisibleMesh]:
     """Return the meshes that the image of a configuration (d,) shows.
 
-    With `names` only those are considered.
+    A mesh counts if it is seen first in a pixel. With `names` only those are
+    considered.
     """
     description = renderer.scene.definition[0]
     surfaces = renderer.surfaces(u)
@@ -103,6 +104,7 @@ def _compare_outline(
     x = outline.left + (column + 0.5) * outline.step
     y = outline.top + (row + 0.5) * outline.step
     is_inside = (x > 0) & (x < width) & (y > 0) & (y < height)
+    # visible pixels over the pixels of the full outline, also those beyond the image
     fraction = float(mask.sum()) / (len(row) * outline.step**2)
     return min(1.0, fraction), bool((~is_inside).any())
 
@@ -124,8 +126,14 @@ def _project_faces(
 ) -> Float64Array | None:
     """Project the corners of a mesh's faces to pixels (F, 3, 2) from the top left.
 
-    None where the mesh is no outline: of a cut-out, at the seam of a panorama, or where
-    it reaches behind the camera.
+    None where the faces do not tell the outline: with cut-outs, at the seam of a
+    panorama, or where the mesh reaches behind the camera.
+
+    Args:
+        renderer: of the scene.
+        inputs: of the scene, assembled.
+        name: of the mesh.
+        size: height and width of the image.
     """
     height, width = size
     description = renderer.scene.definition[0]
@@ -133,6 +141,7 @@ def _project_faces(
     vertices = renderer.scene.assembly.get_vertices(name, inputs)
     default_camera = torch.from_numpy(camera_to_world(description, width / height))
     camera = inputs.get("camera.to_world", default_camera).detach().double().cpu()
+    # in the camera's coordinates: left, up and ahead
     points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
     positions, is_before = project_points(
         description, _select_camera_inputs(inputs), points, size
@@ -156,9 +165,10 @@ class _Outline:
     step: int  # width of a cell in pixels
 
     def covers(self, mask: BoolArray) -> bool:
-        """Return whether visible pixels lie in the outline, or next to it.
+        """Return whether the visible pixels of a mask (H, W) lie in the outline.
 
-        At least `MIN_MATCHING_FRACTION` of those of the mask (H, W) have to.
+        At least `MIN_MATCHING_FRACTION` of them have to lie in a cell of the outline,
+        or in a neighbour of one. If not, the projection is not what was rendered.
         """
         n_rows, n_columns = self.cells.shape
         pixel_row, pixel_column = np.nonzero(mask)
@@ -175,7 +185,8 @@ class _Outline:
 def _rasterise_outline(corners: Float64Array) -> _Outline:
     """Rasterise the outline of faces with corners (F, 3, 2) in pixels.
 
-    A cell is a pixel, or several where the outline is wider than `MAX_OUTLINE_SIZE`.
+    A cell is a pixel, or a square of several where the outline is wider or higher than
+    `MAX_OUTLINE_SIZE` pixels.
     """
     lower = np.floor(corners.min(axis=(0, 1)))
     upper = np.ceil(corners.max(axis=(0, 1)))

@@ -102,8 +102,9 @@ class LampGlass(MeshPart):
 def make_mesh_part(
     name: str, shape: Shape, to_world: Float64Array, material: Material
 ) -> MeshPart:
-    """Return a shape in a scene: with a name and material of its own, under a pose (4,
-    4).
+    """Return a shape as a part of a scene.
+
+    Name and material replace the shape's own; `to_world` (4, 4) is its base pose.
     """
     shape_fields = {
         shape_field.name: getattr(shape, shape_field.name)
@@ -177,7 +178,10 @@ class SpotLamp(_Point):
 
     @property
     def to_world(self) -> Float64Array:
-        """(4, 4) pose of the lamp, which shines along its own +z."""
+        """(4, 4) pose of the lamp, which shines along its own +z.
+
+        How it is turned about that axis does not matter.
+        """
         forward = (
             np.array(self.direction)
             if any(self.direction)
@@ -270,13 +274,15 @@ class BeamLamp(ScenePart):
     ) -> tuple[Float64Array, Float64Array]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
 
-        The irradiance is that of a surface that faces the lamp; 0 behind the lamp and
-        outside of its table.
+        The irradiance is that of a surface that faces the lamp: the intensity in that
+        direction, from the table, over the squared distance. It is 0 behind the lamp
+        and outside of its table.
         """
         to_lamp = self.to_world[:3, 3] - position
         # the position in the lamp's axes: x to the table's right, y up, z ahead
         x, y, z = -to_lamp @ self.to_world[:3, :3]
         height, width = self.table.shape
+        # tangents from -1 to 1 over the width; texels are square, row 0 is on top
         column = math.floor((x / max(z, 1e-9) + 1.0) / 2.0 * width)
         row = math.floor((1.0 - y / max(z, 1e-9) * width / height) / 2.0 * height)
         if z <= 0.0 or not (0 <= column < width and 0 <= row < height):
@@ -397,7 +403,8 @@ class MediumPart(PluginPart):
 def make_polygon(corners: int) -> Mesh:
     """Return a regular polygon of radius 1 in the plane z = 0 that faces +z.
 
-    Its middle, then its corners.
+    Vertices are its middle, then its corners; each side is one face with the middle.
+    Texture coordinates are the unit square around it.
     """
     angles = 2.0 * np.pi * np.arange(corners) / corners
     corner_points = np.stack(
@@ -415,8 +422,10 @@ def make_polygon(corners: int) -> Mesh:
 def make_sphere(rows: int, columns: int) -> Mesh:
     """Return a sphere of diameter 1 around the origin.
 
-    It has `rows` bands from pole to pole and `columns` around, hence 2 (rows - 1)
-    columns faces: two for each cell, one at the poles. v is 1 at the top.
+    It has `rows` bands from pole to pole and `columns` around. Each cell between them
+    is two faces, and one at the poles, where the other would have no area: 2 (rows - 1)
+    times `columns` in all. v is 1 at the top; u goes around from +x to +y. Vertices
+    lie row by row from the bottom, `columns` + 1 in each, as a seam needs both ends.
     """
     v, u = (
         array.ravel()
@@ -430,13 +439,15 @@ def make_sphere(rows: int, columns: int) -> Mesh:
         [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)],
         axis=1,
     )
+    # the vertex at the lower left corner of each cell, and the one above it
     corner = (
         np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]
     ).ravel()
     above = corner + columns + 1
     lower = np.stack([corner, corner + 1, above + 1], 1)
     upper = np.stack([corner, above + 1, above], 1)
-    # without those that are points at the poles
+    # without the lower faces of the first row and the upper faces of the last one, two
+    # of whose corners are at a pole
     faces = np.concatenate([lower[columns:], upper[:-columns]])
     vertices, outwards, uvs = (
         array.astype(np.float32)

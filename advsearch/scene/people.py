@@ -188,7 +188,11 @@ class Person:
         data: Mapping[str, np.ndarray],
         defaults: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
-        """Convert the arrays to tensors, and pose the person at its defaults."""
+        """Convert the arrays to tensors, and pose the person at its defaults.
+
+        Lengths become metres. Weights, which are stored as integers, are divided so
+        that those of a point sum to 1.
+        """
         default_by_name = {
             parameter.name: float(parameter.default) for parameter in PARAMETERS
         }
@@ -257,6 +261,7 @@ class Person:
         if bool(number_by_name["stride"] > 0.0):
             raised = self._compute_leg_corrections(points, joints, number_by_name)
             posed = self._correct_legs(posed, rotations, translations, joints, raised)
+        # the body's origin: below the pelvis, at the height of the lowest point
         pelvis = translations[0] + rotations[0] @ joints[0]
         foot_point = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
         return (scale * (posed - foot_point)).index_select(
@@ -266,9 +271,16 @@ class Person:
     def _compute_leg_corrections(
         self, points: Tensor, joints: Tensor, number_by_name: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return how much each foot has to rise, "l" and "r", to touch the ground.
+        """Return by how many metres each foot has to rise, "l" and "r".
 
-        These are the corrections of the walk alone, without other joint angles.
+        Then a foot in stance touches the ground. The heights are those of the shoes'
+        lowest points with the walk alone: joint angles that a user sets on top are left
+        as they are, so a raised foot stays raised.
+
+        Args:
+            points: (P, 3) in the rest pose, without the joints.
+            joints: (J, 3) in the rest pose.
+            number_by_name: the values of all parameters.
         """
         zero = torch.zeros_like(number_by_name["walk"])
         without_joints = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
@@ -297,8 +309,9 @@ class Person:
     ) -> Tensor:
         """Return posed points (P, 3) with feet risen, and legs stretched in proportion.
 
-        Below the hip a point of the leg rises by how far down it is, from 0 at the hip
-        to all of the foot's rise at the ankle.
+        A point of the foot rises by all of the foot's rise. A point of the leg rises by
+        the fraction of the way from hip (0) to ankle (1) at which it is. Points count
+        by their skinning weights for these bones, so that the body stays as it is.
 
         Args:
             posed: (P, 3) points after skinning.
@@ -313,6 +326,7 @@ class Person:
                 self._bones.index(f"{bone}_{side}")
                 for bone in ("thigh", "calf", "foot")
             )
+            # where skinning puts the two joints
             hip_height = (rotations[thigh] @ joints[thigh] + translations[thigh])[2]
             ankle_height = (rotations[foot] @ joints[foot] + translations[foot])[2]
             below_hip = (
@@ -371,7 +385,7 @@ class Person:
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
-        # (G, A, W); and heights (H,) of bodies so mixed, of the three extremes of height
+        # (G, A, W); and heights (H,) of bodies so mixed, at the three extremes
         mixture = torch.einsum(
             "g,a,w->gaw", gender_weights, age_weights, weight_weights
         )
@@ -392,10 +406,14 @@ class Person:
     ) -> tuple[Tensor, Tensor]:
         """Return the rotation (J, 3, 3) and translation (J, 3) of each bone.
 
-        A point p moves to `rotation @ p + translation`. Bones come after their parents.
-        A bone's rotation is that of its parent's joint times its own joint's, after the
-        one that makes it straight in the rest pose; its joint goes where the parent
-        bone puts it.
+        A point p moves to `rotation @ p + translation`. A bone's rotation is first the
+        one that makes it straight, from the rest pose to all angles 0; then its own
+        joint's and those of its ancestors' joints. Its joint goes where the parent bone
+        puts it. Bones come after their parents, which is why one pass is enough.
+
+        Args:
+            joints: (J, 3) positions in the rest pose.
+            angle_by_joint: degrees.
         """
         straight_rotations = self._compute_straight_turns(joints)
         rotation_by_bone = compute_joint_turns(angle_by_joint)
@@ -419,15 +437,17 @@ class Person:
                 bone_vector = joints[index] - joints[parent]
                 positions.append(positions[parent] + rotations[parent] @ bone_vector)
         all_rotations = torch.stack(rotations)
+        # so that the joint itself moves to its position
         return all_rotations, torch.stack(positions) - torch.einsum(
             "jik,jk->ji", all_rotations, joints
         )
 
     def _compute_straight_turns(self, joints: Tensor) -> dict[str, Tensor]:
-        """Return the rotations (3, 3) of limbs from the rest pose to all angles 0, by
-        bone.
+        """Return the rotations (3, 3) of limbs from the rest pose to all angles 0.
 
-        Hands follow the forearm, turned by 60 degrees about the vertical.
+        They are by bone, such as "thigh_l"; each turns the bone, which leads from its
+        joint to the next, to its direction in `STRAIGHT`. Hands follow the forearm, and
+        are turned by 60 degrees about the vertical in addition. `joints` are (J, 3).
         """
         rotations = dict[str, Tensor]()
         for side, sign in (("l", 1.0), ("r", -1.0)):
@@ -461,7 +481,9 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     They sum to 1 from the first node to the last, and beyond these the nearest node has
     all of the weight.
     """
-    # How far the value is through each of the n - 1 intervals.
+    # How far the value is through each of the n - 1 intervals: 1 for those before it, 0
+    # for those after it. A node's weight is how far the interval before it is filled
+    # (the first: 1) minus how far the one after it is.
     fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
     # At a node the derivative is that of one side, not the sum of both.
     is_within = (fraction >= 0.0) & (fraction < 1.0)
@@ -472,7 +494,12 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
 
 
 def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the angles with those of the walk added, within each joint's limits."""
+    """Return the angles with those of the walk added, within each joint's limits.
+
+    The swing of each joint in the gait, `GAIT`, is scaled by the stride; the right side
+    is half a cycle behind the left. All are scalar tensors by parameter, degrees; other
+    parameters are returned as they are.
+    """
     angle_by_joint = dict(angle_by_name)
     phase = torch.deg2rad(angle_by_name["walk"])
     stride = angle_by_name["stride"]
@@ -482,7 +509,8 @@ def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
             angle_by_joint[f"{side}_{joint}"] = (
                 angle_by_joint[f"{side}_{joint}"] + stride * swing
             )
-    # The chest turns against the pelvis, by 5 degrees.
+    # The chest turns against the pelvis by up to 5 degrees, to the left as the left
+    # heel strikes.
     chest_turn = stride * 5.0 * torch.cos(phase)
     angle_by_joint["spine_turn"] = angle_by_joint["spine_turn"] + chest_turn
     limits = {
@@ -499,14 +527,22 @@ def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _compute_gait_angle(
     tenths: Sequence[int], phase: Tensor, phase_shift: float
 ) -> Tensor:
-    """Return an angle of the gait, degrees, at a phase in radians.
+    """Return an angle of the gait, degrees, at a phase.
 
-    It is a Fourier series of the ten samples of a cycle, without the highest wave.
+    The ten samples of a cycle are interpolated by their Fourier series, smooth and
+    periodic. Of its waves 0 to 5 the highest is left out: ten samples do not tell its
+    phase.
+
+    Args:
+        tenths: degrees at each tenth of the cycle.
+        phase: () radians of the left side's cycle.
+        phase_shift: radians, pi for the right side.
     """
     waves = np.fft.rfft(tenths)[:5] / len(tenths)
     swing = phase.new_tensor(float(waves[0].real))
     for order, wave in enumerate(waves[1:], 1):
         argument = order * (phase + phase_shift)
+        # twice the real part: `rfft` has one of each pair of conjugate waves
         swing = swing + 2.0 * (
             float(wave.real) * torch.cos(argument)
             - float(wave.imag) * torch.sin(argument)
@@ -521,6 +557,7 @@ def compute_contact(phase: Tensor) -> Tensor:
     and 0 in the swing, with half a cosine wave in between.
     """
     degrees = torch.remainder(phase, 360.0)
+    # 0 in stance, rising to 1 as the foot is lifted; then the same as it is lowered
     lift_phase = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
     lower_phase = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
     return 0.5 + 0.5 * torch.cos(np.pi * (lift_phase - lower_phase))
@@ -529,11 +566,14 @@ def compute_contact(phase: Tensor) -> Tensor:
 def skin_points(
     points: Tensor, weights: Tensor, rotations: Tensor, translations: Tensor
 ) -> Tensor:
-    """Return points moved with bones: linear blend skinning.
+    """Return points (P, 3) moved with bones: linear blend skinning.
+
+    A point moves by the weighted mean of the maps of all bones, `rotation @ p +
+    translation`.
 
     Args:
         points: (P, 3).
-        weights: (P, J).
+        weights: (P, J) of the bones, which sum to 1 for each point.
         rotations: (J, 3, 3) of the bones.
         translations: (J, 3).
     """
@@ -550,10 +590,11 @@ def skin_points(
 def _correct_heights(
     lowest: Mapping[str, Tensor], contact: Mapping[str, Tensor], amount: Tensor
 ) -> dict[str, Tensor]:
-    """Return how much each foot has to rise to touch the ground.
+    """Return how much each foot has to rise to touch the ground, "l" and "r".
 
-    The ground lies at the mean height of both feet, weighted by their contacts. A foot
-    goes there, or keeps its height above it as far as it has no contact.
+    The ground is taken to lie at the mean height of both feet, weighted by contact. A
+    foot with full contact goes there; one without keeps its height above it, but is not
+    below it; between them in proportion. A negative rise lowers the foot.
 
     Args:
         lowest: height of the lowest point of each foot, "l" and "r".
@@ -571,8 +612,10 @@ def _correct_heights(
 
 
 def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return each bone's rotation (3, 3) against its parent, of joint angles in
-    degrees.
+    """Return each bone's rotation (3, 3) against its parent, by the bone's name.
+
+    About the body's axes: x ahead, y to its left, z up. Bones without a parameter are
+    left out. `angle` are degrees by parameter.
     """
     # The back bends in three equal parts, neck and head share the nod.
     spine, side, turn = (
@@ -601,10 +644,13 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _compute_limb_turns(
     angle_by_joint: Mapping[str, Tensor], side: str, sign: float
 ) -> dict[str, Tensor]:
-    """Return the turns (3, 3) of the bones of arm and leg of a side.
+    """Return the turns (3, 3) of the bones of arm and leg of a side, by bone.
+
+    With all angles 0 a limb hangs down. About y (to the left) a negative angle raises
+    it ahead; about x (ahead) a positive one raises the left one to its side.
 
     Args:
-        angle_by_joint: degrees.
+        angle_by_joint: degrees by parameter, such as "left_knee".
         side: "left" or "right".
         sign: 1 for the left, -1 for the right, which is its mirror image.
     """
@@ -642,8 +688,9 @@ def make_axis_rotation(axis: str, degrees: Tensor) -> Tensor:
 def compute_least_rotation(begin: Tensor, end: Tensor) -> Tensor:
     """Return the smallest rotation (3, 3) from one direction to another.
 
-    It is `I + V + V^2 / (1 + c)`, with V the cross product matrix of the unit vectors
-    and c their dot product. They must not be opposite.
+    It is `I + V + V^2 / (1 + c)`, with V the matrix of the cross product with `a x b`,
+    and c the dot product of the unit vectors a and b. They must not be opposite, and
+    may have any length.
     """
     a = begin / begin.norm()
     b = end / end.norm()

@@ -134,5 +134,6 @@ class LinearMap(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> tuple[None, None, Tensor]:
+        """Apply the transpose, again as such a map, so that it has a derivative."""
         gradient = LinearMap.apply(*ctx.transpose, cotangent.contiguous())  # type: ignore[no-untyped-call]
         return None, None, gradient

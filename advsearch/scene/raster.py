@@ -83,13 +83,18 @@ def find_candidate_pixels(
 def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray:
     """Return the texels (h, w) that bilinear look-ups in triangles read.
 
-    Look-ups repeat at the border. The triangles (F, 3, 2) are as for
-    `rasterize_triangles`, at most half a texel outside of the texture. A look-up reads
-    the cell between four texels that it falls into: its first texel, and the next row
-    and column.
+    A look-up at a point reads the four texels around it: with its row and its column
+    rounded down, and the next ones. The square between these four is a cell here, and
+    has the index of the first. So the cells that a triangle touches are found, and then
+    their texels. Beyond the border the texture repeats.
+
+    Args:
+        corners: (F, 3, 2) as for `rasterize_triangles`, at most half a texel outside of
+            the texture.
+        shape: height and width of the texture.
     """
-    # Cells have the index of their first texel. They begin at texel -1, which is the
-    # last one again: shifted by 1, indices begin at 0.
+    # The first cell begins at texel -1, which is the last one again. All is shifted by
+    # 1, so that the indices of cells begin at 0.
     shifted = corners + 1.0
     lowest_row = np.floor(shifted[..., 1].min(axis=1) - PIXEL_TOLERANCE)
     highest_row = np.floor(shifted[..., 1].max(axis=1) + PIXEL_TOLERANCE)
@@ -114,10 +119,14 @@ def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray
 def _find_column_span(
     corners: Float64Array, row: IntArray
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the columns that triangles (N, 3, 2) have between a row (N,) and the next.
+    """Return the smallest and largest column of triangles between two rows.
 
-    The first and the last column are those of the triangle's corners in between, or of
-    where its edges cross one of the two rows. It is (inf, -inf) if there are none.
+    Each triangle (N, 3, 2) is cut to the strip from its row (N,) to the next. What is
+    left of it reaches farthest at one of its corners inside the strip, or where an edge
+    crosses one of the two rows.
+
+    Returns:
+        (N,) smallest and (N,) largest column; (inf, -inf) where nothing is left.
     """
     rows = row[:, None]
     y = corners[..., 1]
@@ -125,6 +134,7 @@ def _find_column_span(
     left = np.where(is_between, corners[..., 0], np.inf).min(axis=1)
     right = np.where(is_between, corners[..., 0], -np.inf).max(axis=1)
     for offset in (0, 1):
+        # no crossing is an empty range, the first column above the last
         first_column, last_column = _cross_rows(corners, row + offset, PIXEL_TOLERANCE)
         left = np.where(
             first_column <= last_column, np.minimum(left, first_column), left
@@ -138,9 +148,15 @@ def _find_column_span(
 def compute_barycentric(
     corners: Float64Array, row: IntArray | Float64Array, column: IntArray | Float64Array
 ) -> Float64Array:
-    """Return the barycentric weights (N, 3) of pixel centers in triangles (N, 3, 2).
+    """Return the barycentric weights (N, 3) of points in triangles (N, 3, 2).
 
-    They are NaN where a triangle has no area.
+    A corner's weight is the share of the triangle's area that lies between the point
+    and the opposite side: all three are in [0, 1] inside, and one is negative outside.
+    They are NaN or infinite where a triangle has no area.
+
+    Args:
+        corners: columns and rows of the corners.
+        row, column: (N,) where the points are.
     """
     ax, ay = corners[:, 0].T
     bx, by = corners[:, 1].T
@@ -162,18 +178,22 @@ def compute_doubled_areas(corners: Float64Array) -> Float64Array:
 def _list_integers_within(
     lower: Float64Array, upper: Float64Array, size: int, tolerance: float
 ) -> tuple[IntArray, IntArray]:
-    """List the integers of many intervals within [0, size - 1].
+    """List the integers of N intervals, those of the first, then those of the second.
 
-    The intervals are [lower, upper] (N,), wider by `tolerance` on each side; an empty
-    one has no integer.
+    Args:
+        lower, upper: (N,) ends of the intervals; one with `lower` above `upper` has no
+            integer.
+        size: integers outside of [0, size - 1] are left out.
+        tolerance: by how much each interval is wider on both sides.
 
     Returns:
-        The index of the interval, and the integer, interval by interval.
+        For each integer the index of its interval (K,), and the integer (K,).
     """
     first_integer = np.maximum(np.ceil(lower - tolerance), 0.0).astype(np.int64)
     last_integer = np.minimum(np.floor(upper + tolerance), size - 1.0).astype(np.int64)
     counts = np.maximum(last_integer - first_integer + 1, 0)
     interval = np.repeat(np.arange(len(counts)), counts)
+    # position of each interval's first integer in the list
     start = np.cumsum(counts) - counts
     integer = first_integer[interval] + np.arange(len(interval)) - start[interval]
     return interval, integer
@@ -184,8 +204,9 @@ def _cross_rows(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the first and last column (N,) of triangles (N, 3, 2) on rows (N,).
 
-    They are those of the edges that cross a row, which may miss it by `tolerance`;
-    level edges do not count. An empty range is 0 to -1.
+    They are where the triangle's edges cross its row. An edge that ends up to
+    `tolerance` before the row crosses it at that end. Level edges do not count. Where
+    no edge crosses, the range is empty: 0 to -1.
     """
     left = np.full(len(row), np.inf)
     right = np.full(len(row), -np.inf)
@@ -193,6 +214,7 @@ def _cross_rows(
         x0, y0 = corners[:, start_corner].T
         x1, y1 = corners[:, end_corner].T
         rise = y1 - y0
+        # how far along the edge the row is; any number for a level edge
         fraction = np.clip((row - y0) / np.where(rise == 0.0, 1.0, rise), 0.0, 1.0)
         crosses = (
             (np.minimum(y0, y1) - tolerance <= row)
@@ -256,7 +278,8 @@ class Charts:
     def compute_areas(self) -> Float32Array:
         """Return the surface area (h, w) of each texel, in squared mesh units.
 
-        It is 0 where no chart is.
+        It is the area of the texel's face over the number of texels that the face has
+        on the texture; 0 where no chart is.
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         face_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
@@ -330,14 +353,23 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
 
 
 def _compute_clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
-    """Return the barycentric weights (N, 3) of points, clipped to their triangles."""
+    """Return the barycentric weights (N, 3) of points, clipped to their triangles.
+
+    Negative weights, of points outside, become 0, and the others are scaled so that
+    they add up to 1. A triangle without area gets weights of 1 / 3.
+
+    Args:
+        corners: (N, 3, 2) of the triangles.
+        points: (N, 2).
+    """
     doubled = compute_doubled_areas(corners)
-    # A triangle without area has even weights, see below.
+    # Without an area all three are 0 here, and 1 / 3 at the end.
     divisor = np.where(doubled == 0.0, 1.0, doubled)
     corner_weights = []
     for next_corner, previous_corner in ((1, 2), (2, 0), (0, 1)):
         a = corners[:, next_corner] - points
         b = corners[:, previous_corner] - points
+        # the area between the point and the side opposite of the corner
         corner_weights.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / divisor)
     weights = np.maximum(np.stack(corner_weights, axis=1), 0.0)
     total = weights.sum(axis=1, keepdims=True)
@@ -358,17 +390,27 @@ def look_up_texture(
         (..., C) float32.
     """
     height, width = texels.shape[:2]
+    # The four texels around each point, and how far (0 to 1) it is from the first.
     left = np.floor(x)
     top = np.floor(y)
-    fx = (x - left).astype(np.float32)[..., None]
-    fy = (y - top).astype(np.float32)[..., None]
+    column_fraction = (x - left).astype(np.float32)[..., None]
+    row_fraction = (y - top).astype(np.float32)[..., None]
+    # beyond an edge the texture begins again
     column0 = (left % width).astype(np.int64)
     column1 = ((left + 1) % width).astype(np.int64)
     row0 = (top % height).astype(np.int64)
     row1 = ((top + 1) % height).astype(np.int64)
-    upper = texels[row0, column0] * (1 - fx) + texels[row0, column1] * fx
-    lower = texels[row1, column0] * (1 - fx) + texels[row1, column1] * fx
-    return np.asarray(upper * (1 - fy) + lower * fy, dtype=np.float32)
+    upper = (
+        texels[row0, column0] * (1 - column_fraction)
+        + texels[row0, column1] * column_fraction
+    )
+    lower = (
+        texels[row1, column0] * (1 - column_fraction)
+        + texels[row1, column1] * column_fraction
+    )
+    return np.asarray(
+        upper * (1 - row_fraction) + lower * row_fraction, dtype=np.float32
+    )
 
 
 class MeshSurface:
@@ -379,7 +421,10 @@ class MeshSurface:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Compute boxes and normals of the faces, and which faces are neighbours."""
+        """Compute boxes and normals of the faces, and which faces are neighbours.
+
+        Neighbours have an edge in common, by the positions of its ends.
+        """
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
@@ -389,7 +434,8 @@ class MeshSurface:
         edges = np.concatenate(
             [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
         )
-        # Sorted by their vertices, two sides of faces with the same edge are neighbours.
+        # Each edge is listed once for each of its faces. Sorted by their vertices,
+        # equal edges follow one another, and their faces are neighbours.
         edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
         is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
@@ -423,14 +469,17 @@ class MeshSurface:
     def _intersect(self, origin: Float64Array, direction: Float64Array) -> Float64Array:
         """Return the distance (F,) at which a ray meets each face, or infinity.
 
-        Moeller and Trumbore 1997, all faces at once, with the letters of the paper; a
-        ray in the plane of a face does not meet it.
+        The method is that of Moeller and Trumbore 1997, for all faces at once. As in
+        the paper t goes from the face's corner a to the origin, and u and v are the
+        barycentric weights of b and c where the ray meets the plane of the face. A ray
+        in that plane does not meet the face; nor does what lies behind the origin.
         """
         a = self._corners[:, 0]
         b = self._corners[:, 1]
         c = self._corners[:, 2]
         p = np.cross(direction, c - a)
         determinant = ((b - a) * p).sum(axis=1)
+        # 0 stands for a ray in the plane of the face
         inverse = np.where(
             np.abs(determinant) > 1e-15,
             1.0 / np.where(determinant == 0.0, 1.0, determinant),
@@ -482,8 +531,9 @@ def weld_vertices(mesh: Mesh) -> tuple[IntArray, int]:
 def _to_texel_coordinates(mesh: Mesh, shape: tuple[int, int]) -> Float64Array:
     """Return texture coordinates of the faces' corners (F, 3, 2) in texels.
 
-    They are column and row, integers at texel centers. Where a texture repeats, each
-    face is moved by full textures, so that its center lies in the first one.
+    They are column and row, integers at texel centers (hence the half), with row 0 at
+    v = 1. Where a texture repeats, each face is moved by full textures, so that its
+    center lies in the first one.
     """
     uvs = mesh.uvs[mesh.faces].astype(np.float64)
     if mesh.repeats:

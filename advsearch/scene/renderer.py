@@ -145,6 +145,7 @@ class Renderer:
         estimators: Mapping[str, str] | None = None,
         moments: Sequence[Moment] = (),
     ) -> None:
+        """Plan how each coordinate is differentiated; arguments are the class's."""
         self.scene = scene
         self.space = space
         self.formation = formation
@@ -231,8 +232,9 @@ class Renderer:
     def crop_to(self, window: Window, u: Tensor, seed: int, spp: int) -> Renderer:
         """Return a renderer that renders a window alone.
 
-        The rest of its images is that of u (d,), which is rendered now: arguments as
-        for a call. It does not count as a render.
+        Around the window, all of its images show what the image of u (d,) shows there.
+        That is rendered now, with arguments as for a call, and does not count as a
+        render.
         """
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
@@ -290,10 +292,10 @@ class Renderer:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two images of a configuration with independent noise.
 
-        The two are passed through a tone curve that is straight about the third, so
-        that they are right on average, and not darker where they are noisy; they may
-        leave [0, 1]. Arguments as for a call; there is no graph, and nothing is
-        counted.
+        Noise that goes through the tone curve, which is bent, would make a noisy image
+        darker on average. So the two go through its tangent at the third, denoised
+        image instead; they may leave [0, 1]. Arguments as for a call; there is no
+        graph, and nothing is counted.
 
         Returns:
             Three images (H, W, 3): the two, which are not denoised, and that of all
@@ -310,7 +312,10 @@ class Renderer:
             curve_point = self.formation.display(clean)
 
             def display_straight(radiance: Tensor) -> Tensor:
-                """Extend the tone curve's tangent at the denoised image."""
+                """Return the image on the tone curve's tangent at the denoised image.
+
+                The slope is taken over a small part of the way to the noisy image.
+                """
                 nudged = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
                 slope = (
                     self.formation.display(nudged) - curve_point
@@ -329,8 +334,8 @@ class Renderer:
         Arguments as for a call. Nothing is counted.
 
         Returns:
-            Both, which are not denoised, and their mean, which is: (H, W, 3), or
-            (H, W, 4) with coverage where there is a backdrop.
+            The two images, which are not denoised, and their mean, which is. Each is
+            (H, W, 3), or (H, W, 4) with coverage where there is a backdrop.
         """
         hide = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
@@ -449,8 +454,8 @@ class Renderer:
         """Check a call's arguments; raises as `__call__`.
 
         Returns:
-            The configuration as float32; and the same with a graph only where the
-            derivative runs back through scene inputs or the image.
+            The configuration as float32; and the same numbers in a tensor through which
+            only those coordinates have a derivative that the plan gives to autograd.
         """
         u = _to_tensor(u)
         if u.shape != self._shape:
@@ -482,6 +487,7 @@ class Renderer:
             mask = self.plan.autograd_mask
             if bool(mask.all()):
                 return u, u
+            # the value is u, the derivative is the mask
             return u, u.detach() + mask * (u - u.detach())
 
     def _render_image(
@@ -514,7 +520,11 @@ class Renderer:
     ) -> dict[str, Tensor]:
         """Return the scene inputs of u for a camera of a rig, or for the only one.
 
-        They are those of the time when it takes its image, or of another `space`.
+        Args:
+            mount: the camera of the rig; None for the only one.
+            u: (d,) configuration.
+            space: maps u to scene inputs; None: the renderer's, at the time when the
+                camera takes its image.
         """
         if space is None:
             space = self.space
@@ -532,7 +542,15 @@ class Renderer:
     ) -> Tensor:
         """Render the mean radiance of the moments of u, denoised once.
 
-        It counts as one render.
+        Each row of the image takes its own fraction of each moment, as a sensor reads
+        rows one after the other. It counts as one render.
+
+        Args:
+            mount: the camera of a rig; None for the only one.
+            u: (d,) configuration.
+            seed: of the noise; each moment gets its own.
+            spp: samples per pixel of all moments together.
+            hide: hide the environment behind a backdrop.
         """
         is_denoised = self.formation.denoiser == "oidn"
         renders_before = self.renders
@@ -556,14 +574,16 @@ class Renderer:
         self.renders = renders_before + 1
         if not is_denoised:
             return exposed
-        # its derivative is that without a denoiser
+        # The change has no graph: the derivative is that of the image before denoising.
         return exposed + self._compute_denoising_change(exposed, guides)
 
     @torch.no_grad()
     def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
-        """Return by how much a denoiser changes an image (H, W, 3, 4 or 7).
+        """Return the denoised image minus the image, (H, W, C).
 
-        `guides` are albedo and normals (H, W, 6).
+        C is 3, 4 with coverage, or 7 with the change of the plane that takes the
+        shadow. `guides` are albedo and normals (H, W, 6), which show the denoiser the
+        edges.
         """
         has_plane = exposed.shape[-1] > 4
         clean = denoise_image(
@@ -616,11 +636,17 @@ class Renderer:
     ) -> Tensor:
         """Return radiance (H, W, 3) over its backdrop, see `advsearch.scene.backdrop`.
 
+        The backdrop shows where the coverage is below 1, darker or brighter by what the
+        object takes from the plane's light or adds to it; then what is before the
+        object is laid over both.
+
         Args:
-            radiance: times its coverage.
-            rendered: the same with coverage and change of the plane.
+            radiance: (H, W, 3) of the object, already times its coverage.
+            rendered: (H, W, 4 or 7): its channel 3 is the coverage, those from 4 on are
+                the change of the plane's radiance.
             inputs: of the scene.
         """
+        # the photograph is display-linear: divided by the gain it is radiance
         behind = inputs["backdrop.color"] / self.formation.gain
         shade = (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0)
         if "backdrop.plane" in inputs:
@@ -706,8 +732,11 @@ class Renderer:
     def _compute_steps(
         self, groups: tuple[Group, ...], motion: Motion | None
     ) -> Tensor:
-        """Return half-widths (d,) of differences over which outlines move by a
-        pixel.
+        """Return half-widths (d,) of differences over which outlines move by a pixel.
+
+        Groups that move none, that are larger than `MAX_MEASURED_SIZE`, or all of them
+        without `motion`, count as not moving: they have the default step of a range or
+        of a full turn.
         """
         speeds = torch.zeros(len(self.start))
         coordinates: list[int] = []
@@ -730,13 +759,20 @@ class Renderer:
     def _find_routes(self, groups: tuple[Group, ...]) -> dict[str, frozenset[str]]:
         """Find the scene inputs that each group of coordinates reaches.
 
-        They are found by autograd at a point inside the box.
+        Reaches means that the derivative of the input with respect to one of the
+        group's coordinates is not zero, by autograd at one point. It is needed for
+        adjoints alone, and empty where they are valid for no group.
+
+        Returns:
+            Names of scene inputs, by the group's name.
         """
         if not any(set(group.valid) & ADJOINT_ESTIMATORS for group in groups):
             return {}
         routes: dict[str, set[str]] = {group.name: set() for group in groups}
         generator = torch.Generator().manual_seed(0)
         noise = torch.rand(self.start.shape, generator=generator)
+        # Near the start but off the borders and off special values, where a derivative
+        # may be zero by chance; random weights keep those of an input from cancelling.
         u = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
         with torch.enable_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
@@ -757,9 +793,10 @@ class Renderer:
 
 @lru_cache(maxsize=4)
 def _base_pose_and_center(description: SceneDescription) -> tuple[Tensor, Tensor]:
-    """Return the camera's pose (4, 4) and the object's center (3,) by default.
+    """Return the camera's pose (4, 4) and the object's center (3,) in a scene.
 
-    They are cached, since the center takes all vertices.
+    They are those without inputs of a configuration, and cached, since the center takes
+    all vertices.
     """
     pose = camera_to_world(description)
     center = compute_center(description)
@@ -806,6 +843,12 @@ class _Radiance(torch.autograd.Function):
         denoised: bool,
         *tensors: Tensor,
     ) -> Tensor:
+        """Render the radiance of the inputs `tensors`, whose names are `names`.
+
+        NaN and infinite values become zero. It is denoised, unless `denoised` is False,
+        if the formation requires it, and counts as one render. Other arguments as for
+        `Renderer.render_radiance`; the result is the window of its crop alone.
+        """
         ctx.renderer = renderer
         ctx.names = names
         ctx.seed = seed
@@ -828,7 +871,7 @@ class _Radiance(torch.autograd.Function):
                     inputs, image_seeds, spp
                 )
         rendered = renderer.replace_non_finite(rendered)
-        for guide in guides:
+        for guide in guides:  # one if it is to be denoised, otherwise none
             rendered = denoise_image(
                 rendered,
                 guide[..., :3],
@@ -853,7 +896,8 @@ class _Radiance(torch.autograd.Function):
         cotangent = renderer.replace_non_finite(cotangent)
         by_input = dict[str, Tensor]()
         remaining = list(inputs)
-        # what two reach goes to the more general one
+        # An input that groups of both estimators reach goes to the material form, which
+        # is right for more inputs.
         for estimator in ("material", "adjoint"):
             reached = _reached_inputs(renderer, estimator)
             wrt = [name for name in remaining if name in reached]
@@ -898,6 +942,7 @@ class _Differences(torch.autograd.Function):
     def forward(
         ctx: Any, renderer: Renderer, seed: int, spp: int, u: Tensor, image: Tensor
     ) -> Tensor:
+        """Return the image as it is; keep what its backward pass needs."""
         ctx.renderer = renderer
         ctx.seed = seed
         ctx.spp = spp
@@ -907,6 +952,7 @@ class _Differences(torch.autograd.Function):
     @staticmethod
     @forbid_second_derivatives
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the derivative of u by differences, and the image's unchanged."""
         (u,) = ctx.saved_tensors
         derivative = ctx.renderer.compute_differences(u, cotangent, ctx.seed, ctx.spp)
         return None, None, None, derivative, cotangent

@@ -86,10 +86,12 @@ class Mount:
             center: (3,) center of the object.
             unit_metres: length of a unit of the scene.
         """
+        # the mount's axes are OpenCV's, the scene's are Mitsuba's
         mount_pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
         mount_pose[:3, 3] /= unit_metres
         orbit_rotation = torch.eye(4)
         orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
+        # the center stays where it is
         orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
         camera_inputs = {
             **inputs,
@@ -153,8 +155,10 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
 
 
 def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
-    """Raise FileFormatError unless cameras are few, unique, and the first is in
-    place.
+    """Raise FileFormatError unless cameras of a rig fit together.
+
+    They are 2 to `MAX_CAMERAS`, have names of their own, and the first, which is the
+    scene's camera, has no pose, azimuth or delay.
     """
     if not 2 <= len(mounts) <= MAX_CAMERAS:
         raise FileFormatError(
@@ -325,10 +329,14 @@ def _read_frame_models(
 def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     """Return the factor that is already applied to the positions of a transforms.json.
 
-    It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`.
-    A rotation and a shift of the world change nothing between two cameras. Instant
-    NGP's `scale` and `offset` are applied by the program that reads the file, so its
-    positions are without them.
+    It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`,
+    a matrix of 3 or 4 rows. Its rotation and its shift move all cameras alike, and do
+    not count. Instant NGP's `scale` and `offset` are applied by the program that reads
+    the file, so the positions in it are without them.
+
+    Raises:
+        FileFormatError: the transform is none of rotation, shift and scale, or the
+            scale is out of range.
     """
     scale = 1.0
     if data.get("applied_scale") is not None:
@@ -341,6 +349,7 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
         count = 12 if len(rows) == 3 else 16
         numbers = _parse_numbers(path, "applied_transform", cells, count, MAX_DISTANCE)
         linear = np.reshape(numbers, (-1, 4))[:3, :3]
+        # a rotation times s has the determinant s^3, and times its transpose s^2
         turn_scale = abs(float(np.linalg.det(linear))) ** (1.0 / 3.0)
         if not np.allclose(
             linear @ linear.T, turn_scale**2 * np.eye(3), atol=1e-3 * turn_scale**2
@@ -417,11 +426,16 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
     rotation = np.reshape(
         compute_rotation_entries(x / length, y / length, z / length, w / length), (3, 3)
     )
+    # the file has the map from the world to the camera
     return np.asarray(np.linalg.inv(make_pose(rotation, shift)), np.float64)
 
 
 def _parse_names(path: str, listing_text: str, known_names: Sequence[str]) -> list[str]:
-    """Return the names of cameras in a list with commas, or raise FileFormatError."""
+    """Return the names of cameras in a list with commas.
+
+    Raises FileFormatError unless they are 2 to `MAX_CAMERAS` different ones of
+    `known_names`.
+    """
     names = list(map(str.strip, listing_text.split(",")))
     if not 2 <= len(names) <= MAX_CAMERAS or len(set(names)) < len(names):
         raise FileFormatError(

@@ -53,8 +53,9 @@ MAX_ARC_COSINE = 1.0 - 1e-9
 
 
 def find_rig_parameter(name: str) -> Parameter | None:
-    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`, or
-    None.
+    """Return the parameter of a name `JOINT.x` (or y, z) or `TARGET.weight`.
+
+    None for other names. Whether there is such a joint or target is not asked.
     """
     owner, dot, component = name.rpartition(".")
     if not (owner and dot and component in (*AXES, WEIGHT)):
@@ -121,12 +122,15 @@ class SkeletonRig:
     def __init__(
         self, parts: Sequence[Movable], vertices: IntArray, to_mesh: Float64Array
     ) -> None:
-        """Bring the arrays of all parts into the order of the mesh's vertices, as
-        tensors.
+        """Bring the arrays of all parts into the order of the mesh's vertices.
+
+        They become tensors. Joints of a part are rows of its own nodes; here they are
+        rows of the nodes of all parts, one after the other. Arguments are those of the
+        class.
         """
         self.skeleton = parts[0].skeleton
         self._to_mesh = torch.from_numpy(to_mesh)
-        # without the scale
+        # without the scale, the cube root of the determinant
         self._rotation_to_mesh = torch.from_numpy(
             to_mesh / np.cbrt(np.linalg.det(to_mesh))
         )
@@ -171,8 +175,14 @@ class SkeletonRig:
     def _add_targets(self, parts: Sequence[Movable], vertices: IntArray) -> None:
         """Store the morph targets of parts, for the vertices (V,) of the mesh.
 
-        Of a target only the vertices count that the mesh has; they become rows of the
-        mesh.
+        A target names the vertices of its part that it moves. The mesh has some of
+        them, perhaps several times and in another order: for each the rows of the mesh
+        are found, and the offsets are put into that order.
+
+        Args:
+            parts: of the file.
+            vertices: (V,) for each vertex of the mesh its index in the concatenated
+                vertices of all parts.
         """
         counts = [len(part.vertices) for part in parts]
         vertex_starts = np.cumsum([0, *counts])
@@ -180,6 +190,7 @@ class SkeletonRig:
             is_of_part = (vertices >= start) & (vertices < start + count)
             mesh_rows = np.flatnonzero(is_of_part)
             for index, target in enumerate(part.targets):
+                # of each vertex of the part, its row in the target; -1: it stays
                 row_of_vertex = np.full(count, -1)
                 row_of_vertex[target.rows] = np.arange(len(target.rows))
                 target_rows = row_of_vertex[vertices[mesh_rows] - start]
@@ -220,7 +231,7 @@ class SkeletonRig:
         """Values of all parameters at rest, by name."""
         time = {TIME.name: 0.0} if self.clips else {}
         angles = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
-        # Of targets with the same name, the first counts.
+        # Of targets with the same name, the first counts: it is written last.
         weights = {
             f"{target.name}.{WEIGHT}": target.rest_weight
             for target in reversed(self._targets)
@@ -275,7 +286,9 @@ class SkeletonRig:
     def pose(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
         """Return the vertices (V, 3) float64 in the file's axes and unit.
 
-        Arguments are those of `offsets`.
+        Nodes are posed by the clip, then joints are turned; vertices are morphed, then
+        moved with their joints (linear blend skinning). Arguments are those of
+        `offsets`.
         """
         device = next(iter(values.values()), torch.zeros(())).device
         number_by_name = {name: value.double() for name, value in values.items()}
@@ -287,6 +300,7 @@ class SkeletonRig:
                 playing_clip, seconds.to(device)
             )
         local_matrices = self._turn_joints(local_matrices, number_by_name)
+        # (joints, 3, 4) from the rest pose to the scene, without the last row
         joint_matrices = (
             self._compute_world(local_matrices)[self._nodes.to(device)]
             @ self._inverse_binds.to(device)
@@ -341,9 +355,14 @@ class SkeletonRig:
     def _play_clip(
         self, clip: Clip, seconds: Tensor
     ) -> tuple[Tensor, dict[int, Tensor]]:
-        """Return the local matrices (N, 4, 4) of nodes at a time of a clip.
+        """Return what a clip sets at a time.
 
-        The second result are the weights of morph targets, by node.
+        What it does not set is at rest; a node that the file gives as a matrix stays as
+        it is.
+
+        Returns:
+            The matrices (N, 4, 4) of all nodes to their parents; and the weights (T,)
+            of morph targets, by node, for nodes of which the clip sets them.
         """
         skeleton = self.skeleton
         device = seconds.device
@@ -398,8 +417,9 @@ class SkeletonRig:
                         make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
                         @ rotation
                     )
-            # From the axes of the object to those of the file, then of the parent node
-            # at rest, in which local matrices are.
+            # A turn about the object's axes is R. Conjugation brings it to the axes of
+            # the file, then to those of the parent node at rest, in which local
+            # matrices are.
             rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
             parent = int(self.skeleton.parents[node])
             if parent >= 0:
@@ -436,7 +456,8 @@ def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
         parents: (N,) the parent of each node, -1 for a root.
 
     Returns:
-        For each depth the nodes, and the row of each node's parent in the level above.
+        For each depth, roots first: the nodes (n,), and for each the position of its
+        parent among the nodes of the depth above (n,); without meaning for roots.
     """
     levels = list[tuple[Tensor, Tensor]]()
     nodes = np.flatnonzero(parents < 0)
@@ -452,14 +473,22 @@ def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
 def sample_track(track: Track, seconds: Tensor) -> Tensor:
     """Return the value (W,) of a track at a time (glTF 2.0, appendix C).
 
-    Before its first key and after its last it is constant; rotations have length 1. It
-    is differentiable in the time, but for steps.
+    Between two keys it is that of the first (steps), or interpolated: linearly, on the
+    sphere if it is a rotation, or by a cubic Hermite spline. Before the first key and
+    after the last it is constant; rotations are quaternions of length 1. It is
+    differentiable in the time, but for steps.
+
+    Args:
+        track: its `values` are (K, 1, W), or (K, 3, W) for a spline: the tangent before
+            the key, the value, and the tangent after it.
+        seconds: () the time.
     """
     times = torch.from_numpy(track.times).to(seconds.device)
     keys = torch.from_numpy(track.values).to(seconds.device)
-    # Of a cubic spline the value is between two tangents.
+    # 0, or 1 for a spline, whose value is between two tangents
     value_index = keys.shape[1] // 2
     is_rotation = track.path == "rotation"
+    # the first key after the time; 0 or the number of keys outside of the track
     end_key = int(torch.searchsorted(times, seconds.detach(), right=True))
     if track.interpolation == "STEP" or not 0 < end_key < len(times):
         value = keys[max(0, end_key - 1), value_index]
@@ -472,6 +501,7 @@ def sample_track(track: Track, seconds: Tensor) -> Tensor:
     if track.interpolation == "CUBICSPLINE":
         square = fraction**2
         cube = fraction**3
+        # Tangents are per second: the span in seconds makes them per interval.
         spline = (
             (2.0 * cube - 3.0 * square + 1.0) * start_value
             + span * (cube - 2.0 * square + fraction) * keys[start_key, 2]
@@ -493,6 +523,7 @@ def slerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:
     start = start / start.norm()
     end = end / end.norm()
     cosine = start @ end
+    # a quaternion and its negative are one rotation: take the one nearer to the start
     end = torch.where(cosine < 0.0, -end, end)
     cosine = cosine.abs()
     if float(cosine) > MAX_ARC_COSINE:

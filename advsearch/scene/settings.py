@@ -599,7 +599,8 @@ SettingValues = Mapping[str, float | str | Sequence[float]]
 def find_parameter(name: str) -> Parameter | None:
     """Return the parameter that a setting's name means; None if there is none.
 
-    Also for settings of a mesh around the object.
+    A setting of a mesh around the object, ``pose:chair.yaw``, has that of the object,
+    ``pose.yaw``.
     """
     family, _, full_name = name.partition(":")
     if full_name and family in MESH_FAMILIES:

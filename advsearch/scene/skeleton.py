@@ -87,7 +87,8 @@ def with_ancestors(
 ) -> set[int]:
     """Return nodes and all their ancestors.
 
-    `parents` (N,) are the parents of all nodes, -1 for a root.
+    `parents` (N,) are the parents of all nodes, -1 for a root. The ancestors are found
+    level by level; one that was reached already is not followed again.
     """
     reached = set[int]()
     level = set(nodes)
@@ -100,7 +101,8 @@ def with_ancestors(
 def compute_rotation_entries(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
     """Return the nine entries, row by row, of the rotation of a unit quaternion.
 
-    Its real part is `w`.
+    Its real part is `w`. The components are numbers, or arrays or tensors of one shape,
+    which the entries then have.
     """
     return [
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),

@@ -81,7 +81,12 @@ def unwrap(soup: Soup, chart_group: IntArray | None = None) -> Soup:
 
 
 def _make_grid_uvs(count: int) -> Float64Array:
-    """Return texture coordinates (count, 3, 2): two faces in each cell of a grid."""
+    """Return texture coordinates (count, 3, 2): two faces in each cell of a grid.
+
+    Faces 0 and 1 are the lower left and the upper right half of the first cell, and so
+    on, row by row from the bottom. The grid is the smallest with as many rows as
+    columns that has a place for all.
+    """
     n_columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
     face = np.arange(count)
     cell = face // 2
@@ -94,7 +99,16 @@ def _make_grid_uvs(count: int) -> Float64Array:
 
 
 def _generate_atlas(soup: Soup, groups: Sequence[IntArray]) -> xatlas.Atlas:
-    """Unwrap groups of faces into one atlas, of `ATLAS_SIZE` if they fit into it."""
+    """Unwrap groups of faces into one atlas, of `ATLAS_SIZE` if they fit into it.
+
+    Each group is a mesh of its own for xatlas, with the vertices that it uses, so that
+    no chart has faces of two groups. xatlas makes several atlases of the size where one
+    is too small; then it is run again for one of any size.
+
+    Args:
+        soup: the faces.
+        groups: for each the indices of its faces.
+    """
     for resolution in (ATLAS_SIZE, 0):  # 0: one atlas, however large
         atlas = xatlas.Atlas()
         for group in groups:
@@ -151,6 +165,7 @@ def _find_patches(soup: Soup) -> IntArray:
         return np.zeros(count, dtype=np.int64)
 
     smoothed = _smooth_normals(normals, face, neighbour)
+    # (F,) index of the nearest of the 14 directions
     direction = (smoothed @ _make_cut_directions().T).argmax(axis=1)
     is_same = direction[face] == direction[neighbour]
     patch = find_components(count, face[is_same], neighbour[is_same])
@@ -164,7 +179,14 @@ def _find_patches(soup: Soup) -> IntArray:
 def _smooth_normals(
     normals: Float64Array, face: IntArray, neighbour: IntArray
 ) -> Float64Array:
-    """Average the normals of faces with their neighbours', in several rounds."""
+    """Average the normals of faces with their neighbours', in several rounds.
+
+    A round replaces each normal by the unit mean of itself and its neighbours'.
+
+    Args:
+        normals: (F, 3).
+        face, neighbour: (E,) indices of the two faces of each shared edge.
+    """
     count = len(normals)
     itself = np.arange(count)
     rows = np.concatenate([face, neighbour, itself])
@@ -185,10 +207,16 @@ def _make_cut_directions() -> Float64Array:
 
 
 def _halve_patches(centers: Float64Array, patch: IntArray) -> IntArray:
-    """Halve patches (F,) until they are small.
+    """Halve patches until each has at most `_MAX_CELL_FACES` faces.
+
+    A patch is cut across its longest axis, at the median of its faces' centers.
+
+    Args:
+        centers: (F, 3) of the faces.
+        patch: (F,) the patch of each face.
 
     Returns:
-        The cell (F,) of each face; faces have centers (F, 3).
+        (F,) the piece of each face, numbered from 0.
     """
     cell = np.zeros(len(patch), dtype=np.int64)
     count = 0
@@ -239,7 +267,11 @@ class SurfaceParts:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        """Rasterise the map, and find the center of each cell and of each face."""
+        """Rasterise the map, and find the center of each cell and of each face.
+
+        Parts are the cells, row by row, and then the faces, unless there are more than
+        `MAX_FACES`: then the faces are left out.
+        """
         self.mesh = mesh
         self._mesh_uvs = mesh.uvs[mesh.faces].astype(np.float64)
         self.is_unwrapped = not _has_unique_uvs(mesh, self._mesh_uvs)
@@ -255,6 +287,7 @@ class SurfaceParts:
             [charts.compute_positions().reshape(-1, 3), face_centers]
         )
         self.centers = centers.astype(np.float64)
+        # the middle of each cell; row 0 is at v = 1
         row, column = np.divmod(np.arange(MAP_SIZE * MAP_SIZE), MAP_SIZE)
         cell_uvs = np.stack(
             [(column + 0.5) / MAP_SIZE, 1.0 - (row + 0.5) / MAP_SIZE], axis=1
@@ -270,14 +303,17 @@ class SurfaceParts:
         return kinds
 
     def find_cells(self, face: IntArray, uv: Float64Array) -> IntArray:
-        """Return the cells (n,) of points on faces.
+        """Return the index of the map's cell (n,) in which each point on a face lies.
+
+        Where the map has texture coordinates of its own, a point is taken to it by its
+        barycentric weights in the face. What is outside counts as on the border.
 
         Args:
             face: (n,) index of the face.
             uv: (n, 2) the mesh's own texture coordinates.
         """
         if self.is_unwrapped:
-            # rows run along v here
+            # The order is (row, column), so v and u. No area: all three weights alike.
             weights = compute_barycentric(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
@@ -327,8 +363,10 @@ def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
 def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
     """Return whether texture coordinates (F, 3, 2) tell points of a surface apart.
 
-    They lie in the unit square, give almost all of the surface an area, cover enough of
-    the square, and hardly any of it twice.
+    They do if they lie in the unit square, give almost all of the surface an area,
+    cover enough of the square, and hardly any of it twice. The last two are tested on a
+    raster of `_TEST_RASTER_SIZE`; a negative tolerance there leaves out pixels on the
+    border of a face, which neighbours share.
     """
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
@@ -342,6 +380,7 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
         (_TEST_RASTER_SIZE, _TEST_RASTER_SIZE),
         tolerance=-1e-6,
     )
+    # pixels in any face; and how often a pixel is in one more face
     covered = len(np.unique(row * _TEST_RASTER_SIZE + column))
     doubled = len(row) - covered
     return (

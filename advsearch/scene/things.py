@@ -90,7 +90,8 @@ class ThingPart(MeshPart):
 def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
     """Read the things of a setting, see above.
 
-    A name that is taken gets a number behind it, unless it was chosen with `name=`.
+    They are separated by semicolons. A name that is taken gets a number behind it,
+    unless it was chosen with `name=`.
 
     Raises:
         InputError: it is invalid, or has more than `MAX_THINGS`.
@@ -104,6 +105,7 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
                 f"things: {part}: another thing of the scene is called "
                 f"{thing.name}; choose another name"
             )
+        # car, car-2, car-3: the number before is taken off again
         suffix = 2
         while thing.name in reserved:
             thing = replace(
@@ -226,7 +228,9 @@ def _make_thing(
 ) -> tuple[ThingPart, list[str]]:
     """Return a thing that stands in a scene, and remarks on it.
 
-    Arguments and errors are as for `add_things`.
+    Remarks are those of its file, doubts about its size, and where there are lanes a
+    guess of its front. `thing` is what was asked for; other arguments and errors are as
+    for `add_things`.
     """
     object_spec = thing.object_spec
     name = thing.name
@@ -257,7 +261,10 @@ def _make_thing(
 
 
 def _list_overlap_remarks(scene: SceneDescription) -> list[str]:
-    """Return a remark on each two of the object and the things that overlap."""
+    """Return a remark on each pair that overlaps, of the object and the things.
+
+    That is by their convex outlines from above, at heights that both have.
+    """
     footprints = {"the object": compute_footprint(scene.base_vertices)} | {
         name: compute_footprint(compute_base_vertices(part))
         for name, part in scene.meshes.items()
@@ -280,8 +287,13 @@ def _compute_pose(
     """Return the pose (4, 4) of a thing: at its place, on the ground, turned and
     scaled.
 
-    `metres` is the longest side that it has.
+    Args:
+        scene: with the object, whose size is the unit of lengths.
+        asset: the thing's object.
+        requested: where it stands and how it is turned.
+        metres: its longest side.
     """
+    # the point of the mesh that is put on the ground, and its longest side
     foot_point, extent = find_footing(asset.mesh.vertices.astype(np.float64))
     scaled_rotation = (
         metres / scene.metres / extent * make_rotation(requested.heading, 0.0, 0.0)
@@ -318,10 +330,12 @@ def find_ground_height(scene: SceneDescription, position: Float64Array) -> float
 def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list[float]:
     """Return the heights of triangles (F, 3 corners, 3) above or below a point (2,).
 
-    Only triangles that have the point inside count, seen from above; those that stand
-    upright do not.
+    A triangle counts if the point is inside it or on its border, seen from above; one
+    that stands upright does not. Its height is that of its plane at the point.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
+    # Signed, from above, of the triangles that the point makes with each side. Divided
+    # by their sum they are the weights of the corners opposite, a, b and c.
     doubled_areas = [
         (end[:, 0] - start[:, 0]) * (position[1] - start[:, 1])
         - (end[:, 1] - start[:, 1]) * (position[0] - start[:, 0])
@@ -351,7 +365,10 @@ def find_overlapping_solid(scene: SceneDescription, footprint: Footprint) -> str
 
 
 def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with a remark on its object and each thing inside a solid."""
+    """Return the scene with a remark on its object and each thing inside a solid.
+
+    Solids are those of the place around it; without any the scene is returned as it is.
+    """
     if not any(part.solids for part in scene.surrounding_meshes.values()):
         return scene
     footprints = {"the object": compute_footprint(scene.base_vertices)}
@@ -373,8 +390,9 @@ def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
 def list_camera_remarks(
     scene: SceneDescription, eyes: Sequence[Float64Array]
 ) -> tuple[str, ...]:
-    """Return a remark where cameras, at positions (3,) in metres, are inside a
-    solid.
+    """Return a remark where cameras are inside a solid of the place; empty if none is.
+
+    `eyes` are their positions (3,) in metres, at least one.
     """
     solid_names = list[str]()
     for eye in eyes:

@@ -102,8 +102,9 @@ def compute_rotation(up: str, front: str) -> Float64Array:
 def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -> Soup:
     """Join parts into one soup of unit extent with welded points.
 
-    The lowest corner of its box becomes the origin before it is turned. Vertices that
-    no face has count neither for the extent nor for the corner.
+    A vertex v becomes turn (v - low) / extent, with low the lowest corner of the
+    bounding box and extent its largest side. Vertices that no face has count for
+    neither. Normals are turned likewise, and become unit vectors.
 
     Args:
         parts: at least one.
@@ -171,7 +172,7 @@ def _check_finite(vertices: Float64Array, source: str) -> None:
 
 
 def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
-    """Merge vertices (V, 3) that are closer than `WELD_DISTANCE`.
+    """Merge vertices (V, 3) that are closer than `WELD_DISTANCE` into one point.
 
     Returns:
         The points (P, 3), and the point of each vertex (V,).
@@ -179,6 +180,8 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
     # Imported late, as in `parts`.
     from scipy.spatial import cKDTree
 
+    # Equal vertices first, then near ones: chains of near points become one cluster,
+    # and its first point stands for all.
     points, point_of_vertex = np.unique(vertices, axis=0, return_inverse=True)
     point_of_vertex = point_of_vertex.reshape(-1)
     pairs = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
@@ -295,13 +298,14 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     end = np.roll(faces, -1, axis=1).reshape(-1)
     lower = np.minimum(start, end)
     upper = np.maximum(start, end)
-    # Sorted by their ends, the sides of faces that are one edge follow one another.
+    # Sides of faces, sorted by their ends: those that are one edge follow one another.
     order = np.lexsort((upper, lower))
     is_new_edge = np.concatenate(
         [[True], (np.diff(lower[order]) != 0) | (np.diff(upper[order]) != 0)]
     )
     edge_entry = np.flatnonzero(is_new_edge)
     edge_counts = np.diff(np.append(edge_entry, len(order)))
+    # positions in the order at which a run of exactly two sides begins
     pair_entry = edge_entry[edge_counts == 2]
     left_corner = order[pair_entry]
     right_corner = order[pair_entry + 1]
@@ -311,9 +315,10 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 def _link_windings(
     left_face: IntArray, right_face: IntArray, same_direction: BoolArray
 ) -> tuple[IntArray, IntArray]:
-    """Return the links between the nodes "as it is" (2 f) and "turned" (2 f + 1).
+    """Return the links (2 E) between the nodes of faces, see `_find_turned_faces`.
 
-    Each edge has two links: between the nodes of its faces that agree with one another.
+    Face f is the nodes 2 f, "as it is", and 2 f + 1, "turned". Each edge has two links:
+    between the nodes of its two faces that agree with one another in winding.
 
     Args:
         left_face: one face of each shared edge.
@@ -331,9 +336,11 @@ def _link_windings(
 def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
     """Decide which faces to turn over so that neighbours agree in winding.
 
-    Every face is two nodes of a graph, "as it is" and "turned". Neighbours that agree
-    are linked like to like, others crosswise. A shell is orientable if the two nodes of
-    its faces are in two components. Each shell keeps the winding of most of its area.
+    Every face is two nodes of a graph, "as it is" (2 f) and "turned" (2 f + 1).
+    Neighbours that agree are linked like to like, others crosswise. So a component is a
+    choice for all faces of a shell, and the shell's other component is the reverse
+    choice. If both are one component, the shell is one-sided. Each shell keeps the
+    winding of most of its area.
 
     Returns:
         Which faces (F,) to turn over; the shell of each face (F,); and whether some
@@ -345,7 +352,8 @@ def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
     component = find_components(2 * len(area), starts, ends)
     as_is = component[0::2]
     turned = component[1::2]
-    # Of two windings that have the same area, the one of the first face is left.
+    # The area that each choice leaves as it is. A face is turned if more area is left
+    # by the reverse choice; of equal areas, the first face's winding is kept.
     component_area = np.bincount(
         as_is, weights=area, minlength=int(component.max()) + 1
     )
@@ -372,7 +380,11 @@ def _compute_shell_bounds(
 def _find_closed_shells(
     soup: Soup, shell: IntArray, face_counts: IntArray
 ) -> BoolArray:
-    """Return for each shell (S,) whether all its edges belong to two of its faces."""
+    """Return for each shell (S,) whether all its edges belong to two of its faces.
+
+    Then twice the number of its shared edges is its number of sides, three for each
+    face. `shell` is (F,), `face_counts` (S,).
+    """
     edge_shell = shell[find_shared_edges(soup.faces)[0] // 3]
     paired_edges = np.bincount(edge_shell, minlength=len(face_counts)) * 2
     return np.equal(paired_edges, 3 * face_counts)
@@ -382,11 +394,11 @@ def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
     """Return for each shell (S,) whether it must be turned over.
 
     A closed shell, all of whose edges belong to exactly two of its faces, is turned if
-    its signed volume is negative, unless it lies within another closed shell (then it
-    is the wall of a hollow) and the file's normals do not object. If most of the volume
-    is negative, the whole object counts as inside out: everything is turned, and the
-    rule holds for the result. An open sheet is turned if the file's normals point away
-    from its front.
+    its signed volume is negative. An exception is one within another closed shell: it
+    is taken for the wall of a hollow, and stays, unless the file's normals say
+    otherwise. If the signed volume of all closed shells together is negative, the whole
+    object counts as inside out: everything is turned, and the rule holds for the
+    result. An open sheet is turned if the file's normals point away from its front.
 
     Args:
         soup: a soup whose neighbours agree in winding.
@@ -403,6 +415,7 @@ def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
     # Agreement with the file's normals; 0 if it has none.
     agreement = np.bincount(shell, weights=face_agreement, minlength=n_shells)
     lower, upper = _compute_shell_bounds(soup, shell, n_shells)
+    # Below, `is_inverted` is said of the object after it was turned as a whole.
     mostly_negative = volume[is_closed].sum() < 0.0
     is_inverted = (volume < 0.0) ^ mostly_negative
     for index in np.flatnonzero(is_closed & is_inverted):
@@ -413,6 +426,7 @@ def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
         )
         if not is_enclosing.any():
             continue  # it stays inverted
+        # the wall of a hollow: by the file's normals, whose sense turned with the whole
         if mostly_negative:
             is_inverted[index] = agreement[index] > 0.0
         else:
@@ -426,7 +440,13 @@ def _compute_signed_volumes(
     """Return six times the signed volume of each shell, (S,).
 
     It is the sum of tetrahedra from the shell's center to its faces, which is accurate
-    far from the origin too.
+    far from the origin too; positive if the faces' fronts are outside.
+
+    Args:
+        soup: the faces.
+        shell: (F,) the shell of each face.
+        vectors: (F, 3) their normals, as long as twice the areas.
+        face_counts: (S,) the number of faces of each shell.
     """
     corners = soup.points[soup.faces]
     coordinate_sums = [
@@ -445,10 +465,10 @@ def _compute_signed_volumes(
 def _fix_normals(soup: Soup, notes: Notes) -> Soup:
     """Return the soup with a normal on the front of its face at every corner.
 
-    The file's normals are kept if they agree with the faces on most of the surface. If
-    they disagree on most of it they are all reversed; otherwise all are computed anew.
-    What is missing, or on the back of its face, is computed: smooth, or that of the
-    face where a part is flat.
+    The file's normals are kept if they are on the front of their faces on most of the
+    surface (`MIN_NORMAL_AGREEMENT`), and all reversed if they are on the back on most
+    of it; otherwise all are computed anew. A single one that is missing, or on the back
+    of its face, is computed too: smooth, or that of the face where a part is flat.
     """
     vectors = soup.compute_face_vectors()
     area = np.linalg.norm(vectors, axis=1)
@@ -479,7 +499,8 @@ def compute_smooth_normals(soup: Soup) -> Float64Array:
 
     At each point, the faces that can be reached from one another over edges with less
     than the crease angle share one normal: the mean of their normals weighted by their
-    angles at that point (Thuermer and Wuethrich 1998).
+    angles at that point (Thuermer and Wuethrich 1998). Corners are the nodes of a
+    graph, and a smooth edge links the two corners at either end of it.
     """
     face_normals = normalize_vectors(soup.compute_face_vectors())
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
@@ -499,7 +520,8 @@ def compute_smooth_normals(soup: Soup) -> Float64Array:
         axis=1,
     )
     smooth_normals = normalize_vectors(normal_sums)[smoothing_group].reshape(-1, 3, 3)
-    # False also for NaN, where normals cancel.
+    # The face's own normal where the mean is not on its front. False also for NaN,
+    # where normals cancel.
     is_valid = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True) > 0.0
     return np.where(is_valid, smooth_normals, face_normals[:, None])
 
@@ -511,6 +533,7 @@ def _get_next_corner(corner: IntArray) -> IntArray:
 
 def _compute_corner_angles(soup: Soup) -> Float64Array:
     """Return the angle in radians at each corner, (F, 3)."""
+    # by arctan2, which is accurate for angles near 0 and 180 degrees too
     corners = soup.points[soup.faces]
     to_next = np.roll(corners, -1, axis=1) - corners
     to_previous = np.roll(corners, 1, axis=1) - corners
@@ -546,7 +569,8 @@ def normalize_vectors(vectors: Float64Array) -> Float64Array:
 def find_components(count: int, edge_starts: IntArray, edge_ends: IntArray) -> IntArray:
     """Return the connected component (count,) of each node of a graph.
 
-    Edges are between the nodes `edge_starts` (E,) and `edge_ends` (E,).
+    Components are numbered from 0. Edges are between the nodes `edge_starts` (E,) and
+    `edge_ends` (E,), in no direction.
     """
     # Imported late, as in `parts`.
     from scipy.sparse import coo_array, csgraph
@@ -640,6 +664,9 @@ def _triangulate_equal(
 ) -> tuple[IntArray, int, int]:
     """Triangulate polygons (P, n) with the same number of corners.
 
+    First all triangles from the first corner (a fan). Of a convex polygon they all have
+    a positive area; of the others, ears are cut off instead.
+
     Args:
         points: (C, 3).
         corners: (P, n) indices into `points`.
@@ -672,8 +699,9 @@ def _triangulate_equal(
 def _project_to_planes(corners: Float64Array) -> Float64Array:
     """Project polygons (P, n, 3) to their planes, (P, n, 2).
 
-    They are counter-clockwise and about 1 large. The plane is the one whose normal is
-    the sum of the cross products of successive corners (Newell).
+    The plane is the one whose normal is the sum of the cross products of successive
+    corners (Newell). Seen from the normal's side the results are counter-clockwise;
+    they are centered, and scaled so that their largest coordinate is about 1.
     """
     corners = corners - corners.mean(axis=1, keepdims=True)
     sizes = np.abs(corners).max(axis=(1, 2), keepdims=True)
@@ -741,10 +769,14 @@ class _EarCutter:
     def step(self, budget: int) -> None:
         """Try the tip of every active polygon; cut it off if it is an ear.
 
+        Then the next corner is the tip. Polygons with all their triangles are no longer
+        active.
+
         Args:
             budget: limit of the comparisons; then all ears are cut off untested.
         """
         active = self.active
+        # (active,) the tip b of each, and its neighbours a and c
         b = self.tip[active]
         a = self.previous_corner[active, b]
         c = self.next_corner[active, b]
@@ -759,8 +791,13 @@ class _EarCutter:
     ) -> BoolArray:
         """Return which active polygons lose their corner b, between a and c.
 
-        These are ears, the last three corners, and, as failures, corners of polygons
-        that have no ear, and all corners once the budget is spent.
+        They do if b is the tip of an ear, or one of the last three corners. As a
+        failure, which is recorded, they also do if all corners were tried without an
+        ear, or once the budget is spent.
+
+        Args:
+            a, b, c: (active,) three successive corners of each active polygon.
+            budget: limit of the comparisons.
         """
         active = self.active
         n_left = self.flat.shape[1] - self.n_cut[active]
@@ -778,7 +815,11 @@ class _EarCutter:
         return np.asarray(is_cut | is_hopeless)
 
     def _cut(self, rows: IntArray, a: IntArray, b: IntArray, c: IntArray) -> None:
-        """Cut the ears a, b, c off the polygons in `rows`; b is no corner any more."""
+        """Cut the ears a, b, c off the polygons in `rows`, (N,) each.
+
+        The triangle is stored, and b is taken out of the linked list of corners and of
+        the dents.
+        """
         self.triangles[rows, self.n_cut[rows]] = np.stack([a, b, c], axis=1)
         self.is_present[rows] &= self.dent[rows] != b[:, None]
         self.next_corner[rows, a] = c
@@ -823,6 +864,7 @@ def _find_dents(flat: Float64Array, area: Float64Array) -> tuple[IntArray, BoolA
     is_dent = (
         _compute_doubled_areas(previous, flat, following) <= _MIN_AREA * area[:, None]
     )
+    # False (a dent) is sorted before True; what is no dent fills up the rows
     max_dents = int(is_dent.sum(axis=1).max())
     dent = np.argsort(~is_dent, axis=1, kind="stable")[:, :max_dents]
     return dent, np.take_along_axis(is_dent, dent, axis=1)
@@ -835,6 +877,9 @@ def _is_ear(
     min_area: Float64Array,
 ) -> BoolArray:
     """Return which triangles have an area and contain no present point, (P,).
+
+    A point is inside if it is on the left of all three sides, which run
+    counter-clockwise; on a side counts as inside.
 
     Args:
         corners: the three corners of each triangle, (P, 2) each.

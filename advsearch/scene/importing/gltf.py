@@ -71,7 +71,11 @@ def read_header(path: Path, data: bytes) -> Header:
 
 
 def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
-    """Parse the JSON of a header, which must have an asset."""
+    """Parse the JSON of a header, which must have an asset.
+
+    It is checked before that it is not too large: commas and brackets are counted as an
+    upper bound of its values. Raises FileFormatError.
+    """
     text = decode_text(chunk)
     check_most(
         path,
@@ -116,6 +120,7 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
         FileFormatError: some are no objects.
     """
     extensions: set[str] = set()
+    # A walk through all lists and objects but `extras`, which are free.
     pending: list[JsonValue] = [content]
     while pending:
         entry = pending.pop()
@@ -285,8 +290,9 @@ def find_unread_extensions(entry: Entry) -> list[str]:
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     """Check the accessors of a primitive; raise FileFormatError if one is wrong.
 
-    Their types, that attributes have as many values as positions, and that indices are
-    unsigned integers. Numbers that only an unsupported extension has are an error too.
+    Types have to be those of the format, attributes need as many values as positions,
+    and indices are unsigned integers. An accessor without numbers is an error if an
+    extension that is not supported may have them, compressed.
     """
     accessors = {
         name: header.accessors[index] for name, index in primitive.attributes.items()
@@ -330,8 +336,9 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
 def _check_tree(path: Path, header: Header) -> None:
     """Check the number of triangles and primitives, and that nodes form trees.
 
-    A mesh counts as often as nodes draw it. Nodes have one parent at most, no cycles,
-    and are at most `DEEPEST_TREE` deep. Raises FileFormatError.
+    A mesh counts as often as nodes draw it, and once if none does. Nodes have one
+    parent at most, no cycles, and are at most `DEEPEST_TREE` deep. Raises
+    FileFormatError.
     """
     triangles_of_mesh = [
         sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
@@ -356,6 +363,7 @@ def _check_tree(path: Path, header: Header) -> None:
         LARGEST_TREE,
         "glTF of at most {} nodes and pieces",
     )
+    # From the roots down, level by level. A cycle has no root, so it is never reached.
     level = [index for index in range(len(header.nodes)) if index not in children]
     n_reached = 0
     depth = 0
@@ -494,7 +502,8 @@ class GltfFile:
     def read_values(self, index: int) -> npt.NDArray[Any]:
         """Return the values (count, width) of an accessor as they are stored.
 
-        Sparse values are filled in.
+        They are zeros, or those of the buffer view; sparse values replace some rows
+        (section 3.6.2.3).
 
         Raises:
             FileFormatError: they reach beyond their view.
@@ -554,6 +563,13 @@ class GltfFile:
         stride: int | None = None,
     ) -> npt.NDArray[Any]:
         """Return an array in a buffer view, without copying it.
+
+        Args:
+            view: index of the buffer view.
+            offset: its first byte in the view.
+            shape: rows and columns.
+            kind: type of its numbers.
+            stride: bytes from one row to the next; None: rows follow without a gap.
 
         Raises:
             FileFormatError: the view is too short.

@@ -467,6 +467,7 @@ class GltfSurfaces:
         name = "(embedded)" if is_embedded else str(entry.uri)
 
         def load_content() -> bytes:
+            """Return the bytes of the image's file; empty if it has none."""
             if entry.uri is not None:
                 return self.file.load_uri(entry.uri)
             if entry.bufferView is None:
@@ -600,14 +601,28 @@ class GltfSurfaces:
     ) -> tuple[list[Float32Array], float, float]:
         """Pad images along an axis as far as texture coordinates reach.
 
-        Images that would become too large stay as they are, with a note. Arguments and
-        result are those of `_fit_axis`; `has_border` is whether pads are black (flat in
-        a normal map), and otherwise repeat the edge.
+        Then the renderer, which repeats textures, finds in the pad what the wrap mode
+        asks for. Images that would become larger than twice the limit of a texture stay
+        as they are, with a note.
+
+        Args:
+            images: of one surface, perhaps of different sizes.
+            axis: axis of their arrays, 0 for rows.
+            bounds: smallest and largest texture coordinate along the axis.
+            normals_index: which of the images is a normal map.
+            has_border: whether pads are black (flat in a normal map); otherwise they
+                repeat the edge.
+
+        Returns:
+            The images; and the scale and shift by which a coordinate of an old image
+            becomes that of the padded one, t -> scale t + shift.
         """
         min_uv, max_uv = bounds
         sizes = [image.shape[axis] for image in images]
-        # A pad is an integer number of units, each as many texels in every image: the
-        # images have `unit_size` units.
+        # All images need pads of the same width in texture coordinates, and whole
+        # texels. So an image is divided into as many units as the greatest common
+        # divisor of the sizes: a unit is a whole number of texels in each, and pads are
+        # whole units. One more on each side keeps filtering from reaching beyond them.
         unit_size = int(np.gcd.reduce(sizes))
         units_before = max(0, int(np.ceil(-min_uv * unit_size))) + 1
         units_after = max(0, int(np.ceil((max_uv - 1.0) * unit_size))) + 1
@@ -664,15 +679,17 @@ def _pad(
 
 
 def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
-    """Enlarge an image to at least `SMALL_IMAGE_SIZE` texels along an axis,
-    interpolating linearly.
+    """Enlarge an image to at least `SMALL_IMAGE_SIZE` texels along an axis.
 
-    At that size a border of one texel is not visible.
+    It is interpolated linearly, by a whole factor. At that size a border of one texel
+    is not visible.
     """
     size = picture.shape[axis]
+    # rounded up
     factor = -(-SMALL_IMAGE_SIZE // size)
     if factor == 1:
         return picture
+    # of the new texels' centers, in old texels with integers at their centers
     position = ((np.arange(size * factor) + 0.5) / factor - 0.5).clip(0.0, size - 1.0)
     lower = np.floor(position).astype(np.int64)
     shape = [1] * picture.ndim
@@ -838,7 +855,7 @@ def _make_parts(
     """Return the parts of pieces with their surfaces and final UVs.
 
     Keys are mesh and index of the primitive in it. Pieces with the same material share
-    one surface.
+    one surface, whose images fit the texture coordinates of all of them.
     """
     groups = dict[int | None, dict[tuple[int, int], PrimitiveData]]()
     for key, piece in with_faces.items():
@@ -856,7 +873,10 @@ def _make_parts(
 
 
 def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose]:
-    """Return the skins of some nodes, in the pose of the scene, by index."""
+    """Return the skins of some nodes, in the pose of the scene, by index.
+
+    A skin's matrices are the poses of its joints times its inverse bind matrices.
+    """
     header = file.header
     # Joints may be outside of the scene that is shown.
     all_poses = dict(
@@ -892,6 +912,9 @@ def _pose_parts(
     skeleton: Skeleton | None,
 ) -> list[ImportedPart]:
     """Return the primitives that nodes draw, in the pose of each node.
+
+    One with a skin is posed by its joints alone; others by their node. A mesh that
+    several nodes draw is there several times.
 
     Args:
         file: the glTF file.
@@ -980,7 +1003,11 @@ class PrimitiveData(NamedTuple):
 def _read_vertex_colors(
     file: GltfFile, attributes: Mapping[str, int], used: IntArray, faces: IntArray
 ) -> tuple[Float64Array | None, bool]:
-    """Return colors (F, 3, 3) of faces, if any, and whether an alpha is below 1."""
+    """Return vertex colors at the corners of faces, and whether an alpha is below 1.
+
+    They are linear, (F, 3, 3), or None if the primitive has none. `used` are the
+    vertices that are used, and `faces` (F, 3) indices into these.
+    """
     if "COLOR_0" not in attributes:
         return None, False
     rgba = file.read_numbers(attributes["COLOR_0"], used)
@@ -1086,7 +1113,14 @@ def _read_texture_coordinates(
 ) -> Float64Array | None:
     """Return the texture coordinates of used vertices, or None if there are none.
 
-    They are (N, 2) after the texture's transform, (0, 0) at its top left corner.
+    They are (N, 2) after the texture's transform (KHR_texture_transform): scaled,
+    rotated, then shifted. (0, 0) is the texture's top left corner.
+
+    Args:
+        file: the glTF file.
+        attributes: accessors of the primitive, by name.
+        use: the texture for which they are; None: the first coordinates as they are.
+        used: (N,) the vertices that are used.
     """
     name = "TEXCOORD_0" if use is None else use.uv_attribute
     if name not in attributes:
@@ -1109,7 +1143,13 @@ def _read_texture_coordinates(
 def _make_triangles(order: IntArray, mode: int) -> IntArray:
     """Return the faces (F, 3) of a primitive of a mode (section 3.7.2.1).
 
-    `order` are its vertices in the order in which it lists them.
+    A list has three vertices for each face; a strip or a fan one for each face after
+    the first two. Of a strip every second face has its last two corners swapped, so
+    that all have the same winding.
+
+    Args:
+        order: the vertices in the order in which the primitive lists them.
+        mode: `TRIANGLES`, `STRIP` or `FAN`.
     """
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)

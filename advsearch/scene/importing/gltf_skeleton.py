@@ -51,7 +51,11 @@ MIN_QUATERNION_LENGTH = 1e-6  # minimum length of a quaternion; the format requi
 
 
 def iterate_poses(header: Header) -> Iterator[tuple[int, Float64Array]]:
-    """Yield the nodes of the file's scene with their poses (4, 4) in it."""
+    """Yield the index and the pose (4, 4) of each node of the file's scene.
+
+    The pose leads from the node's coordinates to the scene's. A file without scenes
+    shows all nodes. The order is that of a walk through the trees, not of indices.
+    """
     if header.scenes:
         roots = list(header.scenes[header.scene or 0].nodes)
     else:
@@ -68,7 +72,8 @@ def iterate_poses(header: Header) -> Iterator[tuple[int, Float64Array]]:
 def compute_matrix(node: Node) -> Float64Array:
     """Return the matrix (4, 4) from a node to its parent.
 
-    It is the node's own matrix, or else translation, rotation (normalised) and scale.
+    It is the node's own matrix, which the file stores by columns; or else its scale,
+    then its rotation (normalised), then its translation.
     """
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
@@ -194,7 +199,8 @@ def pose_part(
     normals = part.normals
     vertices = np.einsum("vij,vj->vi", linear, part.vertices) + transforms[:, :, 3]
     if normals is not None:
-        # Normals are transformed by the cofactors.
+        # The cofactors are the inverse transpose times the determinant, and exist for
+        # matrices without an inverse too.
         cofactors = np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
         normals = np.einsum("vij,vj->vi", cofactors, normals)
     is_mirrored = bool((np.linalg.det(linear) < 0.0).all())
@@ -322,7 +328,7 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
 
     Raises:
         FileFormatError: the primitives of a mesh have different numbers of targets, or
-            too much moves.
+            there is more to move than `MAX_MOVES`: vertices times targets, plus joints.
     """
     header = file.header
     n_targets = dict[int, int]()
@@ -383,6 +389,7 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
         unique_names.make_unique(bone_names.get(index) or node.name or f"node-{index}")
         for index, node in enumerate(header.nodes)
     ]
+    # of nodes without a rotation the identity, (x, y, z, w)
     rotations = np.array(
         [node.rotation or [0.0, 0.0, 0.0, 1.0] for node in header.nodes]
     )
@@ -420,6 +427,11 @@ def _read_clips(
     That is what sets the transform of a node with a mesh, of a joint or of an ancestor
     of one, and the weights of morph targets. A clip without any such channel is left
     out.
+
+    Args:
+        file: the glTF file.
+        target_counts: the nodes with a mesh, and their number of morph targets.
+        skins: indices of the skins of these nodes.
     """
     header = file.header
     joints = (joint for skin in skins for joint in header.skins[skin].joints)
@@ -466,7 +478,17 @@ def _read_track(
     channel: Channel,
     target_counts: Mapping[int, int],
 ) -> Track:
-    """Read one channel of a clip.
+    """Read one channel of a clip: the keys of one property of a node.
+
+    The file has a flat list of values: for each key one value, or for a cubic spline
+    the tangent before it, the value and the tangent after it; and each of these for
+    every morph target if the property is their weights.
+
+    Args:
+        file: the glTF file.
+        animation: the clip.
+        channel: one of its channels.
+        target_counts: number of morph targets, by node.
 
     Raises:
         FileFormatError: its keys are not as the format defines them.
@@ -511,7 +533,11 @@ def _count_numbers(count: int) -> str:
 
 
 def _read_times(file: GltfFile, index: int) -> Float64Array:
-    """Return the times (K,) in seconds of the keys of a clip, which must rise."""
+    """Return the times (K,) in seconds of the keys of a clip, which must rise.
+
+    `index` is that of their accessor. Raises FileFormatError: it is of another type, or
+    times do not rise from 0 or later.
+    """
     path = file.path
     accessor = file.header.accessors[index]
     is_float32 = accessor.componentType == 5126

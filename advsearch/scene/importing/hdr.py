@@ -133,7 +133,11 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
 def _read_layer(
     file: Path, data: bytes
 ) -> tuple[dict[str, Any], dict[str, Plane], list[str]]:
-    """Return the header, the planes and the notes of the layer that is the image."""
+    """Return the header, the planes and the notes of the layer that is the image.
+
+    Planes are by `CHANNEL_NAMES`. The file is opened twice: first its header alone, to
+    check its size before pixels are read. Raises ValueError if channels are missing.
+    """
     with OpenEXR.File(
         io.BytesIO(data), separate_channels=True, header_only=True
     ) as exr_file:
@@ -216,6 +220,9 @@ def _select_layer(
 ) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
     """Select the layer that is the image.
 
+    That is the one whose name stands first in `MAIN_LAYER_NAMES`; of equal ones, and if
+    there is none, one with colors before one with luminance, and then the first.
+
     Args:
         file: the file, for messages.
         parts: header and channels of each part.
@@ -267,9 +274,16 @@ def _find_color_layers(
 ) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
     """Return the name, header and channels of every layer with color or luminance.
 
-    Channels are by what they hold, see `CHANNEL_NAMES`; in a layer's name their part
-    counts only if the layer has none of its own. Luminance Y with X or Z is no
-    luminance, but XYZ, and chroma needs both RY and BY.
+    A channel's name is that of its layer, a dot, and what it holds: "diffuse.R". Those
+    without a dot are of the layer "", which has the name of its part if the file has
+    several. A layer counts if it has R, G and B, or luminance Y: alone, or with both
+    chroma channels RY and BY. Y beside X or Z is a color of XYZ and does not count.
+
+    Args:
+        parts: header and channels of each part.
+
+    Returns:
+        Channels are by what they hold, see `CHANNEL_NAMES`.
     """
     layers: list[tuple[str, dict[str, Any], dict[str, Any]]] = []
     for header, channels in parts:
@@ -296,7 +310,9 @@ def _convert_luminance(
 ) -> dict[str, Plane]:
     """Convert luminance, and chroma if there is any, to red, green and blue.
 
-    RY = (R - Y) / Y, and BY likewise.
+    RY is (R - Y) / Y and BY is (B - Y) / Y, so that R and B follow; G follows from Y,
+    the weighted mean of the three. Chroma may have fewer pixels than `size`, and is
+    interpolated. Without chroma the image is grey.
     """
     if "RY" not in planes:
         return dict.fromkeys("RGB", planes["Y"])
@@ -316,7 +332,8 @@ def _convert_luminance(
 def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     """Interpolate chroma, which has a value at every n-th row and column, to a size.
 
-    Past the last value it is repeated.
+    Linearly, first along rows and then along columns. Past the last value it is
+    repeated.
     """
     for axis in (0, 1):
         last_index = plane.shape[axis] - 1
@@ -324,6 +341,7 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
         position = np.minimum(np.arange(size[axis]) / spacing, last_index)
         lower = position.astype(np.int64)
         upper = np.minimum(lower + 1, last_index)
+        # (rows, 1) or (1, columns)
         fraction = np.expand_dims((position - lower).astype(np.float32), 1 - axis)
         plane = (
             plane.take(lower, axis) * (1.0 - fraction)
@@ -335,7 +353,11 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
 def _intersect_ranges(
     data_start: int, data_length: int, start: int, length: int
 ) -> slice:
-    """Return what two ranges have in common; it stops before its start if nothing."""
+    """Return what two ranges of integers have in common.
+
+    Each is a start and a length. The slice stops before its start if they have nothing
+    in common.
+    """
     stop = min(data_start + data_length, start + length)
     return slice(max(data_start, start), stop)
 
@@ -345,7 +367,9 @@ def _crop_to_display_window(
 ) -> Planes:
     """Crop or pad planes from the data window to the display window.
 
-    Pads are black; data that is cropped away is noted.
+    Both windows are rectangles in one grid of pixels, which may overlap in part: a
+    file's data need not be all of its image. Pads are black; data that is cropped away
+    is noted in `notes`. Planes have the size of the data window.
     """
     (data_top, data_left), data_size = _read_window(header, "dataWindow")
     (top, left), (height, width) = _read_window(header, "displayWindow")
@@ -366,6 +390,7 @@ def _crop_to_display_window(
         """Copy what both windows have into a black plane of the display window."""
         result = np.zeros((height, width), plane.dtype)
         if rows.stop > rows.start and columns.stop > columns.start:
+            # the same pixels, counted from the corner of either window
             result[
                 rows.start - top : rows.stop - top,
                 columns.start - left : columns.stop - left,
@@ -454,7 +479,9 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
 def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     """Return the inverse (3,) of all COLORCORR lines, and notes on invalid ones.
 
-    EXPOSURE lines are ignored, as everywhere: exposure is metered.
+    A line has three factors that were already applied to the pixels. One that would
+    take the product out of range is invalid too. EXPOSURE lines are ignored, as
+    everywhere: exposure is metered.
     """
     factors = np.ones(3)
     notes = list[str]()
@@ -509,7 +536,10 @@ def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes
 
 
 def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
-    """Fill a line (W, 4) from its four run-length encoded channels.
+    """Fill a line (W, 4) from its four run-length encoded channels, one by one.
+
+    A run is a byte n and then, if n is above 128, one value that is repeated n - 128
+    times; otherwise n values.
 
     Returns the position after them. Raises IndexError or ValueError if they end early,
     or do not fit.
@@ -537,11 +567,14 @@ def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
 def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from pixels of four bytes.
 
-    A pixel (1, 1, 1, n) repeats the last one n times; a further one in a row holds the
-    next 8 bits of the number. Returns the position after the line. Raises ValueError if
-    a repeat does not fit.
+    A pixel (1, 1, 1, n) is no color: it repeats the last one n times. A second one
+    right after it repeats it 256 n times, a third one 65,536 n times: they are the
+    bytes of one count.
+
+    Returns the position after the line. Raises ValueError if a repeat does not fit.
     """
     width = len(line)
+    # Usually there are no repeats, and the line is copied at once.
     n_bytes = min(4 * width, len(body) - position)
     line_bytes = np.frombuffer(body, np.uint8, count=n_bytes, offset=position)
     if len(line_bytes) == 4 * width:

@@ -85,8 +85,9 @@ class MtlReader:
     def read_library(self, name: str) -> None:
         """Read a material file; of materials with the same name, the first counts.
 
-        A file that is missing is noted, and so is a second material of a name in one
-        file, unless its statements are the same.
+        Its materials are kept by name for `get_surface`. A file that is missing is
+        noted, and so is a second material of a name in one file, unless its statements
+        are the same. Statements before the first material are recorded as left out.
         """
         try:
             text = decode_text(self.references.get(name))
@@ -145,9 +146,11 @@ class MtlReader:
     def find_squares(self, name: str, candidates: Sequence[int]) -> list[int]:
         """Return those of some UDIM squares for which a material has images.
 
-        All squares, if the name of its first image has the placeholder, or if there is
-        an image for any square but the one in that name. There are none if the name has
-        no square, or if the images repeat: only the one square has one, which is noted.
+        The first of its images that has a square in its name decides. All `candidates`
+        have images if the name has the placeholder ``<UDIM>``, or if there is an image
+        for one of them that is not the square in the name. If there is none, the image
+        is taken for an ordinary one that repeats, which is noted, and no square is
+        returned; nor is one if no name has a square.
 
         Args:
             name: the material.
@@ -254,8 +257,10 @@ class MtlReader:
     def _drop_other_layouts(
         self, material: MtlMaterial, uses: dict[str, MapUse], first_use: MapUse
     ) -> None:
-        """Remove the maps whose scale and offset differ from those of the first, in
-        place.
+        """Remove maps whose texture coordinates differ from those of the first.
+
+        A surface has one layout, by scale and offset. Those removed are noted. `uses`
+        are the maps by keyword, which is changed.
         """
         for key in [key for key in UV_MAPS if key in uses]:
             if (uses[key].scale, uses[key].offset) != (
@@ -312,8 +317,9 @@ class MtlReader:
     def _note_unread(self, material: MtlMaterial) -> None:
         """Note the statements that are not read, unless they change nothing.
 
-        Nothing is changed by zeros, by ignored keywords, and by an ambient map that is
-        the color's; also noted are statements that were overridden, a fourth number of
+        Nothing is changed by zeros, by ignored keywords, by a clear coat's roughness
+        without a coat, by a grey filter of transmission, and by an ambient map that is
+        the color's. Also noted are statements that were overridden, a fourth number of
         Kd, and illumination models with more than highlights.
         """
         zero_keys = {
@@ -377,6 +383,7 @@ class MtlReader:
         options.mark_read(*read_options)
 
         def is_quiet(option: str, value: str) -> bool:
+            """Return whether an option has a value that changes nothing."""
             if option == "colorspace":
                 return value.lower() == ("srgb" if has_colors else "linear")
             is_default = value.lower() == DEFAULT_OPTIONS.get(option)
@@ -464,6 +471,13 @@ class MtlReader:
         """Return a roughness ("pr") or metallic ("pm"), None if there is none.
 
         It is the mean of its map over the faces that show it, or else its number.
+
+        Args:
+            material: the material.
+            key: "pr" or "pm".
+            use: its map, or None.
+            name: by which the mesh file uses the material.
+            square: the UDIM square.
         """
         note_template = (
             f"{material.spelling.get(f'map_{key}')} {{name}} {{why}}; it is left out"
@@ -556,8 +570,8 @@ class MtlReader:
 def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """Return the values (H, W) of an image for a map of numbers.
 
-    They are the channel that ``-imfchan`` names, or else the alpha, or the mean of the
-    colors if it has no alpha.
+    They are the channel that ``-imfchan`` names; or else the alpha, if it is not opaque
+    everywhere; or else the mean of the colors, also for an alpha that is not there.
     """
     channel = CHANNELS.get(use.options.get("imfchan", "").lower())
     has_alpha = picture.shape[2] == 4
@@ -788,8 +802,9 @@ def without_comment(text: str) -> str:
 def parse_map(argument: str) -> MapUse | None:
     """Parse the arguments of a statement that names an image; None if it names none.
 
-    Options stand before or after the name, which may have blanks. An option that is not
-    known is one before the name; its value is left out.
+    Known options are taken out wherever they stand; what is left is the name, which may
+    have blanks. What then stands before the name with a dash is an option that is not
+    known; its value is left out.
     """
     options: dict[str, str] = {}
     for match in _OPTION.finditer(argument):

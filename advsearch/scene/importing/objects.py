@@ -308,8 +308,8 @@ def _compute_mean_material(
 ) -> Material:
     """Return the roughness and metallic of all surfaces, averaged by area.
 
-    A note says so, unless all of them are the same. Surfaces without faces do not
-    count.
+    The renderer has one value of each for an object. A note says so, unless all of them
+    are the same. Surfaces without faces do not count.
     """
     visible_area = np.bincount(
         soup.part,
@@ -384,14 +384,15 @@ def _compute_file_to_mesh(
 ) -> Float64Array:
     """Return the map (4, 4) from the file's coordinates to the normalised mesh's.
 
-    It is that of `join_parts` and `normalise_mesh` together; `turn` (3, 3) leads from
-    the file's axes to ours.
+    `join_parts` maps a vertex v to turn (v - lowest corner) / extent, and
+    `normalise_mesh` that point p to (p - origin) / size; this is the one after the
+    other. `turn` (3, 3) leads from the file's axes to ours.
     """
-    used = [part.vertices[np.unique(part.faces)] for part in parts]
-    low = np.min([points.min(axis=0) for points in used], axis=0)
+    used_points = [part.vertices[np.unique(part.faces)] for part in parts]
+    lowest_corner = np.min([points.min(axis=0) for points in used_points], axis=0)
     origin, size = find_footing(soup.points[np.unique(soup.faces)])
     linear = turn / (compute_extent(parts) * size)
-    return make_pose(linear, -linear @ low - origin / size)
+    return make_pose(linear, -linear @ lowest_corner - origin / size)
 
 
 def _compute_emitted(
@@ -399,7 +400,9 @@ def _compute_emitted(
 ) -> Float32Array | None:
     """Return the radiance (H, W, 3) that leaves a surface: emission times opacity.
 
-    Both maps are brought to the larger of their sizes. None: it emits nothing.
+    Both maps are brought to the size of the wider one (of the higher one, if they are
+    equally wide): the opacity is interpolated, texels of the emission are repeated.
+    None: it emits nothing. An emission (h, w, 3) without opacity is returned as it is.
     """
     if emission is None or opacity is None:
         return emission

@@ -60,7 +60,8 @@ def make_normal_map(picture: Float32Array, scale: float = 1.0) -> Float32Array:
 def has_normals(picture: Float32Array) -> bool:
     """Return whether an image (H, W, 3) has normals, and not heights, which are grey.
 
-    Black texels are ignored: no face shows them.
+    Normals are mostly blue, since they point out of the surface, and have a length of
+    about 1. Black texels are ignored: no face shows them.
     """
     visible_texels = picture[picture.any(axis=2)]
     if not len(visible_texels):
@@ -119,7 +120,10 @@ class ImportedSurface:
         )
 
     def with_images(self, pictures: Iterable[Float32Array]) -> ImportedSurface:
-        """Return the surface with other images, in the order of `images`."""
+        """Return the surface with other images, in the order of `images`.
+
+        There are as many as in `images`: what the surface does not have stays None.
+        """
         remaining = iter(pictures)
         texture = None if self.texture is None else next(remaining)
         normals = None if self.normal_map is None else next(remaining)
@@ -265,7 +269,10 @@ def select_visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
 
 
 def transform_part(part: ImportedPart, matrix: Float64Array) -> ImportedPart:
-    """Return a part transformed by an affine matrix (4, 4)."""
+    """Return a part transformed by an affine matrix (4, 4).
+
+    One that mirrors keeps the fronts of its faces outside.
+    """
     if np.array_equal(matrix, np.eye(4)):
         return part
     linear = matrix[:3, :3]
@@ -273,7 +280,8 @@ def transform_part(part: ImportedPart, matrix: Float64Array) -> ImportedPart:
     with np.errstate(all="ignore"):
         vertices = part.vertices @ linear.T + matrix[:3, 3]
         if normals is not None:
-            # Normals are transformed by the cofactors of the matrix.
+            # Normals are transformed by the cofactors of the matrix: the inverse
+            # transpose times the determinant, which singular matrices have too.
             cofactors = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]])
             normals = normals @ cofactors.T
     return replace_geometry(
@@ -290,7 +298,8 @@ def replace_geometry(
 ) -> ImportedPart:
     """Return a part with other vertices and normals.
 
-    If it is mirrored, faces are turned over, and normals, which cofactors have flipped.
+    Mirroring turns the winding of faces around and, by the cofactors, normals: if
+    `is_mirrored`, both are turned back. Colors of corners go with their corners.
     """
     part = replace(part, vertices=vertices, normals=normals)
     if not is_mirrored:
@@ -335,7 +344,7 @@ def split_at_corners(
         flat: as in `ImportedPart`.
     """
     # One number for each corner, the digits of which are its rows of all values: in
-    # base (number of values + 1), since a missing row is -1.
+    # base (number of values + 1), since a missing row is -1, which is the digit 0.
     corner_key = np.zeros(3 * len(triangles), dtype=np.int64)
     n_codes = 1  # bound of the numbers
     for indexed in filter(None, (points, normals, uvs)):

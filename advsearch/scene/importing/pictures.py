@@ -80,7 +80,7 @@ def load_display_image(
         warnings.simplefilter("ignore")  # of large images and odd metadata
         image.load()
         shrink = 1.0 if limit is None else limit / max(height, width)
-        # Tables of the 256 levels.
+        # Tables of the 256 levels, which replace a computation for each pixel.
         display_of_level: Float32Array = np.arange(256, dtype=np.float32) / np.float32(
             255.0
         )
@@ -137,10 +137,12 @@ def average_in_bands(
     """
     row_weights = _compute_overlaps(size[0], target[0])
     column_weights = _compute_overlaps(size[1], target[1])
+    # rows of the result whose source rows have about `_BAND` pixels
     rows_per_band = max(1, _BAND * target[0] // (size[0] * size[1]))
     bands = []
     for start in range(0, target[0], rows_per_band):
         weights = row_weights[start : start + rows_per_band]
+        # the source rows that these rows of the result take
         top = int(weights.indices.min())
         end = int(weights.indices.max()) + 1
         bands.append(_average(load_band(top, end), weights[:, top:end], column_weights))
@@ -162,11 +164,15 @@ def average_area(image: Float32Array, height: int, width: int) -> Float32Array:
 def _average(
     image: Float32Array, row_weights: sparse.csr_array, column_weights: sparse.csr_array
 ) -> Float32Array:
-    """Average an image (R, C, K) by weights of rows (H, R) and of columns (W, C)."""
+    """Average an image (R, C, K) by weights of rows (H, R) and of columns (W, C).
+
+    Returns (H, W, K). First along rows and then along columns; for each the other two
+    axes are made one, since a sparse matrix multiplies matrices only.
+    """
     rows, columns, channels = image.shape
     height = row_weights.shape[0]
     width = column_weights.shape[0]
-    # The sparse product is of two matrices: all but one axis are one. (H, C * K)
+    # (H, C * K)
     by_rows = row_weights @ image.reshape(rows, columns * channels)
     # (C, H * K)
     transposed = (
@@ -186,9 +192,10 @@ def _average(
 def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
     """Return the weights (target, source) of source cells in target cells.
 
-    They are the overlapping lengths along an axis, normalised so that rows sum to 1:
-    the edges of both grids cut it into pieces, each of which lies in one cell of
-    either.
+    Both grids divide the same length, into `source` and into `target` equal cells. A
+    weight is the length that two cells have in common, normalised so that rows sum to
+    1. The edges of both grids cut the length into pieces, each of which lies in one
+    cell of either: its length is added to the weight of these two.
     """
     target_edges = np.arange(target + 1) * (source / target)
     all_edges = np.unique(

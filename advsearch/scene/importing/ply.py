@@ -122,10 +122,14 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
 def _parse_header(
     header: str, notes: Notes
 ) -> tuple[dict[str, Element], list[str], str]:
-    """Return the elements, the comments and the byte order, empty for ASCII.
+    """Parse the lines of a PLY header.
 
     A property belongs to the element before it; its type has the byte order of the
     format, which stands first. Raises FileFormatError for any other line.
+
+    Returns:
+        The elements by name, with the types of their properties and no values yet; the
+        comments; and the byte order, "<", ">" or empty for ASCII.
     """
     elements: dict[str, Element] = {}
     comments = list[str]()
@@ -176,8 +180,9 @@ def _read_rows(
 ) -> int:
     """Read the rows of an element, and return the position of the byte after them.
 
-    If all rows are as long as the first, their values are gathered at once; only if
-    lists have different lengths are the rows walked one by one.
+    All rows are assumed to be as long as the first, so that their values are gathered
+    at once. If the lengths of lists, read on that assumption, differ, the rows are
+    walked one by one instead.
 
     Args:
         notes: about the file.
@@ -196,8 +201,9 @@ def _read_rows(
 
         No byte is copied: number i of the view is made of the bytes from i on.
         """
-        kind = np.dtype(np.float64) if text else kind
+        kind = np.dtype(np.float64) if text else kind  # an ASCII file's numbers
         n_starts = max(0, len(cells) - kind.itemsize + 1)
+        # a stride of one byte
         numbers: Numbers = np.ndarray((n_starts,), kind, cells, 0, (1,))
         return numbers
 
@@ -211,7 +217,7 @@ def _read_rows(
     }
 
     def check_end(end: int) -> None:
-        """Raise FileFormatError if the file has no so many bytes."""
+        """Raise FileFormatError if the file has fewer bytes than `end`."""
         if end > len(cells):
             raise _make_length_error(notes, element, text)
 
@@ -219,10 +225,12 @@ def _read_rows(
         """Walk through rows one by one.
 
         Returns:
-            The bytes at which each property begins, (n_rows,), and the end of all.
+            For each property the bytes at which it begins, (n_rows,); and the byte
+            after the last row.
         """
         starts = {name: list[int]() for name in scalar_widths}
         byte = position
+        # a longer list than the whole file could hold is damage
         max_length = len(cells) // (8 if text else 1)
         for _ in range(n_rows):
             for name, width in scalar_widths.items():
@@ -246,6 +254,7 @@ def _read_rows(
 
     if not element.count or not scalar_widths:
         return position
+    # At least the scalars and counts have to be there, before memory is taken for rows.
     check_end(position + element.count * sum(scalar_widths.values()))
     # All rows are assumed to be as long as the first.
     first_starts, first_end = walk_rows(1)
@@ -272,9 +281,10 @@ def _store_values(
 
     Args:
         element: its scalars and lists are set.
-        starts: the byte at which each property begins, in each row.
-        values: the numbers of each property's type that begin at each byte.
-        counts: those of the type of the count; only of lists.
+        starts: by property, the bytes (rows,) at which it begins in each row.
+        values: by property, the number of its type that begins at each byte.
+        counts: by property that is a list, the count that begins at each byte. A list
+            is its count and then its values.
     """
     for name, property_starts in starts.items():
         if name in counts:
@@ -288,11 +298,15 @@ def _store_values(
 def _gather_lists(
     values: Numbers, first_values: IntArray, lengths: IntArray
 ) -> ListValues:
-    """Return the lists whose first values are at some bytes, (N,), with lengths (N,).
+    """Return the values of N lists, one list after the other.
 
-    `values` are the numbers that begin at each byte.
+    Args:
+        values: the number that begins at each byte.
+        first_values: (N,) the byte of each list's first value.
+        lengths: (N,) how many values each list has.
     """
     list_starts = np.cumsum(lengths) - lengths
+    # 0, 1, ... for each list anew
     index_in_list = np.arange(int(lengths.sum())) - np.repeat(list_starts, lengths)
     value_bytes = np.repeat(first_values, lengths) + values.itemsize * index_in_list
     return ListValues(lengths, values[value_bytes])
@@ -426,6 +440,7 @@ class _Properties:
     notes: Notes
 
     def __post_init__(self) -> None:
+        """Record all properties, so that those that are never read are noted."""
         for element in self.elements.values():
             if element.name in ("vertex", "face", "tristrips"):
                 for name in element.types:
@@ -550,7 +565,7 @@ class _Properties:
             if vertex_uvs is None:
                 return None
             return IndexedValues(vertex_uvs, corners[triangles])
-        # Triangles of strips have no wedges.
+        # Triangles of strips, which come after the faces, have no wedges.
         wedge_counts = np.zeros(len(counts), np.int64)
         wedge_counts[: len(wedges.counts)] = wedges.counts
         is_mapped = wedge_counts == 2 * counts
@@ -728,8 +743,9 @@ def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
 def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
     """Return the triangles (T, 3) of triangle strips.
 
-    Every second triangle of a strip is wound backwards, and vertex -1 starts a new
-    strip. Triangles with a repeated vertex are left out.
+    A strip's triangles are each three successive vertices of it. Every second one is
+    wound backwards, and turned here. A vertex of -1 ends a strip and starts a new one
+    after it. Triangles with a repeated vertex are left out.
 
     Args:
         vertices: those of all strips, concatenated.
@@ -737,11 +753,12 @@ def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
     """
     is_strip_start = np.zeros(len(vertices) + 1, dtype=np.bool_)
     is_strip_start[np.cumsum(counts) - counts] = True
-    is_strip_start[1:][vertices < 0] = True
+    is_strip_start[1:][vertices < 0] = True  # the vertex after a -1
     index = np.arange(len(vertices))
     # for each vertex, where its strip began
     strip_start = np.maximum.accumulate(np.where(is_strip_start[:-1], index, 0))
     position = index - strip_start
+    # every vertex but the first two of a strip is the last of a triangle
     last_corner = np.flatnonzero((position >= 2) & (vertices >= 0))
     triangles: IntArray = np.stack(
         [vertices[last_corner - 2], vertices[last_corner - 1], vertices[last_corner]],

@@ -259,6 +259,13 @@ def _make_surrounding_mesh(
 
     The shape is normalised as an object is; its pose puts it back to where it was, with
     the size that it had relative to the object.
+
+    Args:
+        path: the file, for messages.
+        name: of the part.
+        parts: what the node draws.
+        front: the axis of the file that is the front.
+        object_frame: that of the object.
     """
     frame = _compute_frame(parts, object_frame.turn)
     shape = make_object(parts, notes=[], file=path, name=name, up="y", front=front)
@@ -403,7 +410,9 @@ class FileFrame:
 def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFrame:
     """Return the frame in which parts have extent 1, stand on z = 0 and are centred.
 
-    The largest extent is meant; parts are centred in x and y.
+    The largest extent is meant; parts are centred in x and y. Only visible faces with
+    an area count, as the repair of the geometry leaves no others. `turn` (3, 3) leads
+    from the file's axes to ours.
     """
     face_corners = []
     for part in select_visible(parts):
@@ -429,9 +438,11 @@ def _find_light_unit(
 ) -> tuple[float, str]:
     """Return how many candela are one unit of radiant intensity, and a note on it.
 
-    In a file without surfaces that emit light, lamps are taken as watts, as exporters
-    write them. With such surfaces, of which one nit is one unit, a candela decides how
-    bright lamps and surfaces are relative to each other.
+    glTF has lamps in candela and surfaces in nit (candela per square metre); a nit of a
+    surface is one unit here. Exporters write watts times `LUMENS` for lamps. So where
+    there are lamps alone, `LUMENS` candela are one unit. Where there are surfaces that
+    emit light too, what counts is how bright both are relative to each other: as glTF
+    says, or in Blender's files as Blender shows them. The note is empty, or a sentence.
     """
     if header.asset.generator == GENERATOR:
         # A light of USD emits radiance, as its surfaces do.
@@ -467,9 +478,10 @@ def _make_lamp(
 ) -> PointLamp | SpotLamp:
     """Return a light of a file as a lamp.
 
-    A directional light becomes a lamp so far away that its rays are parallel, and as
-    bright there as its lux at the object. Intensities of others are scaled by the
-    square of the object's size.
+    A directional light has lux. It becomes a lamp so far away that its rays are
+    parallel, with an intensity of lux times squared distance, which is the same lux at
+    the object. Lengths of others are divided by the object's size, so that intensities
+    are divided by its square.
 
     Args:
         path: the file, for messages.
@@ -535,6 +547,7 @@ def _make_camera(
             field of view.
     """
     assert camera.perspective is not None
+    # columns are the camera's axes in ours, made unit vectors: the scale does not count
     axes = frame.turn @ pose[:3, :3] @ GLTF_CAMERA_AXES
     axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)

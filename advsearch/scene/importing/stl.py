@@ -54,6 +54,7 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         colors = _read_colors(data[:80], facets["attribute"], notes)
         if colors is not None:
             corner_colors = np.repeat(colors[:, None], 3, axis=1)
+            # white, which the colors of facets multiply
             surface = ImportedSurface(color=np.ones(3, np.float32))
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         points = _parse_text(data, notes)
@@ -126,6 +127,7 @@ def _read_colors(
     magics_position = head.find(b"COLOR=")
     channels = [(attributes >> shift) & 31 for shift in (10, 5, 0)]
     colors = np.stack(channels, axis=1).astype(np.float32) / np.float32(31.0)
+    # up to 70: so that the four bytes after it are in the header of 80
     if 0 <= magics_position <= 70:
         if b"MATERIAL=" in head:
             notes.record("header entry", "MATERIAL")

@@ -95,7 +95,7 @@ def apply_textures(
     is_uniform = all(surface.has_same_maps(first_surface) for surface in used_surfaces)
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
     material = index_materials(soup, surfaces)[1]
-    # First the ways that need no baking; if none is possible, the last one.
+    # First the ways that need no baking, which return; the rest is baked.
     is_lit_twice = False
     if is_uniform and has_uniform_factor:
         if not first_surface.images:
@@ -173,8 +173,9 @@ def index_materials(
 def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     """Return whether faces of different materials share many texels.
 
-    More than `_MAX_SHARED` of the texels that UVs (F, 3, 2) cover, at a size of
-    `BAKED_SIZE`; `material` is the index of each face's (F,).
+    Many is more than `_MAX_SHARED` of the texels that UVs (F, 3, 2) cover, at a size of
+    `BAKED_SIZE`. `material` (F,) is the index of each face's material. The negative
+    tolerance leaves out texels on the border of a face, which neighbours share.
     """
     if material.min() == material.max():
         return False
@@ -182,6 +183,8 @@ def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     face, row, column, _ = rasterize_triangles(
         uvs * size - 0.5, (size, size), tolerance=-1e-6
     )
+    # Smallest and largest material on each texel: if they differ, it is shared. Texels
+    # without a face have a largest one of -1.
     first_material = np.full(size * size, len(uvs))
     last_material = np.full(size * size, -1)
     np.minimum.at(first_material, row * size + column, material[face])
@@ -203,9 +206,14 @@ def _is_lit_twice(
 ) -> bool:
     """Return whether texels that emit light are on several faces.
 
-    Mitsuba would send light from one of them only. More than `_MAX_SHARED` of the lit
-    texels have to be; an emission that is the same everywhere has no texels. The last
-    picture is that of the emission.
+    Mitsuba would send light from one of these faces only. It is so if more than
+    `_MAX_SHARED` of the lit texels are on several; an emission that is the same
+    everywhere has no texels.
+
+    Args:
+        uvs: (F, 3, 2).
+        surface: the only surface.
+        pictures: its images for these UVs, the last of which is the emission.
     """
     if surface.emission is None or surface.emission.shape == (1, 1, 3):
         return False
@@ -310,8 +318,9 @@ def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
 def _move_into_unit_square(soup: Soup) -> Float64Array:
     """Move each chart by an integer offset so that it starts in the unit square.
 
-    A repeating texture looks the same. A chart is what corners with the same point and
-    UV connect. Returns UVs (F, 3, 2).
+    A repeating texture looks the same. A chart is a set of faces that are connected by
+    corners with the same point and the same UV. The lower corner of its bounding box
+    ends up in [0, 1). Returns UVs (F, 3, 2).
     """
     flat_uvs = soup.uvs.reshape(-1, 2)
     corners = np.column_stack([soup.faces.reshape(-1), flat_uvs])
@@ -320,6 +329,7 @@ def _move_into_unit_square(soup: Soup) -> Float64Array:
     starts = np.concatenate([vertex[:, 0], vertex[:, 1]])
     ends = np.concatenate([vertex[:, 1], vertex[:, 2]])
     chart = find_components(int(vertex.max()) + 1, starts, ends)
+    # (charts, 2) the smallest u and v of each chart
     chart_corner = np.full((int(chart.max()) + 1, 2), np.inf)
     np.minimum.at(chart_corner, chart[vertex.reshape(-1)], flat_uvs)
     uvs: Float64Array = soup.uvs - np.floor(chart_corner + _UV_TOLERANCE)[chart[vertex]]
@@ -331,9 +341,11 @@ def _crop_to_window(
 ) -> tuple[Float64Array, Sequence[Float32Array]]:
     """Crop images to the window that UVs span; the layout of the charts stays.
 
-    This is done if UVs overstep the unit square a little or use a corner of it. The
-    window is one texel wider on each side. Windows larger than `_MAX_WINDOW` textures
-    are left alone: there the textures repeat.
+    The window is the bounding box of the UVs, one texel wider on each side, so that
+    filtering finds its neighbours. Images are cropped if UVs overstep the unit square,
+    or use only a small part of it; then texels are resampled, and keep their size. They
+    are left alone if UVs lie inside and fill enough of the square, or if the window is
+    larger than `_MAX_WINDOW` textures: there the textures repeat.
 
     Args:
         uvs: (F, 3, 2).
@@ -343,6 +355,7 @@ def _crop_to_window(
     Returns:
         UVs relative to the window, and the images of it; or both as they were.
     """
+    # (2,) width and height of a texel of the coarsest image, in textures
     largest_texel = np.max(
         [1.0 / np.array(picture.shape[1::-1]) for picture in pictures], axis=0
     )
@@ -363,6 +376,7 @@ def _crop_to_window(
         """Return an image of the window; texels keep their size."""
         shape = np.ceil(window_size * np.array(picture.shape[1::-1]))
         width, height = np.clip(shape, 1, TEXTURE_LIMIT).astype(int)
+        # u of the columns, and v of the rows from the top (the largest v) down
         columns = window_lower[0] + (np.arange(width) + 0.5) / width * window_size[0]
         rows = window_upper[1] - (np.arange(height) + 0.5) / height * window_size[1]
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -408,6 +422,7 @@ def bake(
         _to_texels(uvs, (size, size)), (size, size), tolerance=1e-9
     )
     maps = _make_blank_maps(surfaces, size)
+    # (T, 3) factor of the base color at each texel
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
     for surface, texel in zip(surfaces, group_indices(soup.part[face]), strict=False):
         if not len(texel):
@@ -477,7 +492,8 @@ def _sample_base_color(
 ) -> Float32Array:
     """Return the base color (T, 3 or 4) of a surface at UVs (T, 2).
 
-    If UVs are missing, it is the mean over all faces that show its texture.
+    Display-referred. If some UVs are missing (NaN), all texels have the mean of the
+    texture over the faces of the soup that show it. `surfaces` are those of its parts.
     """
     if surface.texture is not None and np.isfinite(uvs).all():
         return sample_colors(surface.texture, uvs)
@@ -496,7 +512,8 @@ def _sample_base_color(
 def _count_texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     """Return how many texels of the file's images an object shows.
 
-    A part counts by the area of its UVs and the largest of its images.
+    Of a part that is the area of its UVs times the texels of the largest of its images;
+    where an image repeats, its texels count as often.
     """
     n_texels = 0.0
     uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
@@ -540,9 +557,11 @@ def average_over_faces(
         return np.asarray(texture.mean(axis=(0, 1), dtype=np.float64), np.float32)
     uvs = uvs[is_known]
     areas = areas[is_known]
+    # the finest division whose samples, its square for each face, stay within the limit
     n_steps = int(np.clip(np.sqrt(_MAX_SAMPLES / len(areas)), 1, _MAX_STEPS))
     weights = _compute_sample_weights(n_steps)
     weighted_sum = np.zeros(texture.shape[2])
+    # rounded up; in batches, so that memory is bounded
     n_batches = -(-len(areas) * len(weights) // _MAX_SAMPLES)
     for batch in np.array_split(np.arange(len(areas)), n_batches):
         sample_uvs = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
@@ -555,17 +574,19 @@ def average_over_faces(
 
 
 def _compute_sample_weights(steps: int) -> Float64Array:
-    """Return barycentric weights (P, 3) of the centers of small triangles.
+    """Return barycentric weights (P, 3) of points evenly spread over a triangle.
 
-    A triangle is divided into steps**2 equal ones. Those that point up have their
-    corner at (i, j) and their center a third of a step beyond it; those that point down
-    two thirds.
+    Each side is cut into `steps` parts, which divides the triangle into steps**2 equal
+    ones. The points are the centers of these. A small one that points up has its corner
+    at the grid point (i, j) and its center a third of a step beyond it along both
+    sides; one that points down two thirds.
     """
     grid_i, grid_j = np.meshgrid(np.arange(steps), np.arange(steps))
     i = grid_i.reshape(-1)
     j = grid_j.reshape(-1)
     is_up = i + j < steps
     is_down = i + j < steps - 1
+    # of the second and the third corner: steps along the two sides, as fractions
     weight_b, weight_c = (
         np.concatenate([index[is_up] + 1.0 / 3.0, index[is_down] + 2.0 / 3.0]) / steps
         for index in (i, j)
@@ -630,9 +651,11 @@ def _unmirror(
 ) -> tuple[Soup, SurfaceMaps]:
     """Return a soup whose UVs mirror no face, and the maps for it.
 
-    No texel is resampled. Only a normal map needs it. If all faces are mirrored, the
-    bumps' y is reversed; if some are, the maps get a second half, which is the first
-    one mirrored, and these faces are moved there.
+    Only a normal map needs it, as the renderer's bitangent differs from the file's on
+    mirrored faces, those whose UVs run clockwise. If (almost) all faces are mirrored,
+    the bumps' y is reversed. If some are, the maps get a second half to the right,
+    which is the first one mirrored, and these faces are moved there. No texel is
+    resampled.
 
     Args:
         soup: the object.
@@ -656,6 +679,7 @@ def _unmirror(
     # Both halves have half of the width: u in [0, 2] first, then halved.
     new_uvs[is_mirrored, :, 0] = 2.0 - new_uvs[is_mirrored, :, 0]
     new_uvs[:, :, 0] /= 2.0
+    # x -> 1 - x reverses the sign of the bumps along u
     mirrored_normals = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array(
         [1, 0, 0], np.float32
     )
@@ -676,6 +700,9 @@ def convert_normals(
 ) -> Float32Array:
     """Convert texels of a normal map from the tangents of old UVs to those of new UVs.
 
+    A texel is the bump along tangent, bitangent and normal, stored as (n + 1) / 2. It
+    is turned within the surface; what is along the normal stays.
+
     A normal that cannot be converted, where UVs have no area, becomes upright.
 
     Args:
@@ -691,10 +718,12 @@ def convert_normals(
     normal = normalize_vectors(np.einsum("tk,tkc->tc", weights, old_soup.normals[face]))
     old_tangent = _compute_tangents(old_soup, normal, face)
     new_tangent = _compute_tangents(replace(old_soup, uvs=new_uvs), normal, face)
+    # the file's bitangent points up the image, also where UVs are mirrored
     handedness = np.sign(compute_doubled_areas(old_soup.uvs[face]))[:, None]
     old_bitangent = np.cross(normal, old_tangent) * handedness
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)
     in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent
+    # along the renderer's tangent and bitangent, which is normal x tangent
     new_x = (in_plane * new_tangent).sum(axis=1)
     new_y = (in_plane * np.cross(normal, new_tangent)).sum(axis=1)
     bumps = np.stack([new_x, new_y, z], axis=1)
@@ -705,7 +734,8 @@ def convert_normals(
 def _compute_tangents(soup: Soup, normal: Float64Array, face: IntArray) -> Float64Array:
     """Return unit tangents (T, 3) along u on faces (T,), orthogonal to normals (T, 3).
 
-    They are NaN where UVs have no area.
+    Each is the direction on its face in which u grows and v stays, without the part
+    along the normal. They are NaN where UVs have no area.
     """
     used_faces, used_index = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used_faces, k]] for k in range(3))
@@ -713,7 +743,8 @@ def _compute_tangents(soup: Soup, normal: Float64Array, face: IntArray) -> Float
     (_, v1) = (uvs[:, 1] - uvs[:, 0]).T
     (_, v2) = (uvs[:, 2] - uvs[:, 0]).T
     handedness = np.sign(compute_doubled_areas(uvs))[:, None]
-    # d position / d u, up to a positive factor
+    # d position / d u is (b - a) v2 - (c - a) v1 over the UVs' doubled area, of which
+    # only the sign matters here
     tangent = ((b - a) * v2[:, None] - (c - a) * v1[:, None]) * handedness
     tangent = tangent[used_index.reshape(-1)]
     along_normal = normal * (tangent * normal).sum(axis=1, keepdims=True)

@@ -127,7 +127,8 @@ def _note_repetition(uvs: Float64Array, notes: Notes) -> None:
 def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an OBJ file and the material files that it names.
 
-    Each material becomes one part, and its faces without texture coordinates another.
+    Faces with the same material, smoothing and UDIM square become one part, and those
+    among them without texture coordinates another.
 
     Raises:
         FileFormatError: the file is of another kind, is cut short, refers to geometry
@@ -150,7 +151,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         name: str, square_number: int
     ) -> tuple[Float64Array, Float64Array]:
         """Return UVs (F, 3, 2) and doubled areas (F,) of the faces with a material."""
-        # Called only after the arrays below exist.
+        # The reader calls it only after the arrays below exist.
         is_selected = (material == names.index(name)) & (square == square_number)
         return _measure_mapped_faces(uv, position, is_selected)
 
@@ -242,7 +243,14 @@ def _find_squares(
 ) -> IntArray:
     """Return the UDIM square of each triangle, (T,); 0 where one image is for all.
 
-    Only squares for which the material has an image count.
+    A UDIM texture has an image for each unit square of texture coordinates, numbered
+    from 1001. Only squares for which the material has an image count.
+
+    Args:
+        reader: of the materials.
+        names: of the materials.
+        material: (T,) the material of each triangle; -1: none.
+        uv: the texture coordinates of the triangles.
     """
     square = np.zeros(len(material), np.int64)
     has_uvs = (uv.rows >= 0).all(axis=1)
@@ -379,11 +387,17 @@ def _read_colors(
     """Return the linear color (V, 3) of every vertex, or None if the file has none.
 
     A ``v`` line has three coordinates, then perhaps a weight, or a color, or a color
-    and its opacity; ZBrush writes colors into comments. Vertices without a color are
-    neutral grey in a file with colors.
+    and its opacity; ZBrush writes colors into comments. Colors are sRGB, in [0, 1] or
+    in [0, 255]. Vertices without a color are neutral grey in a file with colors.
+
+    Args:
+        lines: of the file.
+        table: (V, 7) the numbers of ``v`` lines, NaN where there are none.
+        notes: where weights and opacities are recorded, which are not read.
     """
     weight = table[:, 3]
     opacity = table[:, 6]
+    # a fourth number without a fifth is a weight, not a color
     if (np.isfinite(weight) & np.isnan(table[:, 4]) & (weight != 1.0)).any():
         notes.record("weights of vertices, the fourth number of", "v")
     if np.isfinite(opacity).any() and not np.isin(opacity, (1.0, 255.0)).all():
@@ -433,7 +447,11 @@ class ObjLines:
     """
 
     def __init__(self, data: bytes, notes: Notes) -> None:
-        """Find the lines of a file, and the kind of each by its first bytes."""
+        """Find the lines of a file, and the kind of each by its first bytes.
+
+        All lines at once: arrays of their first, second and third bytes are compared
+        with the keywords.
+        """
         if b"\x00" in data:
             raise notes.damaged(EXPECTED, data)
         text = _normalize_lines(data)
@@ -444,6 +462,7 @@ class ObjLines:
         self.bytes = np.frombuffer(text, dtype=np.uint8)
         self.ends = np.flatnonzero(self.bytes == _NEWLINE)
         self.starts = np.concatenate([[0], self.ends[:-1] + 1])
+        # a last line may be shorter than three bytes
         padded = np.concatenate([self.bytes, np.full(3, _NEWLINE, np.uint8)])
         first_byte, second_byte, third_byte = (
             padded[self.starts + offset] for offset in range(3)
@@ -473,7 +492,8 @@ class ObjLines:
     def read_table(self, kind: str) -> Float64Array:
         """Return the numbers of all lines of a kind, (N, columns) as in `TABLES`.
 
-        Numbers that a line does not have are 0 for ``vt`` and NaN for the others.
+        Numbers that a line does not have are 0 for ``vt`` and NaN for the others;
+        further ones are left out.
 
         Raises:
             FileFormatError: a line has too few numbers, or other words.
@@ -494,6 +514,7 @@ class ObjLines:
             table = values.reshape(len(rows), -1)[:, :columns]
             n_missing = columns - table.shape[1]
             return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
+        # Otherwise each number goes to its line's row, and its place in the line.
         first_of_line = np.cumsum(counts) - counts
         column = np.arange(len(values)) - np.repeat(first_of_line, counts)
         row = np.repeat(np.arange(len(rows)), counts)
@@ -561,7 +582,12 @@ class ObjLines:
         return corners - 1, sizes, rows
 
     def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:
-        """Raise FileFormatError for a last face cut short, or faces over a limit."""
+        """Raise FileFormatError for a last face cut short, or faces over a limit.
+
+        A face of fewer than 3 corners counts as cut short only where the file ends in
+        its line without a line break. `rows` (P,) are the rows of the faces' lines, and
+        `sizes` (P,) their numbers of corners.
+        """
         is_last_line = rows[-1] == len(self.starts) - 1
         if sizes[-1] < 3 and self.is_unended and is_last_line:
             ((line_number, words),) = self._iterate_words(rows[-1:])
@@ -576,14 +602,21 @@ class ObjLines:
     def _resolve_relative(
         self, index: IntArray, kind: str, rows: IntArray, sizes: IntArray
     ) -> None:
-        """Replace negative indices (C,) in place; they count back from a face's line.
+        """Replace negative indices (C,) in place by those that count from 1.
 
-        -1 is the last row of the table `kind` before that line. `rows` are those of the
-        lines of faces, and `sizes` their numbers of corners.
+        They count back from their face's line: -1 is the last row of the table `kind`
+        before it.
+
+        Args:
+            index: (C,) of all corners.
+            kind: one of `TABLES`.
+            rows: (P,) the row of each face's line in the file.
+            sizes: (P,) the number of corners of each face.
         """
         is_relative = index < 0
         if not is_relative.any():
             return
+        # how many rows of the table stand above each line, for each corner
         count_before_line = np.cumsum(self.kind == KINDS.index(kind))
         count_before = np.repeat(count_before_line[rows], sizes)
         if (index < -count_before).any():
@@ -607,15 +640,16 @@ class ObjLines:
         return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
 
     def _select_lines(self, kind: str) -> tuple[IntArray, Bytes]:
-        """Return the rows of the lines of a kind, and their bytes.
+        """Return the rows of the lines of a kind, and their bytes, one after the other.
 
-        Keywords and comments are blanked out or removed, so that only the arguments
-        and one line break for each row are left.
+        Keywords become blanks, and comments are removed: only the arguments and one
+        line break for each line are left.
         """
         is_selected = self.kind == KINDS.index(kind)
         lengths = self.ends - self.starts + 1
         rows = np.flatnonzero(is_selected)
         line_bytes = self.bytes[np.repeat(is_selected, lengths)]
+        # where each selected line begins in `line_bytes`
         starts = np.cumsum(lengths[rows]) - lengths[rows]
         for offset in range(len(kind)):
             line_bytes[starts + offset] = ord(" ")
@@ -693,9 +727,10 @@ def _count_words(data: Bytes) -> IntArray:
 def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntArray:
     """Return the column of each number in its corner, by the slashes before it.
 
-    In ``7//5`` the 7 is in column 0 and the 5, after two slashes, in column 2. As a
-    corner has three numbers at most, that is the sum of the slashes before a number and
-    before up to two predecessors in its corner.
+    In ``7//5`` the 7 is in column 0 and the 5, after two slashes, in column 2: the
+    column is the number of slashes in the corner before the number. As a corner has
+    three numbers at most, that is the sum of the slashes right before the number and
+    right before up to two predecessors in its corner.
 
     Args:
         is_first: whether a number is the first of its corner.
@@ -713,6 +748,12 @@ def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntAr
 def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     """Parse the corners of face lines, such as ``1/2/3 4//5 6``.
 
+    Corners are separated by blanks, and the numbers of a corner by slashes. All numbers
+    are parsed at once; their columns follow from the bytes before them.
+
+    Args:
+        data: the lines without keywords; each ends in a line break.
+
     Returns:
         (C, 3) indices of points, UVs and normals as the file has them, 0 for none; and
         (P,) the number of corners of each face. None if the text is malformed.
@@ -720,10 +761,12 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     is_blank = _BLANK[data]
     is_slash = data == _SLASH
     is_digit = ~(is_blank | is_slash)
+    # a blank is before the first number: the keyword was blanked out
     number_starts = np.flatnonzero(is_digit[1:] & ~is_digit[:-1]) + 1
     is_first = is_blank[number_starts - 1]
     # the byte two before a number is a slash too, if there are two
     column = _find_columns(is_first, is_slash[number_starts - 2])
+    # a number whose three predecessors are in its corner too
     has_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])
     is_malformed = (
         (is_slash[1:] & is_blank[:-1]).any()
@@ -735,9 +778,11 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     values = parse_number_array(without_slashes.tobytes(), np.int64)
     if is_malformed or len(values) != len(number_starts) or (values == 0).any():
         return None
+    # corners before each line break, minus those before the one above
     corner_starts = number_starts[is_first]
     line_ends = np.flatnonzero(data == _NEWLINE)
     sizes = np.diff(np.searchsorted(corner_starts, line_ends), prepend=0)
     corners = np.zeros((len(corner_starts), 3), dtype=np.int64)
+    # the corner of each number is how many began up to it, less 1
     corners[np.cumsum(is_first) - 1, column] = values
     return corners, sizes

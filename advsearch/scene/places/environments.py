@@ -30,8 +30,10 @@ from advsearch.trust.stored_files import track_opened_files
 def import_place(spec: str) -> EnvironmentAsset:
     """Read a place with its light, the first in its file or the one that is named.
 
-    A bundled environment wins over a file of the light's name. With lux, a radiance of
-    1 is so bright that level ground under the open sky gets them.
+    `spec` is the place's file, and perhaps a light, ``place.yaml#night``. A bundled
+    environment wins over a file of the light's name. If the light has lux, they are the
+    illuminance of level ground under the open sky: the luminance of a radiance of 1,
+    `candelas`, follows from that.
 
     Raises:
         FileFormatError, InputError: a file is missing, damaged, outside of the folder,

@@ -57,7 +57,7 @@ def is_place_file(spec: object) -> bool:
 def split_light(spec: str) -> tuple[str, str | None]:
     """Return the file and the light of ``place.yaml#night``.
 
-    None where it names no light.
+    The light is None where none is named, or where this is no place file.
     """
     file, mark, light = spec.rpartition("#")
     # A file may have a # in its own name.
@@ -94,9 +94,9 @@ def read_place_file(path: Path) -> PlaceFile:
 
 
 def resolve_sibling_path(path: Path, name: str) -> Path:
-    """Return a file that the file of a place names.
+    """Return the path of a file that the file of a place names.
 
-    Raises FileFormatError: it leads out of the folder.
+    Raises FileFormatError: it leads out of the folder of the place's file, `path`.
     """
     sibling = path.parent / name
     if "\0" in name or not is_inside(sibling, path.parent):
@@ -126,6 +126,7 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for entry in file.solids
         for outline in entry.list_footprints()
     )
+    # the solids of the place go with its first mesh
     marked = [
         replace(
             part,
@@ -159,11 +160,12 @@ def make_place_parts(
 ) -> tuple[MeshPart, ...]:
     """Return the meshes of a place with lengths in the metres of one object size.
 
-    What they emit is in the unit of the light's radiance. Meshes that are lamps emit
-    only if they shine, and then what the place's file says.
+    What they emit is divided by `candelas`, so that it is in the unit of the light's
+    radiance. Meshes that are lamps emit only if it is dark, and then what the place's
+    file says.
 
     Args:
-        place: the place.
+        place: the place, whose lengths are in metres and whose emission is in cd/m2.
         metres: of one object size.
         candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit,
             and its lamps stay off.

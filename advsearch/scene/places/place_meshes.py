@@ -128,7 +128,10 @@ class _Mappings(_Extension):
 
 
 def _read_extension(path: Path, model: type[M], content: object) -> M:
-    """Return an extension, checked; the default for None. Raises FileFormatError."""
+    """Return an extension of the file as a model; with defaults where it is None.
+
+    Raises FileFormatError: it has other types than the model.
+    """
     try:
         return model.model_validate({} if content is None else content)
     except ValidationError as error:
@@ -239,7 +242,10 @@ def _find_variant(path: Path, header: Header, variant: str) -> int:
 def _select_material(
     path: Path, header: Header, primitive: Primitive, variant: int | None
 ) -> int | None:
-    """Return the index of the material that a primitive has in a variant."""
+    """Return the index of the material that a primitive has in a variant.
+
+    It is the primitive's own where the variant does not change it, or is None.
+    """
     extension = _get_extension(primitive, VARIANTS)
     if variant is None or extension is None:
         return primitive.material
@@ -320,7 +326,7 @@ def _read_pieces(
 ) -> dict[tuple[int, int], PrimitiveData]:
     """Read the primitives of meshes, by the mesh and the index in it.
 
-    Those without faces are left out.
+    Each has the material of the variant. Those without faces are left out.
     """
     header = file.header
     pieces: dict[tuple[int, int], PrimitiveData] = {}
@@ -343,6 +349,9 @@ def _fit_surfaces(
     file: GltfFile, pieces: Mapping[tuple[int, int], PrimitiveData], notes: Notes
 ) -> dict[int | None, tuple[ImportedSurface, Float64Array, Float64Array]]:
     """Return the surface of each material, with the scale and shift of its UVs.
+
+    UVs times the scale (2,) plus the shift (2,) are those in the surface's images,
+    which are fitted to all pieces of the material.
 
     Raises FileFormatError, InputError: there are too many materials or texels.
     """
@@ -389,9 +398,9 @@ def _group_by_material(
 ) -> dict[NameAndMaterial, list[ImportedPart]]:
     """Return the primitives of each mesh, by its name and the material in the variant.
 
-    A mesh has the name of its own material, also where the variant changes all of it.
-    Where the variant changes a part of what has that material, this part has the name
-    of the other one. In the order of materials.
+    A mesh has the name of its own material, also where the variant changes all that has
+    that material. Where the variant changes only some of it, that is a mesh of its own
+    with the name of the other material. Sorted by the index of the variant's material.
     """
     variant_materials: dict[int | None, set[int | None]] = {}
     for primitive in primitives:
@@ -422,7 +431,10 @@ def _name_material(header: Header, index: int | None) -> str:
 def _make_part(
     path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface
 ) -> MeshPart:
-    """Return one mesh of a place from its parts and their surface."""
+    """Return one mesh of a place from its parts and their surface.
+
+    A color without a texture becomes a small texture of it, and its alpha the opacity.
+    """
     color = surface.color
     if color is None:
         color = np.full(3, NEUTRAL_GREY, np.float32)
@@ -452,9 +464,17 @@ def _with_finish(
 ) -> MeshPart:
     """Return a mesh with the specular and the clear coat of its material.
 
-    Specular is so large that the surface reflects as much as by its index of refraction
-    when it faces the light. The gloss of a coat needs a surface in Mitsuba's words; a
-    mesh with cut-outs or bumps has none, and its coat has Mitsuba's own gloss.
+    The file has an index of refraction n, and the reflectance of a surface that faces
+    the light is ((n - 1) / (n + 1))^2; our specular of 1 is one of `REFLECTANCE`, so
+    that the quotient is the specular. The gloss of a coat can only be set in a surface
+    in Mitsuba's words; a mesh with cut-outs or bumps has none, and its coat has
+    Mitsuba's own gloss.
+
+    Args:
+        path: the file, for messages.
+        header: of the file.
+        index: of the material; None: the mesh has none.
+        part: the mesh.
     """
     entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
@@ -469,6 +489,8 @@ def _with_finish(
     is_plain = part.opacity is None and part.normal_map is None
     if coat.clearcoatFactor == 0.0 or not is_plain:
         return part
+    # Mitsuba's width of the lobe goes from `DULL_COAT` at gloss 0 to `GLOSSY_COAT` at
+    # 1; glTF's is the square of the roughness
     gloss = (DULL_COAT - coat.clearcoatRoughnessFactor**2) / (DULL_COAT - GLOSSY_COAT)
     principled = {
         "type": "principled",
@@ -482,10 +504,10 @@ def _with_finish(
 def _join(members: Sequence[ImportedPart]) -> Mesh:
     """Join parts of a file to one mesh, z up, its front along +x.
 
-    Texture coordinates that are missing are 0; normals that are missing are those of
-    faces.
+    Parts have glTF's axes. Texture coordinates that are missing are 0; normals that are
+    missing are those of faces. Normals become unit vectors.
     """
-    rotation = compute_rotation("y", "+z")  # glTF's axes
+    rotation = compute_rotation("y", "+z")  # from glTF's axes
     vertices = list[Float64Array]()
     faces = list[IntArray]()
     normals = list[Float64Array]()

@@ -33,7 +33,9 @@ class _Entry(BaseModel):
 def _is_convex(corners: Float64Array) -> bool:
     """Return whether corners (K, 2), in turn, turn to one side only, and hold an area.
 
-    Either side will do; a corner on a straight line does not count, within rounding.
+    That is, whether the outline is convex: left or right turns only. A corner on a
+    straight line does not count, within rounding. If all are on one line, the outline
+    holds no area.
     """
     edges = np.roll(corners, -1, axis=0) - corners
     # cross products of successive edges
@@ -68,7 +70,11 @@ class SolidEntry(_Entry):
 
     @model_validator(mode="after")
     def _check_form(self) -> SolidEntry:
-        """Check that an entry has one convex outline, or a radius and positions."""
+        """Check that an entry has one convex outline, or a radius and positions.
+
+        Raises ValueError, which pydantic reports: both or neither, heights that do not
+        rise, an outline that is not convex, or a name that is no line of text.
+        """
         has_positions = self.at is not None
         has_radius = self.radius is not None
         has_outline = self.outline is not None
@@ -89,7 +95,10 @@ class SolidEntry(_Entry):
         return self
 
     def list_footprints(self) -> list[Footprint]:
-        """Return the outlines, in metres."""
+        """Return the outlines, in metres: the one, or a polygon around each position.
+
+        A round outline is a regular polygon with its corners on the circle.
+        """
         if self.outline is not None:
             return [Footprint(np.array(self.outline), *self.heights)]
         turn = np.arange(N_CIRCLE_CORNERS) * (2.0 * np.pi / N_CIRCLE_CORNERS)

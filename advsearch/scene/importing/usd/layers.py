@@ -172,7 +172,11 @@ class _LayerCheck:
         self._folder = self.file.parent.resolve()
 
     def run(self) -> list[Path]:
-        """Return the files of all layers and packages, the file itself first."""
+        """Return the files of all layers and packages, the file itself first.
+
+        What a layer names is followed; a package is checked with all that is in it.
+        Raises FileFormatError as `check_layers`.
+        """
         pending = [self.file.resolve()]
         checked_files = dict[Path, None]()
         while pending:
@@ -205,6 +209,10 @@ class _LayerCheck:
     def _find_layer(self, path: Path, name: str) -> Path:
         """Return the file that a layer names; of a file in a package, the package.
 
+        Args:
+            path: the layer, relative to which the name is.
+            name: as it stands there, perhaps with a path in a package.
+
         Raises:
             FileFormatError: it is missing, or not in the folder.
         """
@@ -229,6 +237,7 @@ class _LayerCheck:
             )
         if inner:
             try:
+                # only to check that it is there
                 read_packaged(Ar.JoinPackageRelativePath(str(layer_file), inner))
             except KeyError:
                 raise errors.FileFormatError(

@@ -137,6 +137,9 @@ def _is_png_of_16_bits(data: bytes) -> bool:
 def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
     """Return the values (H, W, 4) in [0, 1] of a PNG file with 16 bits a channel.
 
+    A row is a byte with its filter and then its pixels; all rows are compressed
+    together. `size` is the width and height.
+
     Raises:
         ValueError: it is interlaced or corrupt.
     """
@@ -179,7 +182,11 @@ def _expand_to_rgba(values: Array) -> Array:
 
 
 def _join_png_data(data: bytes) -> bytes:
-    """Return the concatenated IDAT chunks of a PNG file."""
+    """Return the concatenated IDAT chunks of a PNG file.
+
+    After 8 bytes, a file is chunks: 4 bytes of length, 4 of type, the data, and 4 of
+    checksum.
+    """
     content = bytearray()
     position = 8
     while position + 8 <= len(data):
@@ -193,12 +200,17 @@ def _join_png_data(data: bytes) -> bytes:
 def _unfilter(filters: Array, filtered: Array) -> Array:
     """Undo the filters of a PNG image (PNG specification, section 9).
 
-    A pixel depends on those to its left and above, so all pixels on a diagonal are
-    computed at once.
+    A byte was stored minus its prediction from the same byte of the pixels to the left,
+    above, and above to the left, modulo 256. As these have to be known first, pixels
+    are computed diagonal by diagonal: those on one do not depend on each other.
 
     Args:
-        filters: (H,) the filter of each row.
+        filters: (H,) the filter of each row: 0 none, 1 left, 2 above, 3 their mean, 4
+            Paeth.
         filtered: (H, W, bytes) pixels.
+
+    Returns:
+        (H, W, bytes) uint8.
 
     Raises:
         ValueError: a filter is unknown.
@@ -206,9 +218,10 @@ def _unfilter(filters: Array, filtered: Array) -> Array:
     height, width, pixel_size = filtered.shape
     if filters.max(initial=0) > 4:
         raise ValueError("a PNG with an unknown filter")
-    # With zeros above and to the left.
+    # With zeros above and to the left; 16 bits hold the sum of two bytes.
     pixels = np.zeros((height + 1, width + 1, pixel_size), np.int16)
     for diagonal in range(height + width - 1):
+        # the rows that the diagonal row + column = diagonal crosses
         row = np.arange(max(0, diagonal - width + 1), min(height, diagonal + 1))
         column = diagonal - row
         left = pixels[row + 1, column]
@@ -228,7 +241,10 @@ def _unfilter(filters: Array, filtered: Array) -> Array:
 
 
 def _paeth(left: Array, above: Array, corner: Array) -> Array:
-    """Return the Paeth predictor: the neighbour that is closest to their estimate."""
+    """Return the Paeth predictor: the neighbour closest to left + above - corner.
+
+    Of equally close ones that to the left comes first, then the one above.
+    """
     estimate = left + above - corner
     to_left = np.abs(estimate - left)
     to_above = np.abs(estimate - above)

@@ -287,10 +287,11 @@ class Conversion:
     # ---- Cameras and lights ----
 
     def _add_camera(self, camera: Any, node: dict[str, Any]) -> None:
-        """Add a camera to a node; one that is not perspective counts as left out.
+        """Add a camera to a node.
 
-        An orthographic entry stands for it, which the reader of glTF notes. A shifted
-        aperture is noted here.
+        One that is not perspective becomes an orthographic entry, which the reader of
+        glTF leaves out with a note. Aperture and focal length are lengths in the same
+        unit. A shift of the aperture is left out, with a note.
         """
         width = _get_first(camera, "HorizontalAperture")
         height = _get_first(camera, "VerticalAperture")
@@ -319,8 +320,10 @@ class Conversion:
     def _add_light(self, prim: Any, node: dict[str, Any]) -> None:
         """Add a distant or a spherical light to a node; others are noted.
 
-        glTF's intensity is candela, or lux of a distant light: USD's radiance is
-        integrated over the sphere's visible disk, or over the sun's solid angle.
+        USD has radiance, and glTF candela, or lux for a distant light. So the radiance
+        is integrated over the disk that a sphere is seen as, or over the cone under
+        which a distant light is seen. A "normalised" light of USD has a power that does
+        not depend on its size. The light's middle is where the node is.
         """
         light = UsdLux.LightAPI(prim)
         kind = prim.GetTypeName()
@@ -337,6 +340,7 @@ class Conversion:
             half_angle = math.radians(angle) / 2.0
             entry: dict[str, Any] = {"type": "directional"}
             if not is_normalized and half_angle > 0.0:
+                # radiance to irradiance of what faces it
                 intensity *= math.pi * math.sin(half_angle) ** 2
         elif kind == "SphereLight":
             # Radiance times the visible disk, pi r^2. A normalised light is divided by
@@ -347,7 +351,7 @@ class Conversion:
                 intensity *= (
                     math.pi * _get_first(UsdLux.SphereLight(prim), "Radius") ** 2
                 )
-            intensity *= self.unit**2
+            intensity *= self.unit**2  # the radius is in the stage's unit
             entry = _make_point_light(prim)
             self._note("has a SphereLight, which shines from its middle here")
         else:
@@ -518,6 +522,9 @@ class Conversion:
     ) -> dict[str, Any]:
         """Return a primitive as an entry of the header; its data goes to the buffer.
 
+        USD has values for points, corners or faces; glTF for vertices alone. So corners
+        that have the same point and the same value of every attribute become a vertex.
+
         Args:
             path: path of the prim, for messages.
             points: (P, 3).
@@ -537,7 +544,8 @@ class Conversion:
             "uniform": face.repeat(3),
         }
         constant_index = np.zeros(len(corner_rows), np.int64)
-        # One column for each attribute: which of its values each corner has.
+        # A column for the point and one for each attribute: which of its values each
+        # corner has. Without values, or with one for all, that is the first.
         indices = [corners[corner_rows]]
         for attribute in attributes.values():
             index = constant_index
@@ -620,8 +628,10 @@ class Conversion:
     ) -> Iterator[tuple[int, tuple[Array, str] | None, Array]]:
         """Split faces with a material by their colors and opacities.
 
-        A material may take both from primvars. Up to `MAX_TINTS` colors of faces become
-        materials; others are vertex colors. Opacities always become materials.
+        A material may take both from primvars. If faces have up to `MAX_TINTS` colors,
+        each becomes a glTF material; more, or colors that change within a face, become
+        vertex colors. Opacities always become materials, as glTF's vertex colors are
+        imported without.
 
         Args:
             bound: the material.
@@ -648,6 +658,7 @@ class Conversion:
         colors = _read_primvar(primvars, bound.color)
         opacities = _read_primvar(primvars, bound.opacity)
         opacity = self._compute_face_opacities(opacities, faces, counts, corners)
+        # (F, 3) the color of each face that its material gets; NaN: it gets none
         tints = np.full((len(faces), 3), np.nan)
         vertex_colors = colors
         if colors is not None and colors[1] in ("constant", "uniform"):
@@ -675,8 +686,9 @@ class Conversion:
     ) -> Array:
         """Return the opacity of each face, (F, 1); NaN where the material's holds.
 
-        They are rounded to 1/255; more than `MAX_TINTS` are replaced by their mean,
-        with a note. Arguments are those of `_compute_face_values`.
+        They are rounded to 1/255, so that few are different; more than `MAX_TINTS` are
+        replaced by their mean, with a note. `opacities` are values and interpolation of
+        a primvar, or None; other arguments are those of `_compute_face_values`.
         """
         if opacities is None:
             return np.full((len(faces), 1), np.nan)
@@ -717,7 +729,7 @@ class Conversion:
         """Pose the points of a mesh by its skeleton at rest.
 
         A joint moves points by the inverse of its bind transform, then its rest
-        transform.
+        transform. USD's matrices are for rows, so that the first one is on the left.
 
         Returns:
             The matrix (4, 4) of the skeleton, for rows, and the points (P, 3) in it;
@@ -772,9 +784,10 @@ def _make_point_light(prim: Any) -> dict[str, Any]:
 def _compute_face_values(
     primvar: tuple[Array, str], faces: Array, counts: Array, corners: Array
 ) -> Array:
-    """Return the values (F, C) of faces; those of corners are averaged.
+    """Return the values (F, C) of some faces; those of their corners are averaged.
 
-    Indices beyond the values have the last of them.
+    Values are of the mesh ("constant"), of faces ("uniform"), of points ("vertex" and
+    "varying"), or of corners. Indices beyond the values have the last of them.
 
     Args:
         primvar: values (N, C) and their interpolation.

@@ -245,7 +245,10 @@ class UsdSurfaces:
         return self._materials[path]
 
     def _make_default_material(self) -> BoundMaterial:
-        """Add the material of prims without one, whose color is their display color."""
+        """Add the material of prims without one, whose color is their display color.
+
+        That is a primvar of each mesh, so that faces are tinted later.
+        """
         surface = {
             "baseColorFactor": [*DEFAULT_COLOR, 1.0],
             "metallicFactor": 0.0,
@@ -270,9 +273,15 @@ class UsdSurfaces:
     def make_tinted(
         self, bound: BoundMaterial, color: Sequence[float] | None, opacity: float | None
     ) -> int:
-        """Return the index of a material with another color and opacity.
+        """Return the index of a glTF material with another color and opacity.
 
-        Both are linear values, clipped to [0, 1]; None leaves them as they are.
+        It is a copy of the bound material's entry, which is added unless there is an
+        equal one; it is blended if its opacity is below 1.
+
+        Args:
+            bound: the material.
+            color: (3,) linear, clipped to [0, 1]; None: the material's.
+            opacity: clipped to [0, 1]; None: the material's.
         """
         entry = dict(self.header["materials"][bound.index])
         surface = dict(entry["pbrMetallicRoughness"])
@@ -522,7 +531,10 @@ class PreviewSurface:
         return PrimvarUse(primvar, reader.get_numbers("fallback", [0.0] * len(default)))
 
     def _is_srgb(self, color_space: str, data: bytes) -> bool:
-        """Return whether an image is in sRGB, by the shader or else by the image."""
+        """Return whether an image is in sRGB, by the shader or else by the image.
+
+        `color_space` is the shader's: "raw", "sRGB", or "auto", where the file decides.
+        """
         if color_space not in ("auto", "raw", "sRGB"):
             self.surfaces.note(
                 f"has a texture with the sourceColorSpace {color_space[:50]!r}, which "
@@ -537,7 +549,7 @@ class PreviewSurface:
 
         Returns:
             The texture; or the numbers, one for each channel, that stand in for an
-            image that is missing; or None.
+            image that is missing; or None, with a note unless nothing is connected.
         """
         source = self.shader.find_source(name)
         if source is None:
@@ -614,9 +626,9 @@ class PreviewSurface:
     def _find_layout(self, node: Shader) -> TextureLayout:
         """Return the texture coordinates of a texture: a primvar and its transforms.
 
-        The shaders are followed from the texture to the primvar; a transform that comes
-        later is applied to texture coordinates earlier. Other shaders are taken for the
-        primvar st, with a note.
+        The shaders are followed from the texture, input by input, back to the primvar.
+        Texture coordinates run the other way: the transform that is met last is applied
+        first. Shaders of other kinds are taken for the primvar st, with a note.
         """
         matrix = np.eye(3)
         input_name = "st"
@@ -649,6 +661,8 @@ class PreviewSurface:
     ) -> TextureLayout:
         """Return the layout of a texture whose coordinates are a value, with a note.
 
+        Its matrix ignores the texture coordinates, and yields the transformed value.
+
         Args:
             node: the shader with the value.
             input_name: its input.
@@ -677,16 +691,17 @@ class PreviewSurface:
     ) -> tuple[PrimvarUse | None, PrimvarUse | None]:
         """Fill in color and opacity.
 
-        Each comes from a primvar, a texture or a value. An opacity texture needs the
-        layout of the color's, and is left out otherwise. With a threshold the opacity
-        is a mask.
+        Each comes from a primvar (numbers on the mesh), a texture or a value. glTF has
+        one texture for both, so that an opacity texture with other texture coordinates
+        than the color's is left out. With a threshold the opacity is a mask, otherwise
+        it is blended.
 
         Args:
             entry: the glTF material.
             surface: its pbrMetallicRoughness.
 
         Returns:
-            The primvars that replace color and opacity.
+            The primvars that replace color and opacity; None where there is none.
         """
         shader = self.shader
         color_primvar = self._find_primvar(
@@ -698,6 +713,7 @@ class PreviewSurface:
         threshold = shader.get_number("opacityThreshold", 0.0)
         color = list(shader.get_numbers("diffuseColor", DEFAULT_COLOR))
         opacity = shader.get_number("opacity", 1.0)
+        # A tuple is the value that stands in for a missing image.
         if isinstance(color_use, tuple):
             color = list(np.broadcast_to(color_use, 3))
             color_use = None
@@ -741,8 +757,14 @@ class PreviewSurface:
         The image itself does if its sRGB texels are only scaled, and the opacity, if
         there is any, is its alpha.
 
+        Args:
+            color_use: the texture of the color, or None.
+            opacity_use: that of the opacity, or None.
+            color: (3,) linear color where there is no texture of it.
+
         Returns:
-            The index of the texture, or None; and the color that it is multiplied by.
+            The index of the texture, or None; and the color that it is multiplied by,
+            which is 1 for a baked one.
         """
         first_use = color_use or opacity_use
         if first_use is None:
@@ -765,10 +787,11 @@ class PreviewSurface:
         opacity_use: UsdTextureUse | None,
         factor: Sequence[float],
     ) -> Array | None:
-        """Return display values (H, W, 3 or 4) of color and opacity.
+        """Return display-referred values (H, W, 3 or 4) of color and opacity.
 
-        None if neither image can be read. `factor` is the color if it has no image.
-        Images of two sizes are both resized to the larger width and the larger height.
+        None if neither image can be read. `factor` (3,) is the linear color if it has
+        no image. Images of two sizes are both resized to the larger width and the
+        larger height.
         """
         colors = None if color_use is None else self.surfaces.compute_values(color_use)
         opacities = (
@@ -795,11 +818,15 @@ class PreviewSurface:
     def _add_roughness_and_metallic(
         self, surface: dict[str, Any], *, is_specular: bool
     ) -> None:
-        """Fill in roughness and metallic; their images are packed into one.
+        """Fill in roughness and metallic of the glTF material.
 
-        An image with another layout than the first is replaced by its mean, and a
-        primvar by its fallback, with a note. A number without an image fills its
-        channel.
+        glTF has one image for both, in which each is a channel; a number without an
+        image fills its channel. So an image with other texture coordinates than the
+        first is replaced by its mean, and a primvar by its fallback, with a note.
+
+        Args:
+            surface: its pbrMetallicRoughness.
+            is_specular: whether the material has the workflow without metals.
         """
         factor_by_name: dict[str, float] = {}
         plane_by_name: dict[str, Array] = {}
@@ -828,6 +855,7 @@ class PreviewSurface:
         texture = self.surfaces.add_image(
             _pack_planes(plane_by_name, factor_by_name), packed_use.sampler
         )
+        # The image has the numbers, which the factors multiply.
         surface["metallicFactor"] = 1.0
         surface["roughnessFactor"] = 1.0
         surface["metallicRoughnessTexture"] = self._make_slot(
@@ -871,9 +899,11 @@ class PreviewSurface:
     def _add_normal(self, entry: dict[str, Any]) -> None:
         """Fill in the normal map.
 
-        An image of 8 bits with the scale and bias of normals is taken as it is, also if
-        these are missing and its texels look like normals; others are decoded and
-        written anew. A single normal, or one channel, is left out with a note.
+        Texels of 8 bits become normals by a scale of 2 and a bias of -1, which glTF
+        implies. So an image of 8 bits with these is taken as it is; also if they are
+        missing and its texels look like normals. Others are decoded and written anew. A
+        single normal for all, or one channel, is left out with a note. `entry` is the
+        glTF material.
         """
         if self.shader.find_source("normal") is None:
             if not np.allclose(
@@ -920,8 +950,9 @@ class PreviewSurface:
         """Fill in the emission, whose factor may be larger than 1.
 
         An image of sRGB texels times factors is taken as it is; another one is written
-        anew, divided by its largest value. Factors above 1 go to an extension, which
-        glTF needs for it.
+        anew, divided by its largest value, which becomes the factor. glTF's factors are
+        at most 1: the largest one beyond that goes to an extension. `entry` is the glTF
+        material.
         """
         factor: Sequence[float] = self.shader.get_numbers(
             "emissiveColor", (0.0, 0.0, 0.0)
@@ -960,7 +991,9 @@ class PreviewSurface:
 def _pack_planes(planes: Mapping[str, Array], factors: Mapping[str, float]) -> Array:
     """Return an image (H, W, 3) of roughness (green) and metallic (blue).
 
-    A plane that is missing is filled with its factor.
+    Planes (h, w) in [0, 1] and factors are by these two names; where there is no plane,
+    the factor fills the channel. The image has the size of the wider plane, of two
+    equally wide ones of the higher. Red is 1.
     """
     width, height = max((plane.shape[1], plane.shape[0]) for plane in planes.values())
     packed = np.ones((height, width, 3), np.float32)
