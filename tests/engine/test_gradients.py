@@ -196,7 +196,7 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
         with torch.no_grad():
             for again in range(2):
                 assert torch.equal(recorded(u, again, 4), plain(u, again, 4)), (number, again)
-        recording = recorded.scene._recorded["path", 4, recorded.scene.depth]
+        recording = recorded.scene._recorded["path", 4, recorded.scene.depth, None]
         of_a_move[id(recording)] = recording
         if number < 4:
             assert len(of_a_move) == 1 + (number == 3)  # an integrator that is new makes recordings stale
