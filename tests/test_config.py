@@ -32,7 +32,7 @@ from hostile import HOSTILE, shown
 
 WRONG: dict[str, Any] = {
     "object": "", "path": "", "shutter": 0.0, "rolling": -61.0, "environment": [], "up": "x", "size": 0, "things": 3,
-    "judge": "", "backdrop": "", "occluder": "", "unit": "ft",
+    "judge": "", "backdrop": "", "occluder": "", "twins": "", "unit": "ft",
     "facing": "ahead", "camera": "", "set_": {"camera.azimuth": math.nan}, "exposure": 99,
     "resolution": "4x4", "model": "a\x00b", "labels": ["tench, Tinca tinca", "goldfish"],
     "prompt": "a photo of a {} | ", "value_range": "255,0", "ask": {"calls": "many"}, "task": "  ", "label": "  ",
@@ -48,7 +48,7 @@ WRONG: dict[str, Any] = {
 GIVEN: dict[str, Any] = {
     "object": "mug.obj", "environment": "room.hdr", "up": "y", "facing": "-z", "size": 4.9, "unit": "cm",
     "camera": "front", "things": "car@1,2", "judge": "car", "backdrop": "desk.jpg#1,2,30,40",
-    "occluder": "hand.png",
+    "occluder": "hand.png", "twins": "runs/lmo",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "prompt": "a photo of a {}", "ask": {"calls": 5.0}, "task": "detection",

@@ -39,6 +39,7 @@ from advsearch.questions.stability.scenes import select_cases
 from advsearch.questions.sweep.axes import parse_axes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite
+from advsearch.questions.twins.result import TwinsConfig
 from advsearch.runs import export
 from advsearch.runs.exporters import EXPORTERS
 from advsearch.scene import library
@@ -84,6 +85,9 @@ def check_names(config: Config) -> None:
         return
     if isinstance(config, RecipeConfig):
         assert config.recipe in ("list", "mine.yaml") or plan_runs(read_recipe(config.recipe), config)
+        return
+    if isinstance(config, TwinsConfig):
+        assert config.photographs
         return
     assert isinstance(config, SceneConfig)
     check_run_settings(
