@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -18,9 +19,9 @@ from typing import Any
 import pytest
 
 from advsearch.cluster import WorkerDiedError, Workers, WorkerStats, WorkerTask
-from advsearch.cluster.dask_executor import DaskExecutor, parse_site
+from advsearch.cluster.dask_executor import CLUSTER_CLASSES, MAX_TRIES, DaskExecutor, parse_site
 from advsearch.cluster.local import LocalExecutor
-from advsearch.cluster.worker import compute_version, run_batch
+from advsearch.cluster.worker import Failure, Reply, compute_version, run_batch
 from advsearch.cluster.workers import open_workers
 from advsearch.errors import ClusterError, FileFormatError, InputError
 from conftest import ROOT
@@ -30,6 +31,7 @@ dask: Any = import_module("dask")
 distributed: Any = import_module(
     "distributed"
 )  # first: what it adds to the configuration would go again with what a test sets there
+scheduling: Any = import_module("distributed.scheduler")
 SCRIPTS = Path(sys.executable).parent
 
 
@@ -209,6 +211,28 @@ def executor_of_nobody(**more: Any) -> Any:
     return executor
 
 
+def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its client runs at both, over another connection: what was under way is lost all the same."""
+    connection = object()
+    client = SimpleNamespace(
+        status="running",
+        scheduler_comm=connection,
+        scheduler=SimpleNamespace(ncores=None),
+        sync=lambda function, *args, **__: {"a": compute_version()},
+    )
+    now = time.monotonic()
+    executor = executor_of_nobody(
+        _client=client, _connection=connection, _counted_at=now, _alone_since=now, _looked_at=float("-inf")
+    )
+    again = list[object]()
+    monkeypatch.setattr(executor, "_reconnect", lambda: again.append(client.scheduler_comm))
+    monkeypatch.setattr("advsearch.cluster.dask_executor.LOOK_SECONDS", 0.0)
+    assert executor.count_workers() == 1 and not again
+    client.scheduler_comm = object()
+    executor.count_workers()
+    assert again == [client.scheduler_comm]
+
+
 def looked_at(versions: dict[str, Any], seconds: float) -> tuple[int, list[str]]:
     """How many workers may be given calls, and what is told, of those with such versions after so long."""
     told = list[str]()
@@ -240,6 +264,95 @@ def test_a_worker_of_another_version_is_refused_with_both() -> None:
         looked_at({"b": "2"}, 16.0)
 
 
+def test_nobody_at_all_is_waited_for_and_then_said() -> None:
+    assert looked_at({}, 299.0)[0] == 0
+    with pytest.raises(ClusterError, match="there was no worker that can do it for 300 s; what was stored is kept"):
+        looked_at({}, 301.0)
+
+
+class Prediction:
+    """A future of Dask that ends so."""
+
+    def __init__(self, status: str, comes: Any) -> None:
+        self.status, self.comes, self.released = status, comes, False
+
+    def __await__(self) -> Generator[None, None, Any]:
+        return self._answer().__await__()
+
+    async def _answer(self) -> Any:
+        if isinstance(self.comes, BaseException):
+            raise self.comes
+        return self.comes
+
+    def release(self) -> None:
+        self.released = True
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *answers: Prediction, executor: Any = None) -> Any:
+    """What comes of a call whose answers come so, one for each time that it is asked."""
+    monkeypatch.setattr("advsearch.cluster.dask_executor.LOOK_SECONDS", 0.001)
+    left = iter(answers)
+    plugins = list[Any]()
+
+    async def register_plugin(plugin: Any, name: str) -> None:
+        plugins.append(plugin)
+
+    client = SimpleNamespace(
+        status="running", submit=lambda *args, **named: next(left), register_plugin=register_plugin, plugins=plugins
+    )
+    executor = executor_of_nobody() if executor is None else executor
+    value = asyncio.run(executor._call(client, len, ("abc",)))
+    assert all(one.released for one in answers) and not list(left)
+    return value
+
+
+ON_THE_WAY = [
+    ("finished", distributed.comm.CommClosedError("in ConnectionPool.gather: Stream is closed")),
+    ("finished", OSError("no route to host")),
+    ("finished", TimeoutError("in 120 s")),
+    ("finished", RuntimeError("of a thread that is not there any more")),
+    ("lost", AssertionError("not there")),
+    ("cancelled", distributed.client.FutureCancelledError(key="a", reason="scheduler-connection-lost")),
+    ("cancelled", asyncio.CancelledError("by somebody else")),
+    ("error", scheduling.NoValidWorkerError("a", set(), {"tcp://here"}, {}, 60.0)),
+    ("error", scheduling.NoWorkerError("a", 60.0)),
+]
+
+
+@pytest.mark.parametrize(("status", "error"), ON_THE_WAY, ids=[type(error).__name__ for _, error in ON_THE_WAY])
+def test_what_is_lost_on_the_way_is_asked_again(
+    monkeypatch: pytest.MonkeyPatch, status: str, error: BaseException
+) -> None:
+    value = Prediction("finished", ("tcp://here", "value"))
+    told = called(monkeypatch, Prediction(status, error), Prediction(status, error), value)
+    assert told == "value"
+
+
+def test_what_a_worker_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the state of the call, not by the error's type, which may be the same."""
+    for error in (distributed.comm.CommClosedError("its own"), OSError("the disk is gone"), ValueError("a bug")):
+        with pytest.raises(ClusterError, match=f"a worker cannot begin .{type(error).__name__}: {error}"):
+            called(monkeypatch, *(Prediction("error", error) for _ in range(MAX_TRIES)))
+    killed = distributed.KilledWorker("a", SimpleNamespace(address="tcp://here"), 0)
+    with pytest.raises(WorkerDiedError, match="no answer: 3 workers died of it"):
+        called(monkeypatch, Prediction("error", killed))
+
+
+def test_a_worker_that_is_not_fit_is_given_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it was to do is done elsewhere; files are sent once to all that come."""
+    executor = executor_of_nobody()
+    vars(executor)["_fit"] = frozenset({"tcp://here", "tcp://there"})
+    full = Prediction("finished", ("tcp://here", Reply(failure=Failure.UNFIT, error="the disk is full")))
+    lacks = Prediction("finished", ("tcp://there", Reply(failure=Failure.MISSING_FILES, error="it lacks mug.obj")))
+    done = Prediction("finished", ("tcp://there", Reply(value=3)))
+    assert called(monkeypatch, full, lacks, done, executor=executor).value == 3
+    assert executor._refused == {"tcp://here": "the disk is full"} and executor._sending.done()
+    assert executor._fit == {"tcp://there"} and executor.stats.refused == 1
+    executor._fit |= {"tcp://other"}
+    assert called(monkeypatch, lacks, done, executor=executor).value == 3
+    assert executor._refused["tcp://there"] == "it lacks mug.obj", "it has them not although it was sent them"
+
+
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("advsearch.cluster.dask_executor.CONNECT_SECONDS", 1.0)
     monkeypatch.setattr("advsearch.cluster.dask_executor.RECONNECT_SECONDS", 10_000.0)
@@ -253,10 +366,14 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("class: os.system\narguments: {command: ls}", "class"),
+        ("class: os.system\narguments: {command: ls}", "class: expected one of SLURMCluster.*got 'os.system'"),
         ("address: tcp://a:1\nclass: SLURMCluster", "expected either address, or class"),
-        ("class: SLURMCluster\nworkers: none", "workers"),
+        ("address: 5", "address: expected tcp://HOST:PORT"),
+        ("address: tcp://a:1\nworkers: 3", "says how many there are"),
+        ("class: SLURMCluster\nworkers: none", "workers: expected a whole number"),
+        ("class: SLURMCluster\nsecurity: yes", "security: expected names and values"),
         ("class: SLURMCluster", "SLURMCluster needs dask-jobqueue; pip install dask-jobqueue"),
+        ("class: KubeCluster", "KubeCluster needs dask-kubernetes; pip install dask-kubernetes"),
         ("nanny: 3", "got nanny"),
     ],
 )
@@ -265,3 +382,26 @@ def test_a_file_of_a_cluster_says_what_is_wrong_and_runs_nothing(tmp_path: Path,
     path.write_text(text)
     with pytest.raises((InputError, FileFormatError), match=message):
         parse_site(None, str(path))
+
+
+def test_a_cluster_is_an_address_a_file_or_this_machine(tmp_path: Path) -> None:
+    path = tmp_path / "cluster.yaml"
+    path.write_text("address: tls://10.0.0.1:8786\nsecurity: {tls_ca_file: ca.pem, require_encryption: true}")
+    place = parse_site(None, str(path))
+    assert place.address == "tls://10.0.0.1:8786"
+    assert place.security == {"tls_ca_file": str(tmp_path / "ca.pem"), "require_encryption": True}
+    assert LocalExecutor(3).description == "3 workers on this machine"
+    for workers, cluster, message in (
+        (2, "tcp://a:1", "leave one of the two out"),
+        (None, "a", "expected the address"),
+    ):
+        with pytest.raises(InputError, match=message):
+            parse_site(workers, cluster)
+    assert set(CLUSTER_CLASSES.values()) == {"dask_jobqueue", "dask_kubernetes.operator"}
+
+
+def test_without_dask_the_message_is_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"needs Dask; pip install 'advsearch\[dask\]'"):
+        with open_workers(WorkerTask("a:b", {}), workers=None, cluster="tcp://a:1", tell=lambda text: None):
+            pass
