@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from advsearch.attacks.domain import Block, Domain, project_l2_box
+from advsearch.attacks.domain import TOLERANCE, Block, Domain, option_center, project_l2_box
 from advsearch.errors import InputError
 
 QP_TOLERANCE = 2e-5  # SLSQP stops here; the projection itself is exact to float32
@@ -68,6 +68,23 @@ def test_l2_projection_is_not_clip_then_rescale() -> None:
     assert float((exact - u).norm()) < float((shortcut - u).norm()) - 1e-3
     assert exact[0] == 1.0
     assert float((exact - centre).norm()) == pytest.approx(0.3, rel=1e-6)
+
+
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_points_inside_come_back_bit_for_bit(norm: str) -> None:
+    domain = ball(norm, 0.2, torch.full((50,), 0.5))
+    u = domain.start + 0.02 * torch.randn(50, generator=generator())
+    assert torch.equal(domain.project(u), u)
+
+
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_points_on_the_edge_stay_and_points_outside_land_on_it(norm: str) -> None:
+    start = torch.full((4,), 0.5)
+    domain = ball(norm, 0.2, start)
+    edge = start + (torch.full((4,), 0.2) if norm == "linf" else torch.full((4,), 0.1))
+    assert torch.allclose(domain.project(edge), edge, atol=1e-7)
+    outside = start + 7 * (edge - start)
+    assert torch.allclose(domain.project(outside), edge, atol=1e-6)
 
 
 def test_linf_projection_is_a_clip_of_ball_and_box() -> None:
@@ -132,6 +149,12 @@ def test_a_discrete_choice_is_sampled_at_the_middle_of_its_options_and_has_no_up
     assert domain.project(torch.tensor([1.4, 0.4]))[0] == 1.0
 
 
+def test_the_last_option_ends_at_one() -> None:
+    assert option_center(torch.tensor([0.0, 0.24, 0.26, 0.99, 1.0]), 4).tolist() == [
+        0.125, 0.125, 0.375, 0.875, 0.875,
+    ]  # fmt: skip
+
+
 def test_a_reach_shortens_the_step_in_a_box() -> None:
     domain = Domain(torch.full((4,), 0.5), (Block(4, reach=0.03),))
     assert float(domain.steepest(domain.start, torch.ones(4)).norm()) == pytest.approx(0.03)
@@ -157,6 +180,14 @@ def test_extreme_samples_sit_at_the_extremes() -> None:
     assert 120 < int((corner == linf.upper).sum()) < 280  # signs are balanced
     surface = ball("l2", 0.7, start).sample(generator(), extreme=True)[0]
     assert float((surface - start).norm()) == pytest.approx(0.7, rel=1e-5)
+
+
+def test_interior_samples_are_uniform_in_the_box_that_is_left() -> None:
+    domain = ball("linf", 0.2, torch.tensor([0.1]))
+    values = domain.sample(generator(), 4000)[:, 0]
+    assert values.min() >= 0.0
+    assert values.max() <= 0.3001
+    assert float(values.mean()) == pytest.approx(0.15, abs=0.01)
 
 
 def test_l2_samples_fill_the_ball_uniformly() -> None:
@@ -198,18 +229,64 @@ def test_the_steepest_step_survives_zero_huge_and_tiny_gradients() -> None:
             assert torch.allclose(step, torch.tensor([0.1, 0.0, 0.0]))
 
 
+def test_a_box_step_does_not_push_against_a_bound() -> None:
+    domain = Domain(torch.tensor([1.0, 0.5]), (Block(2),))
+    step = domain.steepest(domain.start, torch.tensor([100.0, 1.0]))
+    assert step[0] == 0.0
+    assert float(step[1]) == pytest.approx(domain.blocks[0].radius)
+
+
+@pytest.mark.parametrize("epsilon", [0.0, -0.1, math.nan, math.inf, None])
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_a_bad_epsilon_names_the_flag(norm: str, epsilon: float | None) -> None:
+    with pytest.raises(InputError, match=r"`epsilon` of 'texture': expected a finite number over 0 .* got"):
+        Block(3, norm, epsilon, name="texture")  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Block(3, "l1", 0.1), "`norm`"),  # type: ignore[arg-type]
+        (lambda: Block(0), "expected a size of at least 1, got 0"),
+        (lambda: Block(3, "l1", 0.1), "`norm`: expected one of linf, l2, box, got 'l1'"),  # type: ignore[arg-type]
+        (lambda: Block(3, "box", 0.1), "has bounds and no norm budget; leave `epsilon` out"),
         (lambda: Block(3, low=0.5, high=0.5), r"expected 0 <= low < high <= 1, got \[0.5, 0.5\]"),
         (lambda: Block(3, "linf", 0.1, periodic=True), "a periodic block cannot have a norm budget"),
+        (lambda: Block(2, options=3), "expected a discrete choice to have at least one option, size 1, norm 'box'"),
         (lambda: Block(1, options=-1), "expected a discrete choice to have at least one option"),
-        (lambda: Domain(torch.zeros(2), (Block(2),), gradient_cost=-1), "gradient_cost"),
+        (lambda: Block(1, periodic=True, options=3), "expected a discrete choice"),
+        (lambda: Block(1, high=0.5, options=3), "expected a discrete choice"),
+        (lambda: Block(2, "linf", 0.1, reach=0.1), "expected a reach over 0 and norm 'box', got 0.1 and 'linf'"),
+        (lambda: Block(2, reach=0.0), "expected a reach over 0 and norm 'box', got 0.0"),
+        (lambda: Domain(torch.zeros(2), (Block(2),), gradient_cost=-1), "gradient_cost: expected at least 0, got -1"),
         (lambda: Domain(torch.zeros(3), (Block(2),)), r"expected shape \(2,\), the sum of the blocks, got \(3,\)"),
-        (lambda: Domain(torch.tensor([0.0, math.nan]), (Block(2),)), "start"),
+        (lambda: Domain(torch.tensor([0.0, 1.5]), (Block(2),)), r"expected values in \[0.0, 1.0\], got 0 to 1.5"),
+        (lambda: Domain(torch.tensor([0.0, math.nan]), (Block(2),)), "start: found NaN or infinite values"),
     ],
 )
 def test_bad_blocks_and_starts_are_refused(make: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         make()  # type: ignore[operator]
+
+
+def test_the_start_is_copied_and_kept_in_float32() -> None:
+    start = torch.full((2,), 0.5, dtype=torch.float64)
+    domain = Domain(start, (Block(2, "linf", 0.1),))
+    start[0] = 0.9
+    assert domain.start.dtype == torch.float32
+    assert torch.equal(domain.start, torch.full((2,), 0.5))
+
+
+def test_a_large_l2_projection_is_exact() -> None:
+    d = 200_000  # several chunks, sums of many terms
+    start = torch.rand(d, generator=generator())
+    domain = ball("l2", 20.0, start)
+    u = start + 0.3 * torch.randn(d, generator=generator(1))
+    projected = domain.project(u)
+    assert domain.violation(projected) <= TOLERANCE
+    assert float((projected - start).double().norm()) == pytest.approx(20.0, rel=1e-6)
+    free = (projected > 0) & (projected < 1)
+    t = (projected - start)[free].double() / (u - start)[free].double()
+    assert float(t.median()) == pytest.approx(float(t.mean()), rel=1e-3)  # one multiplier for all that is free
+    bound = ~free
+    reach = (start + float(t.median()) * (u - start))[bound]
+    assert bool(((reach <= 1e-6) | (reach >= 1 - 1e-6)).all())  # what is clipped would have gone past its bound

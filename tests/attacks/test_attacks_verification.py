@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import runpy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -31,14 +31,18 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.trials import MarginsOf, count_max_samples, derive_trial_seed
 from advsearch.attacks.verification import (
+    EASIER,
+    MIN_RATE,
     OVER_CONDITIONS,
     OVER_LOOKS,
+    TRIAL_LOOKS,
     WORST_CASE,
     Rule,
 )
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import MIN_TRIALS
 from advsearch.questions.region.boxes import GrownBox
+from advsearch.questions.region.result import MIN_SAMPLES
 from advsearch.seeds import stream
 from advsearch.statistics.paired import paired_difference
 from advsearch.tasks import Judgement, Prediction
@@ -72,8 +76,12 @@ def noisy(clean: float, adversarial: float, noise: float) -> Evaluate:
     ("successes", "trials", "low", "high"),
     [  # tables of exact binomial limits
         (0, 10, 0.0, 0.3085),
+        (1, 10, 0.0025, 0.4450),
         (5, 10, 0.1871, 0.8129),
+        (10, 20, 0.2720, 0.7280),
+        (19, 20, 0.7513, 0.9987),
         (20, 20, 0.8316, 1.0),
+        (0, 1, 0.0, 0.975),
     ],
 )
 def test_clopper_pearson_agrees_with_tables(successes: int, trials: int, low: float, high: float) -> None:
@@ -102,14 +110,19 @@ def test_clopper_pearson_covers_at_least_as_often_as_it_says(rate: float) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((1, 0), "trials"),
-        ((3, 2), "successes"),
-        ((1, 2, 1.0), "confidence"),
+        ((1, 0), "trials: expected at least 1, got 0"),
+        ((3, 2), "successes: expected a number from 0 to 2, got 3"),
+        ((1, 2, 1.0), "confidence: expected a number between 0 and 1, got 1.0"),
     ],
 )
 def test_impossible_counts_are_refused(arguments: tuple[float, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
         clopper_pearson(*arguments)  # type: ignore[arg-type]
+
+
+def test_trials_have_a_rate_and_its_interval() -> None:
+    trials = Trials(20, 20, 64)
+    assert trials.rate == 1.0 and trials.interval == pytest.approx((0.8316, 1.0), abs=1e-4)
 
 
 # ---- sample counts
@@ -159,6 +172,17 @@ def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
     assert math.isnan(choice.table[0].drift)
 
 
+def test_what_half_of_the_renders_do_not_settle_all_of_them_may() -> None:
+    """Margins around 1.6 that scatter by 0.5: too wide an interval for four renders, not for eight."""
+    turns = {stream(2, "sample count", k): k for k in range(8)}
+
+    def margins(spp: int, seeds: Sequence[int]) -> list[float]:
+        return [1.6 + 0.5 * (-1.0) ** turns[seed] for seed in seeds]
+
+    choice = choose_spp({"adversarial": margins}, seed=2, ladder=(4, 16, 64))
+    assert (choice.spp, choice.converged, choice.renders) == (16, True, 16)
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize("noise", [0.1, 1.0])
 def test_the_wrong_side_passes_in_about_one_case_of_twenty_at_most(noise: float) -> None:
@@ -182,6 +206,18 @@ def test_a_single_render_on_the_other_side_asks_for_more_samples() -> None:
 
     choice = choose_spp({"it": margins}, seed=0, ladder=(4, 16, 64, 256))
     assert (choice.spp, choice.converged) == (64, True)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_alone_is_no_proof_that_nothing_drifts(seed: int) -> None:
+    """A drift below its own uncertainty must not pass: at 16 and 64 samples these margins say nothing."""
+    choice = choose_spp({"clean": drifting(-3.0, 0, 0.0), "adversarial": drifting(1.0, 1.0, 2.0)}, seed=seed)
+    assert choice.spp >= 256
+
+
+def test_a_margin_at_zero_never_settles_and_says_so() -> None:
+    choice = choose_spp({"adversarial": drifting(0.0, 0.0, 0.3)}, seed=0, ladder=(16, 64, 256))
+    assert (choice.spp, choice.converged) == (256, False)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -237,7 +273,35 @@ def test_renders_of_a_sample_count_are_no_trials_and_both_groups_share_their_see
     assert len(seen["a"]) == 2 and not {derive_trial_seed(3, k) for k in range(100)} & set(sum(seen["a"], ()))
 
 
+def test_a_nan_margin_never_settles() -> None:
+    choice = choose_spp({"adversarial": lambda spp, seeds: [math.nan] * len(seeds)}, seed=0, ladder=(4, 8))
+    assert not choice.converged
+
+
+def test_a_single_rung_is_taken_unmeasured() -> None:
+    choice = choose_spp({"clean": drifting(1.0, 0.0, 0.0)}, seed=0, ladder=(32,))
+    assert (choice.spp, choice.converged, choice.renders) == (32, False, 0)
+
+
+@pytest.mark.parametrize("ladder", [(), (0, 4), (16, 16), (64, 16)])
+def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match="verify_spp: expected rising sample counts"):
+        choose_spp({}, seed=0, ladder=ladder)
+
+
 # ---- verdicts
+
+
+def test_nineteen_of_twenty_are_needed() -> None:
+    assert [WORST_CASE.count_needed(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
+
+
+@pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS, EASIER])
+def test_the_fewest_trials_are_those_whose_interval_excludes_a_claim_that_mostly_fails(rule: Rule) -> None:
+    assert rule.min_trials == MIN_TRIALS
+    assert clopper_pearson(rule.min_trials - 1, rule.min_trials - 1)[0] < MIN_RATE
+    for trials in range(rule.min_trials, 300):
+        assert clopper_pearson(rule.count_needed(trials), trials)[0] >= MIN_RATE
 
 
 @pytest.mark.parametrize("trials", range(1, 6))
@@ -266,6 +330,13 @@ def test_conditions_under_which_the_clean_scene_is_seldom_right_leave_too_few_tr
     assert result.ending is Ending.NOT_VERIFIED
 
 
+def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interval() -> None:
+    low, high = torch.zeros(1), torch.ones(1)
+    for samples in (MIN_SAMPLES - 1, MIN_SAMPLES):
+        region = GrownBox(low, low, high, samples, samples, samples)
+        assert (region.interval[0] >= MIN_RATE) == (samples == MIN_SAMPLES)
+
+
 def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_differs() -> None:
     """Exactly, where a part of the box has another verdict wherever it is cut; without its correction it would not."""
     box, samples, attempts = torch.zeros(1), 50, 4
@@ -288,10 +359,16 @@ def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_di
     ("search_ending", "clean", "adversarial", "expected"),
     [
         (Ending.FOUND, 20, 20, Ending.FOUND),
+        (Ending.FOUND, 19, 19, Ending.FOUND),
         (Ending.FOUND, 20, 18, Ending.NOT_VERIFIED),
+        (Ending.FOUND, 18, 18, Ending.NOT_VERIFIED),
         (Ending.FOUND, 18, 20, Ending.NOT_VERIFIED),
+        (Ending.BUDGET_SPENT, 20, 19, Ending.FOUND),
         (Ending.BUDGET_SPENT, 20, 18, Ending.BUDGET_SPENT),
+        (Ending.STALLED, 20, 0, Ending.STALLED),
+        (Ending.NON_FINITE, 20, 0, Ending.NON_FINITE),
         (Ending.FOUND, 9, 9, Ending.ALREADY_WRONG),
+        (Ending.BUDGET_SPENT, 0, 0, Ending.ALREADY_WRONG),
         (Ending.INTERRUPTED, 20, 20, Ending.INTERRUPTED),
     ],
 )
@@ -385,14 +462,57 @@ def test_curtailed_trials_end_with_the_verdict_of_all(rule: Rule, seed: int) -> 
         assert short.adversarial_counts == whole.adversarial_counts, "a success is tried to the end"
 
 
+def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
+    made: list[str] = []
+
+    def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
+        for query, answer in zip(queries, scripted("0" * 20)(queries), strict=True):
+            made.append(query.kind)
+            yield answer
+
+    found = verify(evaluate, DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
+    assert made == ["control"] * 20 + ["verification"] * 2, "what nobody asks for any more is not made"
+    assert (found.adversarial_counts.successes, found.adversarial_counts.trials, found.ending) == (
+        0,
+        2,
+        Ending.BUDGET_SPENT,
+    )
+
+
+@pytest.mark.parametrize(
+    ("told", "made", "ending"),
+    [
+        ("1" * 23, (14, 14), Ending.FOUND),
+        ("0" + "1" * 22, (22, 23), Ending.FOUND),
+        ("1" * 20 + "011", (14, 14), Ending.FOUND),
+        ("0" + "1" * 20 + "01", (20, 22), Ending.NOT_VERIFIED),
+        ("00" + "1" * 21, (4, 6), Ending.NOT_VERIFIED),
+        ("-" + "1" * 22, (22, 23), Ending.FOUND),
+        ("--" + "1" * 21, (4, 6), Ending.NOT_VERIFIED),
+    ],
+)
+def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[int, int], ending: Ending) -> None:
+    """Told are trials of the answer: successes, failures, and "-" where the clean scene is wrong."""
+    found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=TRIAL_LOOKS)
+    assert (found.adversarial_counts.successes, found.adversarial_counts.trials) == made
+    assert (found.ending, found.stopped) == (ending, "decided")
+    clean = 23 if made[1] > 14 else 14
+    assert (len(found.clean_trials), found.renders) == (clean, clean + made[1])
+
+
 @pytest.mark.parametrize(
     ("told", "made", "clean", "ending"),
     [
+        ("1" * 200, (30, 30), 30, Ending.FOUND),
         ("-1" * 100, (30, 30), 60, Ending.FOUND),
         ("0" + "1" * 199, (59, 60), 60, Ending.FOUND),
+        ("00000" + "1" * 195, (95, 100), 100, Ending.FOUND),
+        ("000000" + "1" * 194, (144, 150), 150, Ending.FOUND),
         ("0" * 10 + "1" * 190, (190, 200), 200, Ending.FOUND),
+        ("-000" + "1" * 197, (97, 100), 101, Ending.FOUND),
         ("1" * 20 + "0" * 180, (20, 41), 60, Ending.NOT_VERIFIED),
         ("--1" * 67, (66, 66), 200, Ending.ALREADY_WRONG),
+        ("-1" * 10 + "-" * 180, (10, 10), 200, Ending.ALREADY_WRONG),
     ],
 )
 def test_trials_over_conditions_end_with_the_verdict(
@@ -406,6 +526,15 @@ def test_trials_over_conditions_end_with_the_verdict(
     assert found.adversarial_counts.interval[0] < clopper_pearson(*made)[0], "it allows for all looks"
 
 
+def test_a_configuration_over_conditions_goes_on_where_a_control_group_of_another_has_more_trials() -> None:
+    """A random search beside it is tried last; what is looked at first are 30 that count all the same."""
+    rule, told = OVER_CONDITIONS, "0" + "1" * 199
+    first = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)
+    again = partial(verify, scripted("1" * 200), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, rule=rule)
+    found = again(trials=OVER_LOOKS, clean=first.clean_trials)
+    assert (found.adversarial_counts.trials, len(found.clean_trials), found.renders) == (30, 60, 30)
+
+
 @pytest.mark.parametrize("counting", [29, 45, 101, 200])
 def test_intervals_over_conditions_cover_as_often_as_they_say(counting: int) -> None:
     """Exactly, by the probability of every outcome, if so many of all trials count; the study takes all numbers."""
@@ -416,6 +545,12 @@ def test_intervals_over_conditions_cover_as_often_as_they_say(counting: int) -> 
     assert sum(chance for chance, _ in chances.values()) == pytest.approx(1.0)
     if counting == 200:
         assert sum(chance for chance, found in chances.values() if found) < 0.033
+
+
+def test_trials_that_were_asked_for_are_all_made() -> None:
+    for told in ("0" * 20, "1" * 20):
+        found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=20)
+        assert (found.adversarial_counts.trials, found.clean_counts.trials, found.stopped) == (20, 20, "asked for")
 
 
 @pytest.mark.medium
@@ -451,3 +586,30 @@ def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
     result = verify(nothing, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=4)
     assert (result.clean_counts.successes, result.adversarial_counts.successes) == (0, 0)
     assert result.ending is not Ending.FOUND
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"trials": 0}, "trials: expected at least 1, got 0"),
+        ({"spp": 0}, "verify_spp: expected at least 1, got 0"),
+    ],
+)
+def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        verify(noisy(-1, 1, 0), DOMAIN, WORST, claim=Ending.FOUND, seed=0, **({"spp": 4} | options))  # type: ignore[arg-type]
+
+
+def test_every_ending_has_a_value_for_json_and_a_sentence() -> None:
+    values = {ending.value for ending in Ending}
+    assert values >= {
+        "found",
+        "budget spent",
+        "not verified",
+        "stalled",
+        "non-finite objective",
+        "interrupted",
+        "already wrong",
+    }
+    for ending in Ending:
+        assert ending.explanation.endswith(".")

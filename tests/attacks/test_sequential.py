@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from advsearch.errors import InputError
 from advsearch.statistics.sequential import STAKES, ConfidenceSequence, count_needed_samples, log_capital_of_counts
 
 STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "sequential.py"
@@ -36,6 +37,12 @@ def test_an_interval_holds_what_is_not_excluded_and_nothing_else() -> None:
     assert of().interval == (0.0, 1.0) and math.isnan(of().mean)
 
 
+def test_right_and_wrong_change_places() -> None:
+    low, high = of(1.0, 1.0, 0.0, 0.5).interval
+    other_low, other_high = of(0.0, 0.0, 1.0, 0.5).interval
+    assert (low, high) == pytest.approx((1.0 - other_high, 1.0 - other_low))
+
+
 @pytest.mark.parametrize(("least", "most"), [(0.5, 8), (0.9, 50), (0.95, 100)])
 def test_draws_that_all_agree_decide_soon(least: float, most: int) -> None:
     sequence, count = ConfidenceSequence(), 0
@@ -43,6 +50,12 @@ def test_draws_that_all_agree_decide_soon(least: float, most: int) -> None:
         sequence.add(1.0)
         count += 1
     assert math.log(2 / 0.05) / -math.log(least) <= count <= most, "never before a bet of everything would"
+
+
+def test_a_surer_interval_is_wider() -> None:
+    draws = [1.0] * 20 + [0.0] * 4
+    (low, high), (wide_low, wide_high) = of(*draws).interval, of(*draws, confidence=0.999).interval
+    assert wide_low < low < high < wide_high
 
 
 @pytest.mark.parametrize("share", [0.5, 0.95])
@@ -74,3 +87,10 @@ def test_the_draws_that_a_claim_needs_are_the_fewest_that_show_it(mean: float, v
     for count in range(1, needed + 1):
         sequence.add(value)
         assert sequence.is_over(mean) is (count == needed)
+
+
+def test_what_is_no_share_is_refused() -> None:
+    with pytest.raises(InputError, match=r"from 0 to 1, got 1\.5"):
+        of(1.5)
+    with pytest.raises(InputError, match="confidence: expected a number between 0 and 1"):
+        ConfidenceSequence(95.0)

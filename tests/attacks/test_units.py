@@ -12,6 +12,7 @@ from scipy.stats import fisher_exact
 from advsearch.errors import InputError
 from advsearch.statistics.clustered import (
     compare_paired,
+    max_lower_bound,
     mean_interval,
     mean_rate,
     one_sided_p_value,
@@ -57,6 +58,11 @@ def test_of_units_it_is_the_interval_by_bets_and_units_of_equal_predictions_are_
     assert mean_interval([3.0, 3.0], 3.0, 3.0) == (3.0, 3.0)
     with pytest.raises(InputError, match="one prediction at least"):
         rate_interval([0, 0], [0, 0])
+
+
+def test_few_units_show_little_and_more_show_more() -> None:
+    shown = [max_lower_bound(n) for n in (1, 3, 5, 10, 30, 100)]
+    assert shown == sorted(shown) and 0.3 < shown[2] < 0.45 and shown[-1] > 0.94
 
 
 def test_copies_of_a_prediction_say_no_more_than_one() -> None:
@@ -148,6 +154,15 @@ def test_the_interval_over_units_of_unequal_size_covers_their_mean(
         covered += low <= truth <= high
         assert low <= mean_rate(counted, of) <= high
     assert covered >= 0.94 * runs
+
+
+def test_all_units_weigh_the_same() -> None:
+    assert mean_rate([1, 3, 0], [1, 12, 0]) == pytest.approx((1.0 + 0.25) / 2)
+    units = np.repeat([0, 1], [1, 12])
+    first, second = np.arange(13) < 1, np.arange(13) > 6
+    difference, (low, high), p = compare_paired(first, second, units)
+    assert difference == pytest.approx((0.0 - 1.0 + 0.5 - 0.0) / 2) and low < difference < high and p > 0.05
+    assert compare_paired(first, second, np.zeros(13, np.int64))[2] == 1.0, "one unit shows nothing"
 
 
 @pytest.mark.parametrize("count", [5, 12, 30])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
@@ -20,6 +21,7 @@ from advsearch.attacks import (
     SearchResult,
     Sobol,
     search,
+    seeded,
 )
 from advsearch.errors import InputError
 
@@ -56,6 +58,12 @@ def test_a_grid_is_full_and_each_point_comes_once() -> None:
     assert sorted(set(seen[:, 2].tolist())) == pytest.approx([1 / 6, 0.5, 5 / 6])
 
 
+def test_an_angle_does_not_repeat_its_end() -> None:
+    domain = Domain(torch.tensor([0.5]), (Block(1, periodic=True),))
+    seen, _ = points(Grid(), domain, 8)
+    assert sorted(seen[:, 0].tolist()) == pytest.approx([k / 8 for k in range(8)])
+
+
 def test_points_come_coarse_to_fine() -> None:
     line, _ = points(Grid(points=9), Domain(torch.tensor([0.5]), (Block(1),)), 9)
     assert line[:, 0].tolist() == pytest.approx([0.0, 1.0, 0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875])
@@ -89,11 +97,34 @@ def test_a_grid_of_given_size_and_a_grid_that_does_not_fit() -> None:
         points(Grid(), Domain(torch.full((3,), 0.5), (Block(2), Block(1, options=8))), 31)
     with pytest.raises(InputError, match="5 values for each of 2 numbers are 25 renders"):
         points(Grid(points=5), Domain(torch.full((2,), 0.5), (Block(2),)), 24)
-    with pytest.raises(InputError, match="points"):
+    with pytest.raises(InputError, match="points: expected at least 2, or 0 for as many as fit, got 1"):
         Grid(points=1)
 
 
+def test_choices_alone_are_enumerated() -> None:
+    domain = Domain(torch.tensor([0.1, 0.9]), (Block(1, options=4), Block(1, options=2)))
+    seen, result = points(Grid(), domain, 20)
+    assert result.stopped is Ending.STALLED
+    assert {(int(a * 4), int(b * 2)) for a, b in seen.tolist()} == {(a, b) for a in range(4) for b in range(2)}
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("steps", [1, 7, 100, 10_000, 123_456])
+def test_one_number_takes_every_render(steps: int) -> None:
+    domain = Domain(torch.tensor([0.5]), (Block(1, periodic=True),))
+    state = Grid().start(domain, seeded(0, 0), max(2, steps))
+    assert len(state.points) == max(2, steps)
+
+
 # ---- sobol
+
+
+def test_a_power_of_two_of_points_is_balanced() -> None:
+    """Sixteen points: one in every sixteenth of every axis, and one in every cell of a 4 x 4 grid."""
+    seen, _ = points(Sobol(), Domain(torch.full((3,), 0.5), (Block(3, low=0.5),)), 16)
+    for j in range(3):
+        assert sorted(((seen[:, j] - 0.5) * 32).int().tolist()) == list(range(16))
+    assert len({(int((a - 0.5) * 8), int((b - 0.5) * 8)) for a, b, _ in seen.tolist()}) == 16
 
 
 def test_chunks_continue_the_sequence(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,6 +134,12 @@ def test_chunks_continue_the_sequence(monkeypatch: pytest.MonkeyPatch) -> None:
     parts, _ = points(Sobol(), domain, 50)
     assert torch.equal(whole, parts)
     assert len({tuple(u) for u in whole.tolist()}) == 50
+
+
+def test_another_seed_scrambles_otherwise() -> None:
+    domain = Domain(torch.full((3,), 0.5), (Block(3),))
+    first, second = points(Sobol(), domain, 8, 0)[0], points(Sobol(), domain, 8, 1)[0]
+    assert not torch.equal(first, second)
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
@@ -115,3 +152,28 @@ def test_an_l2_ball_is_filled_evenly(d: int) -> None:
     assert float((seen - 0.5).mean(dim=0).abs().max()) < 0.002
     angles = sum(bool(u[0] > 0.5) for u in seen)
     assert abs(angles - 512) < 16
+
+
+def test_options_come_equally_often_and_at_their_middle() -> None:
+    seen, _ = points(Sobol(), Domain(torch.tensor([0.1, 0.5]), (Block(1, options=4), Block(1))), 32)
+    assert [int((seen[:, 0] == (k + 0.5) / 4).sum()) for k in range(4)] == [8, 8, 8, 8]
+
+
+def test_too_many_dimensions_are_refused() -> None:
+    domain = Domain(torch.full((21_201,), 0.5), (Block(21_201, "l2", 1.0),))
+    with pytest.raises(InputError, match="expected at most 21201 dimensions, got 21202; use policy random"):
+        points(Sobol(), domain, 2)
+
+
+def test_sobol_beats_random_in_two_dimensions() -> None:
+    """The largest empty disc is smaller: the worst of 500 places is nearer to one of 64 points."""
+    from advsearch.attacks import Random
+
+    domain = Domain(torch.full((2,), 0.5), (Block(2),))
+    places = torch.rand(500, 2, generator=seeded(0, 0))
+
+    def gap(policy: Policy[Any]) -> float:
+        return sum(float(torch.cdist(places, points(policy, domain, 64, s)[0]).amin(1).max()) for s in range(5)) / 5
+
+    assert gap(Sobol()) < 0.85 * gap(Random())
+    assert math.isfinite(gap(Sobol()))
