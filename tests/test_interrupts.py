@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from advsearch.cli.output import InterruptCheckingProgress
-from advsearch.interrupts import INTERRUPTS, Interrupts, interruptible, unless_interrupted
+from advsearch.interrupts import DUPLICATE_SECONDS, INTERRUPTS, Interrupts, interruptible, unless_interrupted
 from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from conftest import ROOT
@@ -162,3 +162,78 @@ def test_a_second_one_ends_native_code_at_once_and_one_that_is_passed_on_does_no
             assert process.stderr is not None and process.stderr.read() == "advsearch: interrupted\n"
         finally:
             process.kill()
+
+
+def test_one_that_is_passed_on_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([5.0, 5.0 + DUPLICATE_SECONDS / 2, 6.0 + DUPLICATE_SECONDS])
+    monkeypatch.setattr("advsearch.interrupts.time.monotonic", lambda: next(times))
+    handler = Interrupts()
+    with pytest.raises(KeyboardInterrupt):
+        handler(2, None)
+    handler(2, None)
+    assert handler.count == 1
+    with pytest.raises(KeyboardInterrupt):
+        handler(2, None)
+    assert handler.count == 2
+
+
+SWALLOWING = """
+import importlib.abc, importlib.util, os, signal, sys
+
+Done = {'ending': 'found'}
+
+def interrupted():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        while True:
+            pass
+    except KeyboardInterrupt:
+        print("swallowed", flush=True)
+
+def carry_out(config, *, progress, resumed):
+    import heavy
+    {loading}
+    print("searched", flush=True)
+    sys.exit("expected nothing to be searched")
+
+class Swallows(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    def find_spec(self, name, path, target=None):
+        return importlib.util.spec_from_loader(name, self) if name == "heavy" else None
+
+    def exec_module(self, module):
+        {importing}
+
+sys.meta_path.insert(0, Swallows())
+sys.argv[1:] = ["attack", "--object", "mug", "--json", *sys.argv[1:]]
+import advsearch.experiment
+from advsearch.cli.main import main
+advsearch.experiment.run_experiment = carry_out
+sys.exit(main())
+"""
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("quiet", [[], ["--quiet"]])
+@pytest.mark.parametrize(
+    "where",
+    [
+        {"importing": "interrupted()", "loading": "progress.stage('loading')"},
+        {"importing": "pass", "loading": "progress.stage('loading'); interrupted(); progress.stage('searching', 9)"},
+        {"importing": "pass", "loading": "interrupted(); return Done"},
+    ],
+    ids=["importing", "loading", "without a stage"],
+)
+def test_an_interrupt_that_an_import_swallows_is_not_lost(where: dict[str, str], quiet: list[str]) -> None:
+    """Imports of others catch everything, so that what came meanwhile is raised when the stage ends."""
+    code = SWALLOWING.replace("{importing}", where["importing"]).replace("{loading}", where["loading"])
+    done = subprocess.run([sys.executable, "-c", code, *quiet], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 130 and "searched" not in done.stdout + done.stderr
+    assert "swallowed" in done.stdout + done.stderr and done.stderr.endswith("advsearch: interrupted\n")
+
+
+def test_an_interrupted_process_ends_without_the_interpreters_own_end() -> None:
+    """What an interrupt inside native code leaves behind aborts there: status 134 and a dump of threads."""
+    code = "import atexit, os; from advsearch.cli import main; main._status = lambda given: print('answer') or 130; "
+    code += "atexit.register(os.abort); from advsearch.__main__ import start; start()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "answer\n", "")
