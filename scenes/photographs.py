@@ -35,7 +35,7 @@ N_FRAMES = 12
 NOISE = 0.02  # standard deviation, sRGB
 DIM = 0.45  # of the light of every third photograph
 ENVIRONMENT = "loft"
-WINDOW = rendering.Window(0, 0, WIDTH, HEIGHT)
+WINDOW = rendering.PhotoWindow(0, 0, WIDTH, HEIGHT)
 Mesh = tuple[Float64Array, IntArray, IntArray]  # vertices in mm, faces, 8-bit colors
 
 

@@ -11,8 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from torch import Tensor
-
 from advsearch import seeds
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
@@ -22,8 +20,6 @@ from advsearch.engine.windows import (
     FullImage,
     Windowing,
     find_window,
-    measure_outside,
-    render_full,
 )
 from advsearch.scene.predictor import Refusal
 from advsearch.scene.renderer import Renderer
@@ -119,19 +115,12 @@ class CroppedSearch(PredictedSearch):
             return renderer
         was_accepted = self.deviations[-1].is_accepted
         with self.count_time():
-            current = self._measure(self.windowing, image, query.u)
+            current, deviation = self.measure_surroundings(
+                self.windowing.window, image, query.u
+            )
+            self.deviations.append(deviation)
             if self.deviations[-1].is_accepted or was_accepted:
                 self.n_renewals = (self.n_renewals or 0) + 1
                 return self._use(self.windowing, kind, number, current)
         self.trace_from(kind, number, f" of the {kind}")
         return None
-
-    def _measure(self, windowing: Windowing, image: FullImage, u: Tensor) -> FullImage:
-        """Measure how far the surroundings of an image are off at u (d,), and return
-        the whole image there.
-        """
-        current = render_full(self.problem, u)
-        self.n_traced += 1
-        deviation = measure_outside(self.problem, windowing.window, image, [current])
-        self.deviations.append(deviation)
-        return current

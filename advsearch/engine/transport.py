@@ -218,6 +218,17 @@ class PredictedSearch(ABC):
         self.n_traced += self.deviations[-1].n_traced
         return self.deviations[-1]
 
+    def measure_surroundings(
+        self, window: Window, before: FullImage, u: Tensor
+    ) -> tuple[FullImage, Deviation]:
+        """Render the whole image of u (d,), and measure how far an earlier one is off.
+
+        Only what is outside of the window counts. Returns the image, and by how much.
+        """
+        current = render_full(self.problem, u)
+        self.n_traced += 1
+        return current, measure_outside(self.problem, window, before, [current])
+
     def trace_from(self, kind: str, number: int, where: str = "") -> None:
         """Trace images from an evaluation of a kind of search on."""
         self.first_traced[kind] = number
@@ -393,9 +404,7 @@ class Transport(PredictedSearch):
             return True, None
         before = self._full_images.get(kind, self._full_images["start"])
         with self.count_time():
-            current = render_full(self.problem, u)
-            deviation = measure_outside(self.problem, self.window, before, [current])
-        self.n_traced += 1
+            current, deviation = self.measure_surroundings(self.window, before, u)
         return deviation.is_accepted, current
 
     def is_likely_success(self, u: Tensor) -> bool:

@@ -50,7 +50,6 @@ from advsearch.runs.results import (
     AverageCase,
     Fields,
     Formation,
-    Interval,
     Result,
     VerifiedRate,
 )
@@ -468,7 +467,7 @@ def make_case_claim(
 def make_average_claim(case: AverageCase, name: str) -> Claim:
     """Return the claim about the average case of an attack."""
     what = "configurations in which the model is right"
-    extent = make_extent(what, case.correct, case.configurations, case.interval)
+    extent = Extent.from_count(what, case.correct, case.configurations, case.interval)
     text = (
         f"{name}: the model is right in {format_extent(extent)} configurations drawn "
         "by chance"
@@ -499,28 +498,8 @@ def make_rate_extent(what: str, rate: VerifiedRate | None) -> Extent | None:
     return (
         None
         if rate is None
-        else make_extent(what, rate.successes, rate.trials, rate.interval)
+        else Extent.from_count(what, rate.successes, rate.trials, rate.interval)
     )
-
-
-def make_extent(
-    what: str,
-    count: int,
-    total: int,
-    interval: Interval | None,
-    share: float | None = None,
-) -> Extent:
-    """Return how much a claim rests on: `count` of `total`, with the interval of their
-    share.
-
-    Args:
-        what: is counted.
-        count: how many there were.
-        total: of how many.
-        interval: of the share, in [0, 1]; None is the whole of [0, 1].
-        share: where it is not count over total, for example weighted.
-    """
-    return Extent.from_count(what, count, total, interval, share)
 
 
 def make_no_claim(why: str, more: str = "") -> Claim:

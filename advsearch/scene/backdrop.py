@@ -119,8 +119,7 @@ class BackdropPhotograph:
         Returns:
             (H, W, 3) float32 in [0, 1].
         """
-        decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
-        return self._resample_part(decoded[self.levels], resolution)
+        return self._resample_part(_decode_all_levels()[self.levels], resolution)
 
     def resample_front(self, resolution: tuple[int, int]) -> Tensor | None:
         """Return what is before the object, (H, W, 1) float32 in [0, 1], or None."""
@@ -333,6 +332,11 @@ def make_backdrop(
     return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
 
 
+def _decode_all_levels() -> Float32Array:
+    """Return the display-linear values (256,) of all levels of 8-bit sRGB."""
+    return srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
+
+
 # ---- The light of a photograph
 
 
@@ -351,7 +355,7 @@ def compute_photograph_gain(
         np.bincount(photograph.levels[..., channel].reshape(-1), minlength=256)
         for channel in range(len(CHANNELS))
     ]
-    decoded = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
+    decoded = _decode_all_levels()
     means = np.array([np.average(decoded, weights=count) for count in counts])
     mean = max(float(means @ LUMINANCE), 1e-3)
     # a matt surface has the radiance reflectance * irradiance / pi
@@ -655,7 +659,7 @@ def compute_view_settings(
         InputError: the object comes from no file, or its size in metres is not known;
             the pose is not rigid, or puts the object behind the camera.
     """
-    mesh_to_camera = _compute_mesh_to_camera(asset, object_to_camera)
+    mesh_to_camera = _check_and_map(asset, object_to_camera)
     vertices = asset.mesh.vertices.astype(np.float64)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
     # of the object, in the camera's coordinates: its z is the depth
@@ -681,15 +685,10 @@ def compute_view_settings(
     }
 
 
-def _compute_mesh_to_camera(
-    asset: ObjectAsset, object_to_camera: npt.ArrayLike
-) -> Float64Array:
-    """Return the map (4, 4) from a mesh to camera coordinates, both in object sizes.
+def _check_and_map(asset: ObjectAsset, object_to_camera: npt.ArrayLike) -> Float64Array:
+    """Return the map (4, 4) from an object's mesh to camera coordinates.
 
-    `object_to_camera` is in the unit of the object's file, hence the division by the
-    size of the object in that unit.
-
-    Raises InputError as `compute_view_settings`.
+    Both are in object sizes. Raises InputError as `compute_view_settings`.
     """
     pose = _check_rigid(object_to_camera)
     if asset.file_to_mesh is None or asset.metres is None:
@@ -697,7 +696,20 @@ def _compute_mesh_to_camera(
             f"{asset.name}: expected an object from a mesh file with a known unit, to "
             "be seen in a measured pose; give `unit`, such as unit=mm"
         )
-    mesh_to_file = np.linalg.inv(asset.file_to_mesh)
+    return compute_mesh_to_camera(asset.file_to_mesh, pose)
+
+
+def compute_mesh_to_camera(
+    file_to_mesh: Float64Array, pose: Float64Array
+) -> Float64Array:
+    """Return the rigid map (4, 4) from a mesh to camera coordinates, in object sizes.
+
+    Args:
+        file_to_mesh: (4, 4), see `ObjectAsset.file_to_mesh`.
+        pose: rigid (4, 4) from the file's coordinates to the camera's, in the file's
+            unit, hence the division by the size of the object in that unit.
+    """
+    mesh_to_file = np.linalg.inv(file_to_mesh)
     # the scale of a map of uniform scale is the cube root of its determinant
     object_size = float(np.cbrt(np.linalg.det(mesh_to_file[:3, :3])))
     mesh_to_camera: Float64Array = pose @ mesh_to_file

@@ -407,7 +407,7 @@ def _curve_claims(result: CurveResult) -> Iterator[Claim]:
     for point in result.curve:
         if point.accuracy is None:
             continue
-        extent = views.make_extent(
+        extent = views.Extent.from_count(
             "objects without a failure", point.robust, point.objects, point.interval
         )
         budget = "the controls' own budget"

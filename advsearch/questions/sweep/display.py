@@ -51,7 +51,6 @@ from advsearch.report.views import (
     ShownResult,
     claim,
     format_extent,
-    make_extent,
     make_rate_extent,
 )
 from advsearch.report.wording import (
@@ -675,7 +674,7 @@ def _drive_row_text(name: str, mean: str, interval: str, worst: str) -> str:
 
 def _accuracy_extent(description: str, counts: CountedPredictions) -> Extent:
     """Return the extent of the claim that predictions are right."""
-    return make_extent(
+    return Extent.from_count(
         description,
         counts.correct,
         counts.configurations,

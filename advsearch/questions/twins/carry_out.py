@@ -23,6 +23,7 @@ from advsearch.extend import (
     Model,
     RunContext,
     Task,
+    color,
     tasks,
     workbench,
 )
@@ -56,7 +57,7 @@ class Selection:
     """
 
     objects: Sequence[PhotographedObject]
-    windows: Mapping[int, rendering.Window]
+    windows: Mapping[int, rendering.PhotoWindow]
     warnings: list[str]
 
 
@@ -145,7 +146,7 @@ class Comparison:
         """
         is_frame = parse_frames(self._config.frames)
         assets: dict[Path, Any] = {}
-        windows: dict[int, rendering.Window] = {}
+        windows: dict[int, rendering.PhotoWindow] = {}
         n_hidden = 0
         n_outside = 0
         for number, item in enumerate(objects):
@@ -309,7 +310,7 @@ class Comparison:
         truth = self._task.truth(facts)
         self._calibrate_once(twin, truth)
         for name, image in twin.images.items():
-            rounded = round_to_levels(image)
+            rounded = color.round_to_8_bit(image.clamp(0.0, 1.0))
             output = model(rounded)
             (judgement,) = workbench.judge_images(
                 self._task, output, rounded[None], [truth]
@@ -333,7 +334,8 @@ class Comparison:
             return
         self._is_calibrated = True
         if self._task.calibrates:
-            output = self._model(round_to_levels(twin.images[PHOTOGRAPH]))
+            photograph = twin.images[PHOTOGRAPH].clamp(0.0, 1.0)
+            output = self._model(color.round_to_8_bit(photograph))
             self._task = self._task.after_calibration(output, truth)
         if self._task.ambiguities:
             raise InputError(f"task {self._task.name}: {self._task.ambiguities}")
@@ -390,11 +392,6 @@ class Comparison:
             renders=self.n_renders,
             warnings=list(dict.fromkeys(warnings)),
         )
-
-
-def round_to_levels(image: Tensor) -> Tensor:
-    """Return an image (H, W, 3) with values of 8 bits, in [0, 1]."""
-    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
 
 
 def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
@@ -456,7 +453,7 @@ def encode_jpeg(image: Tensor) -> bytes:
     """Return an image (H, W, 3) sRGB as a JPEG, `IMAGE_SIZE` pixels at its longer
     side.
     """
-    levels = (image.clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+    levels = color.to_uint8(image.clamp(0.0, 1.0)).numpy()
     picture = Image.fromarray(levels)
     scale = IMAGE_SIZE / max(picture.size)
     size = (round(picture.width * scale), round(picture.height * scale))

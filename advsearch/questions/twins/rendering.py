@@ -37,7 +37,7 @@ MIN_SILHOUETTE = 4.0  # pixels of a silhouette's longer side
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-class Window(NamedTuple):
+class PhotoWindow(NamedTuple):
     """A rectangle of pixels of a photograph."""
 
     x: int
@@ -93,7 +93,7 @@ def choose_window(
     photo_size: tuple[int, int],
     model_size: tuple[int, int],
     margin: float,
-) -> Window | None:
+) -> PhotoWindow | None:
     """Return the window around an object, which has the shape that the model takes.
 
     The box of the full silhouette, whether it is hidden or not, is widened by `margin`
@@ -123,7 +123,7 @@ def choose_window(
     corner = (low + high) / 2.0 - np.array([width, height]) / 2.0
     x = min(max(round(float(corner[0])), 0), photo_width - width)
     y = min(max(round(float(corner[1])), 0), photo_height - height)
-    return Window(x, y, width, height)
+    return PhotoWindow(x, y, width, height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ class LayerRenderer:
     def render(
         self,
         item: PhotographedObject,
-        window: Window,
+        window: PhotoWindow,
         model_size: tuple[int, int],
         number: int = 0,
     ) -> Layer:
@@ -217,7 +217,7 @@ class SurroundedRenderer:
         )
 
     def render(
-        self, item: PhotographedObject, window: Window, number: int = 0
+        self, item: PhotographedObject, window: PhotoWindow, number: int = 0
     ) -> Tensor:
         """Render the object as a photograph shows it, sRGB (h, w, 3) of the film's
         size; arguments as for `LayerRenderer.render`.
@@ -234,7 +234,7 @@ class SurroundedRenderer:
 def make_twin(
     item: PhotographedObject,
     photograph: Tensor,
-    window: Window,
+    window: PhotoWindow,
     layer: Layer,
     surrounded: Mapping[str, Tensor],
     model_size: tuple[int, int],
@@ -291,7 +291,7 @@ def _make_sight(
     )
 
 
-def choose_film(windows: Sequence[Window], pixel_aspect: float) -> tuple[int, int]:
+def choose_film(windows: Sequence[PhotoWindow], pixel_aspect: float) -> tuple[int, int]:
     """Return the (height, width) of a film for windows of one shape, in pixels.
 
     Pixels of a film are square in angles; those of a photograph with different focal
@@ -318,14 +318,11 @@ def compute_mesh_to_camera(
     """
     if asset.file_to_mesh is None:
         raise InputError(f"{item.mesh}: expected a mesh file")
-    to_camera: Float64Array = item.pose @ np.linalg.inv(asset.file_to_mesh)
-    object_size = float(np.cbrt(np.linalg.det(to_camera[:3, :3])))
-    to_camera[:3] /= object_size
-    return to_camera
+    return reading.backdrop.compute_mesh_to_camera(asset.file_to_mesh, item.pose)
 
 
 def make_camera_inputs(
-    item: PhotographedObject, asset: assets.ObjectAsset, window: Window
+    item: PhotographedObject, asset: assets.ObjectAsset, window: PhotoWindow
 ) -> dict[str, Tensor]:
     """Return the scene inputs of the camera that sees a window of a photograph."""
     to_camera = compute_mesh_to_camera(item, asset)
@@ -374,7 +371,7 @@ def resize(image: Tensor, size: tuple[int, int]) -> Tensor:
     return resized[0].permute(1, 2, 0).contiguous()
 
 
-def cut_window(image: Tensor, window: Window) -> Tensor:
+def cut_window(image: Tensor, window: PhotoWindow) -> Tensor:
     """Return a window of an image (H, W, ...)."""
     rows = slice(window.y, window.y + window.height)
     return image[rows, window.x : window.x + window.width]
@@ -389,7 +386,7 @@ def load_photograph(path: Path) -> Tensor:
     return torch.from_numpy(reading.pictures.read_image(path, None))
 
 
-def _read_visibility(item: PhotographedObject, window: Window) -> Tensor:
+def _read_visibility(item: PhotographedObject, window: PhotoWindow) -> Tensor:
     """Return what of a window no other thing hides, (h, w); 1 without a mask.
 
     The mask is widened by a pixel, since the edges of masks are not smooth.
@@ -400,7 +397,7 @@ def _read_visibility(item: PhotographedObject, window: Window) -> Tensor:
     return F.max_pool2d(mask[None, None], 3, 1, 1)[0, 0]
 
 
-def load_mask(path: Path, window: Window) -> Tensor:
+def load_mask(path: Path, window: PhotoWindow) -> Tensor:
     """Read a window (h, w) bool of a mask, which is an image over 1/2 inside."""
     values = reading.pictures.read_image(path, None, is_raw=True)
     mask = cut_window(torch.from_numpy(values[..., 0] > 0.5), window)
@@ -409,7 +406,9 @@ def load_mask(path: Path, window: Window) -> Tensor:
     return mask
 
 
-def measure_pose(item: PhotographedObject, twin: Twin, window: Window) -> float | None:
+def measure_pose(
+    item: PhotographedObject, twin: Twin, window: PhotoWindow
+) -> float | None:
     """Return how far a twin's silhouette agrees with the data set's, as IoU.
 
     It is that of masks, or else of their boxes; None where there is neither.

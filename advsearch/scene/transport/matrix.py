@@ -669,8 +669,7 @@ def _trace_matrices(
     A renderer that has a crop traces its window only; the rest is pasted. Other
     arguments are those of `LinearRenderer`, and of `_collect`.
     """
-    window = renderer.crop.window if renderer.crop else None
-    with renderer.scene.limit_window(window):
+    with renderer.scene.limit_window(renderer.window):
         paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
     radiance = paths.radiance - paths.background if has_backdrop else paths.radiance
     radiance = renderer.replace_non_finite(radiance)
