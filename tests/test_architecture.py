@@ -414,17 +414,6 @@ def requirements(key: str, section: str = "options") -> list[Requirement]:
     return [Requirement(line) for line in setup_cfg()[section][key].split("\n") if line]
 
 
-def test_tests_mirror_the_packages() -> None:
-    files = sorted((ROOT / "tests").rglob("test_*.py"))
-    rooms = {path.parent.relative_to(ROOT / "tests").as_posix() for path in files} - {"."}
-    packages = {
-        module.removeprefix("advsearch.").replace(".", "/") for module in setup_cfg()["options"]["packages"].split()
-    }
-    assert rooms and rooms <= packages
-    names = [path.name for path in files]
-    assert len(set(names)) == len(names), "pytest and mypy take the name of a test file for its module"
-
-
 def test_every_folder_with_python_files_is_listed_as_a_package() -> None:
     packages = {module for module, path in python_files() if path.name == "__init__.py"}
     assert set(setup_cfg()["options"]["packages"].split()) == packages
@@ -508,11 +497,6 @@ def test_no_file_names_a_path_of_the_machine_it_was_written_on() -> None:
         for m in machine.finditer(path.read_bytes())
     ]
     assert found == []
-
-
-def test_the_repository_stays_small() -> None:
-    """Half of it are the bundled places, which compress to a half."""
-    assert sum(path.stat().st_size for path in repository_files()) < 60e6
 
 
 @pytest.mark.medium

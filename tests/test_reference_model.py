@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -52,28 +51,6 @@ def test_training_learns_and_repeats_bit_for_bit() -> None:
     assert len(told) == 32 and told[15].step == told[15].steps == 16 and told[15].seconds_left == 0.0
 
 
-@pytest.mark.parametrize(
-    "changed, message",
-    [
-        ({"batch_size": 100}, "batch_size"),
-        ({"lr": float("nan")}, "lr: expected a finite number"),
-        ({"classes": 2}, "labels"),
-        ({"images": torch.zeros(8, 3, 32, 32)}, "images"),
-    ],
-)
-def test_training_arguments(changed: dict[str, Any], message: str) -> None:
-    data, labels = _coloured(8)
-    arguments = {"images": data, "labels": labels, "classes": 3, "epochs": 1, "batch_size": 4, **changed}
-    with pytest.raises(InputError, match=message):
-        training.train(arguments.pop("images"), arguments.pop("labels"), **arguments)
-
-
-def test_schedule_warms_up_and_ends_at_zero() -> None:
-    factors = [training.schedule(step, 100) for step in range(100)]
-    assert factors[:5] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0]) and factors[-1] == pytest.approx(0.0)
-    assert max(factors) == 1.0 and factors[4:] == sorted(factors[4:], reverse=True)
-
-
 def test_augmentation_is_seeded_bounded_and_leaves_its_input_alone() -> None:
     batch = images(32, 24, 24).permute(0, 3, 1, 2)
     before = batch.clone()
@@ -87,30 +64,6 @@ def test_augmentation_is_seeded_bounded_and_leaves_its_input_alone() -> None:
     torch.testing.assert_close(still(batch, generator), batch, rtol=0, atol=1e-5)
     mirrored = Augmentation(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)(batch, generator)
     torch.testing.assert_close(mirrored, batch.flip(3), rtol=0, atol=1e-5)
-
-
-def test_augmentation_turns_and_shrinks() -> None:
-    still = Augmentation(0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    axis = torch.linspace(-1.0, 1.0, 33)
-    down, across = torch.meshgrid(axis, axis, indexing="ij")
-    disc = torch.exp(-8.0 * (down**2 + across**2)).expand(16, 3, -1, -1)
-    bar = torch.exp(-8.0 * (0.1 * down**2 + across**2)).expand(16, 3, -1, -1)
-    turned = replace(still, turn=45.0)
-    torch.testing.assert_close(turned(disc.clone(), torch.Generator()), disc, rtol=0, atol=0.02)
-    assert float((turned(bar.clone(), torch.Generator()) - bar).abs().amax(dim=(1, 2, 3)).median()) > 0.2
-    small = replace(still, smallest_crop=1.25, largest_crop=1.25)(disc.clone(), torch.Generator())
-    shares = small.sum(dim=(1, 2, 3)) / disc.sum(dim=(1, 2, 3))
-    torch.testing.assert_close(shares, torch.full((16,), 1 / 1.25**2), rtol=0.05, atol=0.0)
-
-
-def test_figures_of_known_predictions() -> None:
-    logits = torch.tensor([[2.0, 0.0], [2.0, 0.0], [0.0, 2.0], [0.0, 2.0]])
-    got = calibration.report(logits, [0, 1, 1, 1], bins=10)
-    confidence = float(torch.tensor([2.0, 0.0]).softmax(0)[0])
-    assert got.accuracy == 0.75 and got.per_class == pytest.approx((1.0, 2 / 3))
-    assert got.confusion == ((1, 0), (1, 2))
-    assert got.confidence == pytest.approx(confidence) and got.error == pytest.approx(confidence - 0.75)
-    assert [b.count for b in got.bins] == [0] * 8 + [4, 0]
 
 
 def test_evaluate_asks_for_float_images_in_batches() -> None:

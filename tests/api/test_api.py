@@ -13,10 +13,8 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.cli.output import format_result as text_of
-from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.runs.listing import can_resume, list_runs
+from advsearch.runs.listing import can_resume
 from advsearch.runs.store import Row, Store
 from stand_ins import interrupted
 
@@ -89,13 +87,6 @@ def test_what_cannot_be_found_is_not_claimed(scene: advsearch.Scene) -> None:
     assert summary.ending == "budget spent"
     assert summary.verified and summary.verified.successes == 0
     assert summary.clean.control and summary.clean.control.correct == 6
-
-
-@pytest.mark.medium
-def test_the_same_seed_gives_the_same_numbers_when_deterministic(
-    whole: advsearch.AttackResult, scene: advsearch.Scene, level: float
-) -> None:
-    assert torch.equal(advsearch.attack(scene, model(level + 0.03), **REPEATED).u, whole.u)
 
 
 @pytest.mark.medium
@@ -198,41 +189,3 @@ def test_rows_keep_what_is_right_apart_from_what_the_attack_wants(
         assert row.correct == (row.label == "mug") == (row.margin >= 0.0)
         assert row.success == (row.margin > 0.0), "an attack that minimises wants right answers"
         assert row.kind.startswith("search") or row.objective == row.margin
-
-
-def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    victim = model(level)
-    with pytest.raises(InputError, match="label"):
-        advsearch.attack(scene, victim, label="teapot", run=run, **FAST)
-    with pytest.raises(UnknownNameError, match=r"unknown policy 'pgdd'. Did you mean 'pgd'"):
-        advsearch.attack(scene, victim, policy="pgdd", run=run, **FAST)
-    with pytest.raises(InputError, match="step"):
-        advsearch.attack(scene, victim, run=run, **{**FAST, "steps": 0})
-    assert not run.exists()
-    run.mkdir()
-    (run / "mine.txt").write_text("keep", encoding="utf-8")
-    with pytest.raises(RunExistsError, match="not empty and not a run"):
-        advsearch.attack(scene, victim, run=run, **FAST)
-    assert (run / "mine.txt").read_text("utf-8") == "keep"
-
-
-@pytest.mark.medium
-def test_a_configuration_whose_check_is_interrupted_is_told_and_verified_later(
-    scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run, wrong = tmp_path / "run", model(level + 0.02)
-    asked: dict[str, Any] = {**FAST, "controls": {"light": {"power": [0, 40]}}, "baseline": False, "run": run}
-
-    def stopped(*_: Any, **__: Any) -> Any:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr("advsearch.engine.verifier.choose_spp", stopped)
-        first = advsearch.attack(scene, wrong, **asked)
-    said = "What was found so far is not verified: the model calls this mug a vase."
-    assert first.summary.ending == "interrupted" and first.summary.verified is None and first.search is not None
-    assert said in text_of(first.summary) and said in (run / "report.html").read_text()
-    assert list_runs(tmp_path)[0].answer == "vase, unverified"
-    done = advsearch.attack(scene, wrong, **asked, resume=True)
-    assert done.found and torch.equal(done.u, first.u) and list_runs(tmp_path)[0].answer == "6/6"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -18,7 +17,6 @@ from advsearch.controls import NumberControl, Parameter, compose
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 
-ANY: Any = advsearch
 FUNCTIONS = [name for name in advsearch.__all__ if inspect.isfunction(getattr(advsearch, name))]
 
 
@@ -42,20 +40,6 @@ def test_a_run_is_a_name_or_a_folder(name: str, run: Any) -> None:
     if "run" in inspect.signature(getattr(advsearch, name)).parameters:
         with pytest.raises(InputError, match="run"):
             getattr(advsearch, name)(*(["mug"] if name in ("attack", "sweep") else []), run=run)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (partial(ANY.attack, False), "scene"),
-        (partial(ANY.attack, "mug", metrics=[]), "metrics"),
-        (partial(ANY.attack, "mug", objective=3), "objective"),
-        (partial(ANY.render, "mug", spp="a"), "spp"),
-    ],
-)
-def test_a_value_of_another_type_is_refused_in_a_sentence(call: Callable[[], Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        call()
 
 
 # ---- losses that lead away from a target ----------------------------------------------------------------------------

@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import shlex
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 
-from advsearch.api.names import LABEL_SETS, PARAMETERS
 from advsearch.cli.main import main
-from advsearch.controls import CONTROLS
-from advsearch.errors import find_similar_names
-from advsearch.models.labels import SETS
 from advsearch.runs.directory import CONFIG
 from advsearch.settings import HEADER
 
@@ -45,20 +38,3 @@ def test_a_slip_is_told_with_what_was_meant(
     said = capsys.readouterr().err
     assert f"id you mean {meant}" in said and "PyTorch" not in said
     assert [one.name for one in (tmp_path / "runs").iterdir()] == ["mug-sweep-001"]
-
-
-@pytest.mark.medium
-def test_nothing_heavy_is_imported_to_tell_it() -> None:
-    code = (
-        "import sys; from advsearch.cli.main import main; main(['attack', '--object', 'mug', '--control', 'textur']);"
-        "sys.exit('torch' in sys.modules or 'mitsuba' in sys.modules)"
-    )
-    begun = time.process_time()
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert told.returncode == 0 and "'texture'" in told.stderr and time.process_time() - begun < 1.0
-
-
-def test_names_that_are_listed_here_are_those_of_the_registries() -> None:
-    parameters = {parameter.name for control in CONTROLS.values() for parameter in control.parameters}
-    assert {name for name in parameters - {*CONTROLS} if find_similar_names(name, CONTROLS)} == PARAMETERS
-    assert LABEL_SETS == SETS

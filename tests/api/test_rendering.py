@@ -56,31 +56,6 @@ def test_a_picture_and_the_five_first_predictions(tmp_path: Path, capsys: pytest
     assert np.abs(linear_to_srgb(linear) - picture.numpy()).max() <= 0.5 / 255 + 1e-4
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--object", "mug"], "--out: expected the path of a .png or .exr file, got nothing"),
-        (
-            ["--object", "mug", "--out", "room.exr/a.png"],
-            "a file of that name stands where a folder is needed; choose another place with --out",
-        ),
-        (["--object", "mug", "--out", "a.exr", "--around", "4"], "--out: a sheet of several views has text in it"),
-        (["--object", "mug", "--environment", "room.exr", "--out", "./room.exr"], "--out: would replace room.exr"),
-    ],
-)
-def test_what_can_be_put_right_is_one_sentence(
-    words: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "room.exr").write_bytes(b"a room")
-    assert message in refused(capsys, *words)
-    assert (tmp_path / "room.exr").read_bytes() == b"a room" and not (tmp_path / "a.png").exists()
-
-
 def test_ground_truth_lies_beside_the_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     render(capsys, "--object", "mug", "--out", str(tmp_path / "a.png"), "--aov", "mask,normal")
     with OpenEXR.File(str(tmp_path / "a.aov.exr"), separate_channels=True) as file:

@@ -15,7 +15,6 @@ from torch import Tensor
 from advsearch.attacks import (
     CMAES,
     NES,
-    PGD,
     Block,
     Domain,
     Ending,
@@ -32,7 +31,6 @@ from advsearch.attacks import (
     search,
 )
 from advsearch.attacks.candidates import Candidate, add_candidate, select_contenders
-from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.seeds import stream
 
@@ -329,32 +327,6 @@ def test_an_interrupt_keeps_the_best_so_far(number: int, expected: float) -> Non
 
 
 # ---- bugs and bad input
-
-
-@pytest.mark.parametrize(
-    ("u", "message"),
-    [
-        (at(0.21), "policy 'script' left its budget by 0.01"),
-        (at(math.nan), "policy 'script' left its budget by inf"),
-        (torch.full((3,), 0.5, dtype=torch.float64), "proposed torch.float64"),
-    ],
-)
-def test_a_policy_that_leaves_the_domain_is_a_bug(u: Tensor, message: str) -> None:
-    with pytest.raises(RuntimeError, match=message):
-        search(RISE, DOMAIN, Script((u,)), steps=1, seed=0)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"steps": 0}, "steps"),
-        ({"steps": 1, "repeats": 0}, "candidates and repeats"),
-        ({"steps": 1, "seconds": math.nan}, "seconds"),
-    ],
-)
-def test_impossible_budgets_are_refused(options: dict[str, float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        search(RISE, DOMAIN, PGD(), seed=0, **options)  # type: ignore[arg-type]
 
 
 # ---- candidates

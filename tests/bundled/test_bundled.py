@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from advsearch.questions.harden.objects import OBJECTS
-from advsearch.questions.harden.objects.shapes import carve_patches, grid
 from advsearch.scene import library
 from advsearch.scene.assets import Mesh, ObjectAsset, normalise_mesh
 from scenes import build
@@ -108,26 +107,6 @@ def test_seeds_decide_everything(name: str) -> None:
     assert not np.allclose(first.base_color, other.base_color, atol=0.02)
 
 
-def test_carving_splits_a_surface_along_a_curve() -> None:
-    at = np.linspace(0.0, 1.0, 9)
-    points = np.stack([*np.meshgrid(at, at), np.zeros((9, 9))], axis=-1)
-    whole = grid("x", points, np.broadcast_to([0.0, 0.0, 1.0], points.shape), (1.0, 1.0), at, at)
-    rest, disc = carve_patches([whole], lambda p: 0.3 - np.hypot(p[:, 0] - 0.5, p[:, 1] - 0.5), "disc")
-    areas = {}
-    for part in (rest, disc):
-        a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
-        areas[part.tag] = float(np.cross(b - a, c - a)[:, 2].sum() / 2)
-        assert (np.cross(b - a, c - a)[:, 2] > 0.0).all()
-    assert areas["disc"] == pytest.approx(np.pi * 0.09, rel=0.05)
-    assert areas["disc"] + areas["x"] == pytest.approx(1.0)
-    assert disc.size == pytest.approx((0.6, 0.6), abs=0.01)
-    used = np.unique(disc.faces)
-    found = disc.rest(disc.uvs[used, 0], disc.uvs[used, 1])
-    np.testing.assert_allclose(found, disc.vertices[used], atol=1e-9)
-    (left,) = carve_patches([whole], lambda p: 0.3 - p[:, 0], None)
-    assert left.vertices[np.unique(left.faces)][:, 0].min() == pytest.approx(0.3)
-
-
 def test_things_of_the_street_have_their_size_and_several_materials() -> None:
     car = library.load_object("car")
     assert car.metres == pytest.approx(4.3, abs=0.05)
@@ -181,14 +160,6 @@ def test_the_scripts_make_the_places_that_are_shipped(name: str) -> None:
 
 def vertex_table(mesh: Mesh) -> np.ndarray:
     return np.concatenate([mesh.vertices, mesh.normals, mesh.uvs], axis=1)
-
-
-def test_the_data_is_small() -> None:
-    """Places, whose meshes are files, are most of it."""
-    sizes = {path: path.stat().st_size for path in build.DATA.rglob("*")}
-    places = sum(size for path, size in sizes.items() if "places" in path.parts)
-    assert places < 29 * 2**20
-    assert sum(sizes.values()) - places < 12 * 2**20
 
 
 @pytest.mark.parametrize("name", sorted(OBJECTS))

@@ -15,9 +15,7 @@ from typing import Any
 import pytest
 
 import samples
-from advsearch.cli.flags import format_as_flags
 from advsearch.cli.main import list_commands, main
-from advsearch.cli.output import format_result as text_of
 from advsearch.errors import InputError, StorageError
 from advsearch.options import Value
 from advsearch.progress import Progress
@@ -121,19 +119,6 @@ def test_bad_input_is_one_line_and_status_2(
     out, err = capsys.readouterr()
     assert out == "" and err.startswith(f"advsearch: error: {message}") and err.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("message", "shown"),
-    [
-        ("epsilon: expected a number; steps: expected more", "--epsilon: expected a number; --steps: expected more"),
-        ("x.yaml: epsilon: expected a number", "x.yaml: epsilon: expected a number"),
-        ("add `overwrite=True` or leave `baseline=False` out", "add --overwrite or leave --no-baseline out"),
-        ("model x.pt2: `layout` is for the network", "model x.pt2: `layout` is for the network"),
-    ],
-)
-def test_settings_in_messages_become_flags(message: str, shown: str) -> None:
-    assert format_as_flags(message) == shown
 
 
 @pytest.mark.medium
@@ -272,16 +257,6 @@ def test_a_bad_file_or_change_is_told(
 # ---- studies, regions and sweeps ----
 
 
-@pytest.mark.parametrize("line", ["--object mug,bowl", "--object mug --epsilon 0.01,0.1"])
-def test_several_objects_or_epsilons_are_a_curve(
-    api: Callable[..., None], capsys: pytest.CaptureFixture[str], line: str
-) -> None:
-    given: list[Any] = []
-    api(noting(given, samples.curve()))
-    assert main(["attack", *line.split(), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == samples.curve().to_dict()
-
-
 @pytest.mark.parametrize(
     ("config", "answer"),
     [
@@ -341,21 +316,6 @@ def test_resume_goes_on_with_what_was_stopped(
     assert found == [(config.command, Path("runs/stopped"))]
 
 
-def test_runs_are_listed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["runs"]) == 0
-    assert capsys.readouterr().out == (
-        "  run      command   object   controls   rows   state     result\n"
-        "  done     attack    mug      texture    80     found     20/20\n"
-        "  killed   attack    mug      pose       2      stopped\n"
-    )
-    assert main(["runs", "runs", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["runs"]
-    assert [(one["name"], one["state"], one["rows"]) for one in found] == [
-        ("done", "found", 80),
-        ("killed", "stopped", 2),
-    ]
-
-
 def test_a_run_that_was_stopped_says_how_far_it_came_and_how_to_go_on(
     runs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -377,29 +337,4 @@ def test_a_run_that_was_stopped_says_how_far_it_came_and_how_to_go_on(
 # ---- list, show, doctor ----
 
 
-def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.chdir(tmp_path)
-    make_run(tmp_path / "runs" / "first", pictures=False, rows=False)
-    assert main(["show", "first"]) == 0
-    assert capsys.readouterr().out == text_of(SUMMARY) + "\n"
-    assert main(["show", "runs/first", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == SUMMARY.to_dict()
-
-
 # ---- the table ----
-
-
-def test_the_table_is_read_in_five_seconds() -> None:
-    assert text_of(SUMMARY) == (
-        "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %).\n\n"
-        "                  prediction    probability   rate                95 % interval\n"
-        "  clean           mug           98 %          right in 20 of 20   83-100 %\n"
-        "  adversarial     vase          91 %          wrong in 20 of 20   83-100 %\n"
-        "  random search   40 pictures                 wrong in 1 of 20    0.1-25 %\n\n"
-        "  changed   texture within 0.1 (linf: the largest change of any value)\n"
-        "  search    pgd, 40 steps: found\n"
-        "  renders   40 of the search, 40 gradients, 21 of the verification\n"
-        "  time      14.6 s\n"
-        "  page      runs/mug-texture-001/report.html\n\n"
-        "Note: How far this holds for photographs was not measured. advsearch twins does; name its run in --twins."
-    )

@@ -13,7 +13,6 @@ import advsearch
 from advsearch.cli.flags import format_as_flags
 from advsearch.cli.main import main
 from advsearch.controls import Space, make_control, make_space
-from advsearch.controls.base import describe_adjusted_defaults
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import sweep_from_config
@@ -92,43 +91,6 @@ def test_the_default_environment_is_asked_for_only_where_it_is_named(
 
 
 # ---- what nobody asked for moves, and that is said ------------------------------------------------------------------
-
-MOVED: list[tuple[dict[str, Any], str]] = [
-    ({"pose": {"yaw": [90, 180]}}, "pose.yaw 90 degrees instead of 0"),
-    ({"camera": {"azimuth": [350, 390]}}, "camera.azimuth 390 degrees instead of 40"),  # the nearer way around
-    ({"pose": {"yaw": {"choices": [100, 300, 200]}}}, "pose.yaw 300 degrees instead of 0"),
-    ({"environment": {"which": ["noon", "kitchen"]}}, "environment noon instead of studio"),
-    ({"sky": {}}, "environment sky instead of studio"),
-    ({"light": {"x": [0, 1]}}, "light.power 6 instead of 0"),
-    ({"camera": {"distance": [2, 3]}}, "camera.distance 2 metres instead of 0.238"),  # which was worked out
-    ({"background": {}}, "ground.size 0 object sizes instead of 3"),
-    ({"patch": {"pixels": [0.45, 0.5]}}, "patch.pixels"),
-]
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(("controls", "change"), MOVED)
-def test_a_default_that_is_left_out_moves_and_is_said(controls: dict[str, Any], change: str) -> None:
-    (said,) = describe_adjusted_defaults(space_of(load_description("mug"), **controls).adjusted_defaults)
-    assert change in said
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    "controls",
-    [
-        {"pose": {}},
-        {"environment": {}},
-        {"lens": {}},
-        {"pose": {"yaw": 90, "pitch": [0, 10]}},
-        {"camera": {"azimuth": [350, 410]}},
-        {"environment": {"which": ["noon", "studio"]}},
-        {"light": {"power": 3.0, "x": [4, 5]}},
-        {"occlusion": {"which": ["sphere", "book"]}},
-    ],
-)
-def test_where_nothing_moves_nothing_is_said(controls: dict[str, Any]) -> None:
-    assert space_of(load_description("mug"), **controls).adjusted_defaults == ()
 
 
 class Screen(NullProgress):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls.background import BACKDROP_COLOR, BackgroundControl, hsv_to_rgb
+from advsearch.controls.background import BackgroundControl, hsv_to_rgb
 from advsearch.scene.description import SceneDescription, load_description
 
 
@@ -39,16 +39,6 @@ def test_it_asks_for_a_backdrop_and_takes_the_ground_away_unless_told_to_keep_it
     kept = BackgroundControl(ground="keep").prepare(scene)
     assert kept.backdrop and kept.number("ground.size") == scene.number("ground.size") > 0.0
     assert kept.values == scene.values and kept.parts == scene.parts
-
-
-def test_the_environment_may_be_a_choice(scene: SceneDescription) -> None:
-    bound = BackgroundControl(what=["colour", "environment"]).bind(scene)
-    assert [group.parameter for group in bound.groups] == ["what", "hue", "saturation", "value"]
-    assert bound.inputs(bound.start) == {}, "it starts as the scene is"
-    assert bound.describe(bound.start)["background.what"]["value"] == "environment"
-    there = bound.start.clone()
-    there[0] = 0.25
-    assert BACKDROP_COLOR in bound.inputs(there)
 
 
 def test_the_picture_has_that_colour_behind_the_object_and_its_slope() -> None:

@@ -15,9 +15,8 @@ from advsearch.controls.contents import FILL_LIMIT, INGREDIENTS, ContentsControl
 from advsearch.controls.pose import PoseControl
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.library import list_objects, load_object
+from advsearch.scene.library import load_object
 
-VESSELS = {"bottle", "bowl", "frying-pan", "mug", "vase", "wine-glass"}
 AGREEMENT = 0.1
 """Relative difference allowed between 64-sample adjoints and 128-sample differences."""
 
@@ -51,11 +50,6 @@ def cup(outer: float = 0.5, inner: float = 0.4, floor: float = 0.1, bottom: bool
 
 
 # ---- the inside of a vessel -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.medium
-def test_vessels_and_nothing_else_are_found_among_the_bundled_objects() -> None:
-    assert {name for name in list_objects() if find_interior(load_object(name)) is not None} == VESSELS
 
 
 def test_the_inside_of_a_turned_cup_is_that_of_its_profile() -> None:

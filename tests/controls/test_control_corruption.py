@@ -180,13 +180,6 @@ def test_jpeg_is_what_a_file_would_be_and_passes_derivatives_through() -> None:
     assert image.grad is not None and torch.equal(image.grad, torch.ones_like(image))
 
 
-def test_pixelate_averages_over_cells() -> None:
-    image = torch.rand(224, 224, 3, generator=torch.Generator().manual_seed(5))
-    cells = image.reshape(56, 4, 56, 4, 3).mean(dim=(1, 3))
-    seen = apply_corruption(image, "pixelate", number(5.0))
-    torch.testing.assert_close(seen, cells.repeat_interleave(4, 0).repeat_interleave(4, 1), atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("which", STEPPED_CORRUPTIONS)
 def test_stepped_corruptions_round_the_severity_and_slope_between_the_steps(which: str) -> None:
     image = scenery(96, 96)

@@ -10,8 +10,6 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls import make_control
-from advsearch.errors import FileFormatError, InputError
 
 SIZE = 16
 
@@ -55,16 +53,3 @@ def test_a_file_that_changed_is_read_again(maps: tuple[str, str], tmp_path: Path
         OpenEXR.File({}, {"RGB": radiance}).write(str(path))
         found.append(shown(advsearch.load_scene("mug"), {"environment": {"which": [maps[0], str(path)]}}, [0.75]))
     assert float((found[0] - found[1]).abs().mean()) > 0.02
-
-
-@pytest.mark.parametrize(
-    ("names", "kind", "reason"),
-    [
-        (["missing.hdr", "noon"], FileFormatError, "missing.hdr"),
-        (["a.hdr", "a.hdr"], InputError, "got a.hdr twice"),
-        ([3, "a.hdr"], InputError, "expected one of own"),
-    ],
-)
-def test_what_cannot_be_is_refused(names: list[object], kind: type[Exception], reason: str) -> None:
-    with pytest.raises(kind, match=reason):
-        make_control("environment", {"which": names}).prepare(advsearch.load_scene("mug").description)

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.lens import LensControl, draw_dots, spread_positions
-from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
 
@@ -86,9 +85,3 @@ def test_the_derivatives_are_those_of_differences() -> None:
         return draw_dots(picture, dict(zip(NAMES, numbers, strict=True)))
 
     assert torch.autograd.gradcheck(seen, (image.requires_grad_(), *tensors), eps=1e-6, atol=1e-5)
-
-
-@pytest.mark.parametrize("dots", [0, 2.5, math.nan])
-def test_a_number_of_dots_that_is_none_is_refused(dots: object) -> None:
-    with pytest.raises(InputError, match=r"lens\.dots"):
-        LensControl(dots=dots)

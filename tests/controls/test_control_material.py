@@ -21,10 +21,8 @@ from advsearch.controls.material import (
 from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.mitsuba_backend.meshes import make_principled, to_loadable
-from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, translate_mesh, translate_part
+from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, translate_mesh
 from advsearch.scene.mitsuba_backend.variant import mi
-from advsearch.scene.parts import PluginNumber, PluginNumbers
 from advsearch.scene.raster import rasterize_charts
 
 BASE_COLOR = "object.base_color"
@@ -104,29 +102,6 @@ def test_a_named_material_brings_its_numbers_and_given_ones_win(scene: SceneDesc
     assert float(own["object.roughness"]) == float(steel["object.roughness"]) == pytest.approx(0.77)
     assert not torch.equal(own[BASE_COLOR].mean(), steel[BASE_COLOR].mean())
     assert bound.describe(torch.tensor([0.75]))["material.which"] == {"value": "steel", "unit": "name"}
-
-
-def test_every_way_into_a_number_has_the_same_guard(scene: SceneDescription) -> None:
-    """At a specular of exactly 0 Mitsuba's metal is black, and at a metallic of exactly 1 an adjoint has the wrong
-    sign: searched, fixed, of a named material, and of a surface in Mitsuba's own words."""
-    part = replace(scene.meshes["object"], material=Material(metallic=1.0, specular=0.0, clearcoat=0.0))
-    fixed = make_principled(part)["bsdf"]
-    assert (fixed["metallic"], fixed["specular"]) == (0.999, 1e-3) and "clearcoat" not in fixed
-    searched = {one.name: one for one in translate_mesh(part).inputs}
-    by_key = PluginNumber("object.bsdf.brdf_0.specular", (0.5,), "mitsuba.specular")
-    searched |= {one.name: one for one in translate_part(PluginNumbers("mitsuba", (by_key,))).inputs}
-    for name, value, rendered in (
-        ("object.metallic", 1.0, 0.999),
-        ("object.specular", 0.0, 1e-3),
-        ("object.clearcoat", 0.0, 1e-4),
-        ("object.roughness", 0.0, 0.0),
-        ("mitsuba.specular", 0.0, 1e-3),
-    ):
-        assert float(searched[name].to_rendered(torch.tensor([value]))) == pytest.approx(rendered)
-    own = to_loadable({"type": "twosided", "bsdf": {"type": "principled", "specular": 0.0, "metallic": 1.0}})["bsdf"]
-    assert own["specular"] == 1e-3
-    assert to_loadable({"type": "principled", "eta": 1})["eta"] == 1.001
-    assert to_loadable({"type": "roughplastic", "specular": 0.0})["specular"] == 0.0
 
 
 def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:

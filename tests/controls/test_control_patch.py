@@ -13,9 +13,8 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.controls import make_space
-from advsearch.controls.patch import BASE_COLOR, PatchControl, find_side_towards_camera
+from advsearch.controls.patch import BASE_COLOR, PatchControl
 from advsearch.controls.texture import TextureControl
-from advsearch.errors import InputError
 from advsearch.scene.assets import Float32Array, Mesh
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.library import list_objects, load_object
@@ -119,13 +118,6 @@ def test_its_top_is_up_and_its_left_is_left(
         assert sign * trend > 0.9  # rows run downwards; seen from +x, y runs to the right
 
 
-def test_it_faces_the_camera_by_default(scene: SceneDescription) -> None:
-    azimuth, height = find_side_towards_camera(scene)
-    assert azimuth == pytest.approx(scene.number("camera.azimuth")) and 0.5 < height < 0.75
-    turned = scene.with_values(pose__yaw=30.0)
-    assert find_side_towards_camera(turned)[0] == pytest.approx(azimuth - 30.0, abs=1e-3)
-
-
 # ---- how it is painted -----------------------------------------------------------------------------------------------
 
 
@@ -140,16 +132,6 @@ def test_it_starts_as_what_is_underneath(scene: SceneDescription) -> None:
     assert torch.equal(start[outside], bare[outside])
     difference = (start - bare)[share > 0.0]
     assert float(difference.abs().mean()) < 0.01
-
-
-def test_it_is_painted_over_what_came_before(scene: SceneDescription) -> None:
-    red = torch.tensor([1.0, 0.0, 0.0]).expand(16, 16, 3)
-    control = bound(scene)
-    found = painted(control, torch.ones(32, 32, 3), red)
-    share = torch.from_numpy(covered(control))
-    assert found.shape == (SIDE, SIDE, 3)
-    torch.testing.assert_close(found[share > 0.99], torch.ones(int((share > 0.99).sum()), 3), atol=0.02, rtol=0)
-    torch.testing.assert_close(found[share == 0.0], red[0, 0].expand(int((share == 0.0).sum()), 3))
 
 
 @pytest.mark.medium
@@ -217,18 +199,3 @@ def test_what_is_kept_can_be_printed_and_stuck_on_again(scene: SceneDescription,
     torch.testing.assert_close(
         again.inputs(torch.ones(1))[BASE_COLOR], control.inputs(u)[BASE_COLOR], atol=0.02, rtol=0
     )
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"resolution": 1}, "patch.resolution"),
-        ({"norm": "box", "epsilon": 0.1}, "patch.epsilon"),
-        ({"pixels": 0.5, "picture": "a.png"}, "patch.pixels"),
-        ({"picture": "a.png", "epsilon": 0.1}, "patch.epsilon"),
-        ({"pixels": 0.5}, "`controls` patch"),
-    ],
-)
-def test_what_cannot_be_is_refused(scene: SceneDescription, given: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        bound(scene, **given)

@@ -11,11 +11,10 @@ import torch
 
 import advsearch
 from advsearch.controls import Space, make_control, make_space
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.errors import InputError
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import compute_footprint, is_overlapping
-from advsearch.scene.parts import Footprint
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -116,14 +115,6 @@ def test_nothing_stands_in_anything_else(scene: SceneDescription) -> None:
     assert 10 < pushed < 50
 
 
-def test_it_is_moved_no_farther_than_it_takes(scene: SceneDescription) -> None:
-    space = space_of(scene)
-    placed = compute_footprint(vertices(space, at(space, chair_x=-2.0), "chair"))
-    car = compute_footprint(vertices(space, space.start, "object"))
-    nearer = Footprint(placed.outline - [0.02, 0.0], placed.lower, placed.upper)
-    assert is_overlapping(nearer, car) and not is_overlapping(placed, car)
-
-
 @pytest.mark.medium
 def test_the_object_and_other_things_may_be_moved_by_other_controls(scene: SceneDescription) -> None:
     object_moves = {"x": [0.3, 0.9]}
@@ -168,14 +159,3 @@ def test_what_is_away_is_neither_seen_nor_in_the_way_and_throws_no_shadow() -> N
     )
     x = [float(space.describe(torch.tensor([share, 0.0]))["things.stop-sign.at_x"]["value"]) for share in (0.2, 0.8)]
     assert x[0] > 4.2 and x[1] == 4.0
-
-
-def test_what_cannot_be_is_refused(scene: SceneDescription) -> None:
-    with pytest.raises(InputError, match="`things`"):
-        space_of(load_description("car"))
-    with pytest.raises(UnknownNameError, match="chiar"):
-        space_of(scene, {"chiar.x": [0, 1]})
-    with pytest.raises(UnknownNameError, match="hight"):
-        make_control("things", {"chair.hight": [0, 1]})
-    with pytest.raises(InputError, match="chair stands in"):
-        space_of(load_description("car", things="chair@1,0,size=1"))

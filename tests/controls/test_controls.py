@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from advsearch import load_scene
-from advsearch.controls import CONTROLS, Control, TextureControl, make_control, make_space
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.controls import CONTROLS, Control, make_control, make_space
+from advsearch.errors import InputError
 from advsearch.scene.description import load_description
 from advsearch.scene.gradients import ESTIMATORS
 from advsearch.scene.settings import SETTINGS
@@ -119,16 +119,6 @@ def test_a_bound_control_says_its_configuration_in_values_with_units(kind: str) 
 
 
 @pytest.mark.medium
-@every_control
-def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
-    control = make_control(kind, NEEDED.get(kind))
-    again = make_control(kind, control.to_settings())
-    scene = load_description(SUITS.get(kind, "mug"), things=BESIDE)
-    first, second = (make_space([one], scene).controls[0] for one in (control, again))
-    assert torch.equal(first.start, second.start) and first.groups == second.groups
-
-
-@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["light", "projector", "spot", "shadow", "occlusion", "patch"])
 def test_two_of_a_kind_live_side_by_side(kind: str) -> None:
     space = make_space([make_control(f"{kind}:one"), make_control(f"{kind}:two")], load_description("mug"))
@@ -141,23 +131,6 @@ def test_two_of_a_kind_live_side_by_side(kind: str) -> None:
     changed = space.inputs(only_first)
     assert any(not torch.equal(both[name], changed[name]) for name in both)
     assert {name.split(".")[0] for name in space.describe(u)} == {"one", "two"}
-
-
-def test_names_and_settings_that_do_not_exist_are_explained() -> None:
-    with pytest.raises(UnknownNameError, match="'textur'"):
-        make_control("textur")
-    with pytest.raises(UnknownNameError, match="'epsilonn'"):
-        make_control("texture", {"epsilonn": 0.1})
-    for setting in ("name", "self"):  # of Python's own
-        with pytest.raises(UnknownNameError, match=f"'{setting}'"):
-            make_control("light", {setting: "x"})
-    with pytest.raises(InputError, match="controls"):
-        make_space([TextureControl(), TextureControl()], load_description("mug"))
-    with pytest.raises(InputError, match="controls"):
-        space = make_space([TextureControl(), TextureControl(name="second")], load_description("mug"))
-        space.inputs(space.start)
-    with pytest.raises(InputError, match="controls"):
-        make_space([], load_description("mug"))
 
 
 # ---- controls from elsewhere ----------------------------------------------------------------------------------------

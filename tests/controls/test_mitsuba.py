@@ -12,9 +12,7 @@ import torch
 import advsearch
 from advsearch.cli.flags import make_config
 from advsearch.cli.main import _parse
-from advsearch.controls import make_space
 from advsearch.engine.gradients import make_smooth_loss
-from advsearch.engine.loading import make_controls
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
@@ -84,19 +82,6 @@ def test_a_plain_number_changes_recorded_renders(box: advsearch.Scene) -> None:
     shown = [float(renderer.radiance(torch.tensor([share]), 1, 16).mean()) for share in (0.0, 0.9, 0.0, 0.9)]
     assert shown[0] == shown[2] and shown[1] == shown[3] and abs(shown[0] - shown[1]) > 0.1 * shown[0]
     assert renderer.plan.groups[0].estimator == "differences"
-
-
-@pytest.mark.medium
-def test_bundled_scenes_have_such_names_too() -> None:
-    scene = advsearch.load_scene("mug")
-    ground = "ground.bsdf.brdf_0.reflectance.value"
-    renderer = scene.renderer({f"mitsuba:{ground}": [0.0, 1.0]}, resolution=SIZE, denoise="none")
-    dark, light = (renderer.radiance(torch.full((3,), share), 1, 16) for share in (0.0, 1.0))
-    assert light.mean() > 1.2 * dark.mean()
-    both = {"mitsuba:object.bsdf.brdf_0.roughness.value": [0.1, 1.0], "material": {"roughness": [0.1, 1.0]}}
-    space = make_space(make_controls(both), scene.description)
-    with pytest.raises(InputError, match=r"object\.roughness"):
-        space.inputs(space.start)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from trimesh.visual.material import PBRMaterial
 import advsearch
 from advsearch.controls import make_control, make_space
 from advsearch.engine.judging import mean_variation, printable_distance
-from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.raster import find_exclusive_texels, find_read_texels, look_up_texture
@@ -188,20 +186,6 @@ def test_the_ball_is_over_what_is_painted(scene: advsearch.Scene) -> None:
     assert told["texture.rms"]["value"] == pytest.approx(0.1) and told["texture.materials"]["value"] == "plate"
 
 
-@pytest.mark.parametrize(
-    ("controls", "message"),
-    [
-        ({"texture": {"materials": ["Bodypaint"]}}, "'Bodypaint'"),
-        ({"texture": {"materials": []}}, "texture.materials"),
-        ({"texture:roof": {}, "texture:plate": {}}, "two controls set object.base_color.*takes several materials"),
-        ({"texture": {"materials": "plate", "resolution": 4}}, "% of the texels of plate too.*a higher resolution"),
-    ],
-)
-def test_what_cannot_be_painted_is_refused(scene: advsearch.Scene, controls: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        scene.renderer(controls, resolution=16)
-
-
 def quads(folder: Path, second: Sequence[Sequence[float]]) -> ObjectAsset:
     """Two quads of two materials with one picture, not square; the first has its left half, the second these UVs."""
     texels = np.random.default_rng(3).integers(0, 256, (256, 320, 3)).astype(np.uint8)
@@ -228,15 +212,6 @@ def test_materials_beside_each_other_on_one_picture_share_no_texel(tmp_path: Pat
     assert np.array_equal(seen(mesh, other, own, 4000), seen(mesh, other, after, 4000))
     changed = (own != after).any(axis=2)
     assert changed[:, 1:159].all() and not changed[:, 159:].any() and not changed[:, 0].any()
-
-
-def test_materials_that_share_all_their_texels_cannot_be_painted_alone(tmp_path: Path) -> None:
-    quads(tmp_path, [(0, 0), (0.5, 0), (0.5, 1), (0, 1)])
-    scene = advsearch.load_scene(tmp_path / "q.obj", up="z")
-    with pytest.raises(InputError, match="100 % of the texels of one"):
-        make_space([make_control("texture:one")], scene.description)
-    both = make_space([make_control("texture", {"materials": ["one", "other"]})], scene.description)
-    assert len(both.start) > 0.45 * 3 * 256 * 320
 
 
 # ---- what takes part in a search -------------------------------------------------------------------------------------

@@ -53,18 +53,6 @@ def test_what_the_search_moved_allows_as_small_a_part_of_it() -> None:
     assert not compare_views(lambda number: ComparedView(1.0, 9.0, 1.0, 3, margin_change=10.0)).is_accepted
 
 
-@pytest.mark.parametrize("broken", [{"margin_bias": math.nan}, {"squared_error": math.nan}, {"margin_bias": math.inf}])
-def test_what_is_no_number_is_refused(broken: dict[str, float]) -> None:
-    given: dict[str, Any] = {
-        "squared_error": 1.0,
-        "allowed_squared_error": 9.0,
-        "margin_bias": 0.0,
-        "n_traced": 3,
-        **broken,
-    }
-    assert not compare_views(lambda number: ComparedView(**given)).is_accepted
-
-
 class Tracer:
     """A renderer of a grey picture with a small object in it: 36 of 4,096 pixels."""
 

@@ -20,10 +20,10 @@ from advsearch.engine.gradients import (
     measure_reference,
     restrict_plan,
 )
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.errors import UnknownNameError
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.scene.gradients import Group, make_first_plan
+from advsearch.scene.gradients import Group
 from advsearch.scene.renderer import Renderer
 
 SIZE = 48
@@ -42,18 +42,6 @@ def group(name: str, begin: int, size: int, valid: tuple[str, ...], **more: Any)
 
 
 # ---- the plan as data -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("forced", "message"),
-    [
-        ({"pose": "magic"}, "unknown estimator for pose 'magic'"),
-        ({"pose.yaw": "adjoint"}, "`estimators` pose.yaw=adjoint: not valid there; expected one of secant, material"),
-    ],
-)
-def test_an_estimator_that_cannot_be_is_refused(forced: dict[str, str], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make_first_plan((group("pose.yaw", 0, 1, ("secant", "material")),), torch.zeros(1), forced)
 
 
 # ---- what estimators compute ----------------------------------------------------------------------------------------
@@ -204,20 +192,6 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
 
 
 # ---- settings of controls -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"yaw": [20, 10]}, "pose.yaw"),
-        ({"yaw": math.nan}, "pose.yaw"),
-        ({"yaw": "north"}, "pose.yaw"),
-        ({"jaw": 5}, "unknown setting of control pose 'jaw'. Did you mean 'yaw'"),
-    ],
-)
-def test_bad_settings_say_what_to_do(settings: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make_control("pose", settings)
 
 
 def test_naming_one_parameter_searches_only_that() -> None:

@@ -32,12 +32,6 @@ def test_a_control_takes_the_settings_of_the_run_whatever_its_name(asked: str, n
     assert (found["epsilon"], found["norm"], found["resolution"]) == (0.07, "l2", 16)
 
 
-def test_what_a_control_says_itself_goes_over_the_run() -> None:
-    found = settings({"texture": {"epsilon": 0.5}, "patch": {"norm": "linf", "resolution": 8}}, **ALL)
-    assert (found["texture"]["epsilon"], found["texture"]["norm"]) == (0.5, "l2")
-    assert found["patch"] == {"epsilon": 0.07, "norm": "linf", "resolution": 8}
-
-
 def test_an_epsilon_for_one_control_leaves_the_others_their_own() -> None:
     found = settings("texture,geometry,texture:label", epsilon="geometry=0.02,texture:label=0.3")
     assert [one.get("epsilon") for one in found.values()] == [None, 0.02, 0.3]

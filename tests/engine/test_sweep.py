@@ -24,11 +24,10 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks.domain import NET, ProductIndex, SampleSequence, split_into_batches
-from advsearch.cli.main import main
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.judging import make_domain
-from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.axes import Points, add_grid_axes, choose_n_parts, parse_axes, parse_axis_values
@@ -157,15 +156,6 @@ def test_digits_and_numbers_are_inverse(sizes: tuple[int, ...], data: st.DataObj
     assert product.index(digits) == index
 
 
-def test_the_last_axis_runs_fastest() -> None:
-    assert [ProductIndex((2, 3)).digits(n) for n in range(6)] == list(itertools.product(range(2), range(3)))
-    assert ProductIndex(()).count == 1 and ProductIndex(()).digits(0) == ()
-    with pytest.raises(IndexError, match="expected a point from 0 to 5, got 6"):
-        ProductIndex((2, 3)).digits(6)
-    with pytest.raises(InputError, match="expected at least one value on each"):
-        ProductIndex((2, 0))
-
-
 @pytest.mark.parametrize("first", [0, 3, 4, 9, 10, 11])
 def test_batches_are_those_of_one_who_started_at_the_beginning(first: int) -> None:
     whole = [list(part) for part in split_into_batches(0, 10, 4)]
@@ -206,45 +196,17 @@ def test_values_of_an_axis(parameter: Parameter, given: Any, values: list[float]
     assert list(parse_axis_values("--grid x", parameter, given)) == values
 
 
-WRONG_AXES = {
-    "0:360:2.5": r"got '0:360:2.5'; FIRST and LAST are numbers and COUNT is a whole number",
-    "0:nan:3": r"FIRST and LAST have to be finite",
-    "0:360:0": r"`grid` pose.yaw: expected a COUNT of at least 1, got 0",
-    "360:0:24": r"the range '360:0:24' is reversed; write 0:360:24",
-    "-4000:-3900:3": r"expected a number from -3600 to 3600 \(degrees\), got -4000",
-}
-
-
-@pytest.mark.parametrize(("text", "message"), WRONG_AXES.items())
-def test_a_wrong_range_says_what_to_do(text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        parse_axes({"pose.yaw": text}, ())
-
-
 @pytest.mark.parametrize(
-    ("values", "message"),
+    ("name", "values"),
     [
-        ([0, 90, 360], r"expected different values, got 0 and 360, the same angle"),
-        ([0, math.nan], r"expected a number from -3600 to 3600 \(degrees\), got nan"),
-        ([], r"expected at least one value, got none"),
+        ("pose.yaw", "0:360:2.5"), ("pose.yaw", "0:nan:3"), ("pose.yaw", "0:360:0"), ("pose.yaw", "360:0:24"),
+        ("pose.yaw", "-4000:-3900:3"), ("pose.yaw", [0, 90, 360]), ("pose.yaw", [0, math.nan]), ("pose.yaw", []),
+        ("poze.yaw", [1, 2]), ("pose", [1, 2]), ("pose.rotation", [1, 2]),
     ],
-)
-def test_a_wrong_list_says_what_to_do(values: list[Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        parse_axes({"pose.yaw": values}, ())
-
-
-@pytest.mark.parametrize(
-    ("name", "error", "message"),
-    [
-        ("poze.yaw", UnknownNameError, r"unknown control 'poze'. Did you mean 'pose'.*`grid` poze.yaw"),
-        ("pose", InputError, "`grid` pose"),
-        ("pose.rotation", InputError, "`grid` pose.rotation"),
-    ],
-)
-def test_a_wrong_name_of_an_axis_says_what_to_do(name: str, error: type[InputError], message: str) -> None:
-    with pytest.raises(error, match=message):
-        parse_axes({name: [1, 2]}, ())
+)  # fmt: skip
+def test_a_wrong_axis_is_named(name: str, values: Any) -> None:
+    with pytest.raises(InputError, match=name):
+        parse_axes({name: values}, ())
 
 
 # ---- from numbers to configurations ---------------------------------------------------------------------------------
@@ -490,41 +452,7 @@ def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     assert 0 <= rendered_again < (5 if stops_at < PICTURES else 9)  # a look and a batch; or what chose the sample count
 
 
-@pytest.mark.medium
-def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path) -> None:
-    path = tmp_path / "run"
-    FakeRenderer.stops_at = 10
-    advsearch.sweep("mug", model(), run=path, **SURVIVES)
-    FakeRenderer.stops_at = None
-    with pytest.raises(RunExistsError, match="the run exists already"):
-        advsearch.sweep("mug", model(), run=path, **{**SURVIVES, "seed": 1})
-    advsearch.sweep("mug", model(), run=path, **SURVIVES)
-    with pytest.raises(RunExistsError, match="the run exists already"):
-        advsearch.sweep("mug", model(), run=path, **SURVIVES)
-
-
 # ---- configuration and command line ---------------------------------------------------------------------------------
-
-
-def command(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    status = main(["sweep", "--object", "mug", "--resolution", "32", "--quiet", *words])
-    out, err = capsys.readouterr()
-    return status, out, err
-
-
-@pytest.mark.medium
-def test_the_command_prints_json(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    status, out, _ = command(
-        capsys, "--grid", "camera.elevation=5:50:4", "--trials", "6", "--verify-spp", "4", "--json"
-    )
-    summary = json.loads(out)
-    assert status == 0 and (summary["schema"], summary["command"]) == (1, "sweep")
-    assert [row["value"] for row in summary["axes"]] == [5.0, 20.0, 35.0, 50.0]
-    wanted = {"configurations", "correct", "accuracy", "interval", "renders_per_second", "worst", "run", "seconds"}
-    assert wanted <= set(summary) and summary["run"] == "runs/mug-sweep-001"
 
 
 def kept_configuration(folder: Path, controls: dict[str, Any], answer: list[float]) -> Path:

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.errors import FileFormatError
 from advsearch.questions.sweep.result import import_threedb
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.thumbnails import find_thumbnails
@@ -92,33 +91,8 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     assert "Right in 18 of 24" in (again / "report.html").read_text().replace("&nbsp;", " ")
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("no json", "line 1"),
-        ("[1, 2]", "render_args"),
-        ("[" * 5000, "nested"),
-    ],
-)
-def test_a_damaged_log_is_named(tmp_path: Path, line: Any, message: str) -> None:
-    with pytest.raises(FileFormatError, match=message):
-        import_threedb(write(tmp_path / "in", line), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 def test_an_id_leads_nowhere_else(tmp_path: Path) -> None:
     secret = tmp_path / "secret_rgb.png"
     secret.write_bytes(b"no picture")
     run = import_threedb(write(tmp_path / "in", {**LINE, "id": "../../secret"}), tmp_path / "run")
     assert find_thumbnails(run) is None
-
-
-@pytest.mark.medium
-def test_a_large_picture_is_refused(tmp_path: Path) -> None:
-    from PIL import Image
-
-    folder = write(tmp_path / "in", LINE)
-    (folder / "images").mkdir()
-    Image.new("1", (20_000, 20_000)).save(folder / "images" / "a-1_rgb.png")
-    with pytest.raises(FileFormatError, match="pixels"):
-        import_threedb(folder, tmp_path / "run")

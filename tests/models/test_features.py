@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from advsearch.attacks.objectives import get_objective
 from advsearch.models import Model, Preprocessing, load_model
-from advsearch.models.features import Features, features_of
+from advsearch.models.features import features_of
 
 SIZE = 12
 
@@ -92,20 +92,6 @@ def test_an_exported_program_gives_what_its_module_gave(tmp_path: Path, lower: C
 
 
 # ---- nothing to look into -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_script_falls_back_to_centred_logits_and_says_so() -> None:
-    network = sequential()
-    features = features_of(load(torch.jit.trace(network, torch.rand(1, 3, SIZE, SIZE))))
-    check_fallback(features, network)
-
-
-def check_fallback(features: Features, network: nn.Sequential) -> None:
-    logits = by_hand(network, len(network))
-    assert torch.allclose(features(images()), logits - logits.mean(dim=1, keepdim=True), atol=1e-6)
-    assert (features.size, features.penultimate) == (4, False)
-    assert features.source.startswith("the logits, 4 numbers: no layer before them can be read in a ")
 
 
 # ---- all of them ----------------------------------------------------------------------------------------------------

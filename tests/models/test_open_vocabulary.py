@@ -14,7 +14,6 @@ from torch import Tensor, nn
 import advsearch
 from advsearch import load_model
 from advsearch.models import Model
-from advsearch.tasks import Detection
 from small_models import SMALL_ATTACK
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
@@ -163,15 +162,6 @@ def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> Non
     with torch.no_grad():
         seen = (value(image + 1e-5 * way) - value(image - 1e-5 * way)) / 2e-5
     assert float(seen) == pytest.approx(float((gradient * way).sum()), rel=0.01)
-
-
-def test_what_its_boxes_are_is_known(tmp_path: Path) -> None:
-    """They are not guessed from what they look like: here they are smaller than a pixel, and wrong."""
-    model = load_model(published(tmp_path, "Owlv2"), labels=NAMES, task="detection")
-    task = Detection().on(model)
-    tiny: Any = [{"boxes": torch.tensor([[0.2, 0.2, 0.4, 0.9]]), "scores": torch.tensor([[0.9, 0.1, 0.1]])}]
-    assert not task.calibrates and task.after_calibration(tiny, None).inferred_unit == "pixels"
-    assert Detection(boxes="xywh").on(model).calibrates, "what is said counts, and is compared"
 
 
 @pytest.mark.medium

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +10,6 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.models import load_model
-from advsearch.trust.code import allow_code
 from advsearch.trust.foreign_code import PLAIN, Switches, use_plain_switches
 
 TURNED = {
@@ -61,19 +59,6 @@ def test_a_model_is_loaded_and_asked_whatever_is_turned(turned: str) -> None:
             and Switches.read_current() == PLAIN
         )
     assert Switches.read_current() == theirs
-
-
-def test_what_the_code_of_a_network_turns_stays_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "turning_nets.py").write_text(
-        "import torch\ntorch.set_default_dtype(torch.float64)\ntorch.set_grad_enabled(False)\n"
-        f"import sys; sys.path.append({str(Path(__file__).parent)!r})\nfrom test_switches import OfItsType\n"
-        "def make():\n    return OfItsType()\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    allow_code("turning_nets:make")
-    model = load_model("turning_nets:make", input_size=16)
-    assert Switches.read_current() == PLAIN and model.dtype == torch.float64 and model.differentiable
-    assert model(torch.zeros(16, 16, 3)).dtype == torch.float32 and Switches.read_current() == PLAIN
 
 
 def test_a_network_that_switches_gradients_off_as_it_runs_does_so_for_itself() -> None:

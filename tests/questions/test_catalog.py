@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import json
 import os
 import re
@@ -116,18 +114,6 @@ def test_without_all_removable_parts_the_tool_works(tmp_path: Path) -> None:
     assert attacked.returncode == 0, attacked.stderr
     exported = run_python(tmp_path, "-m", "advsearch", "export", "attacked", "--out", "rows.csv")
     assert exported.returncode == 0, exported.stderr
-
-
-def test_no_control_imports_another_one() -> None:
-    modules = {part.target.partition(":")[0] for part in BUILT_INS if part.kind == "control"}
-    found = set()
-    for module in modules:
-        spec = importlib.util.find_spec(module)
-        assert spec is not None and spec.origin is not None
-        for node in ast.walk(ast.parse(Path(spec.origin).read_text("utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module in modules - {module}:
-                found.add((module, node.module))
-    assert found == set()
 
 
 SETUP = """from setuptools import setup

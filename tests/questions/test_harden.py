@@ -13,7 +13,6 @@ import torch
 
 import advsearch
 from advsearch.engine.loading import Scene
-from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.reference import load
 from advsearch.questions.attack.settings import AttackConfig
@@ -126,18 +125,3 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
             assert len(judged_at) == looked_at, "less than the best part is looked at once"
             torch.testing.assert_close(net.bias.detach(), given["bias"] + part)
     shutil.rmtree(run.path)
-
-
-@pytest.mark.parametrize(
-    ("given", "text"),
-    [
-        ({"object": "x.glb"}, "held_out"),
-        ({"task": "depth"}, "task"),
-    ],
-)
-def test_what_cannot_be_hardened_is_refused_in_words(
-    attacks: list[tuple[str, int | None]], given: dict[str, Any], text: str
-) -> None:
-    with pytest.raises(InputError, match=text):
-        asked.run(HardenConfig(**{**SMALL, "labels": "labels.json", **given}))
-    assert not list(Path("runs").glob("*/*"))

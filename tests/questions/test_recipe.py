@@ -19,7 +19,6 @@ from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe import recipe as asked
 from advsearch.questions.recipe.carry_out import make_figures, read_figure_options
 from advsearch.questions.recipe.description import Recipe, list_recipes, plan_runs, read_recipe, titles
-from advsearch.questions.recipe.given import find_triangle, list_triangles
 from advsearch.questions.recipe.rates import ClusteredFraction, FigureContent, Rows, make_frame
 from advsearch.questions.recipe.result import RecipeConfig, RecipeResult
 from advsearch.questions.sweep.settings import SweepConfig
@@ -155,21 +154,6 @@ def test_what_no_command_takes_is_refused_before_anything_is_done(
     described = {"title": "a", "settings": {"object": "mug"}, "parts": {"a": {"command": "sweep"}}, **change}
     with pytest.raises(kind, match=message):
         plan_runs(Recipe(**described), RecipeConfig(recipe="mine", quick=True))
-
-
-@pytest.mark.medium
-def test_what_only_a_later_run_would_meet_is_refused_before_anything_is_rendered(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """An object that there is not, and a figure of a column that no row will have."""
-    path = tmp_path / "mine.yaml"
-    path.write_text(TINY)
-    assert main(["recipe", str(path), "--object", "mug,nosuch", "--run", str(tmp_path / "run")]) == 2
-    assert "unknown object 'nosuch'" in capsys.readouterr().err
-    path.write_text(f"{TINY}  - {{figure: rates, by: camera.elevatoin}}\n")
-    assert main(["recipe", str(path), "--run", str(tmp_path / "run")]) == 2
-    assert f"It stands in {path}, figure 3 (rates)" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
 
 
 def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -320,16 +304,6 @@ def test_shape_and_texture_are_told_apart() -> None:
         made = figure({"figure": "cues", "classes": {"zebra": ["zebra"]}}, answered)
         assert any(text in one for one in made.text)
         assert any(row[-1] for row in made.rows) == (answers[0] == "zebra")
-
-
-def test_a_mixture_lies_in_its_triangle() -> None:
-    for side in (1, 3, 5):
-        corners = list_triangles(side)
-        assert len(corners) == side * side
-        for mixture in [*np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), 200), *np.eye(3)]:
-            three = np.array(corners[find_triangle(mixture, side)])
-            weights = np.linalg.solve(three.T, mixture)
-            assert weights.min() > -1e-9 and weights.sum() == pytest.approx(1.0)
 
 
 def test_photographs_agree_with_the_renderings_whose_configurations_they_show() -> None:

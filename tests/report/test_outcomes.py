@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import numpy as np
-import pytest
 
 from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.questions.attack.outcome import name_objective
-from advsearch.questions.sweep.page import verdict_text
 from advsearch.questions.sweep.result import OUTCOMES, Predictions, TableAxis
 from advsearch.report.wording import format_goal
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
-from samples import sweep
 
 
 def judged(right: bool, label: str, outcome: Outcome | None) -> Judgement:
@@ -48,9 +44,3 @@ def test_rows_of_a_sweep_are_counted_by_outcome() -> None:
     near, far = axis.make_rows(predictions.is_right[numbers], numbers, predictions.outcome[numbers])
     assert near.outcomes == {"missed": 1} and far.outcomes == {"loose": 2}
     assert OUTCOMES[predictions.outcome[0]] is Outcome.FOUND
-
-
-@pytest.mark.parametrize("outcomes", [{"loose": 1, "unknown": 4}, {}])
-def test_an_unknown_outcome_of_a_file_is_passed_over(outcomes: dict[str, int]) -> None:
-    said = verdict_text(sweep(task="detection", outcomes=outcomes))
-    assert bool(re.search("1 in a loose box", said)) is bool(outcomes) and "unknown" not in said

@@ -16,7 +16,7 @@ from PIL import ImageCms
 import advsearch
 from advsearch.api.export import make_printable_pieces
 from advsearch.cli.main import main
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import FileFormatError
 from advsearch.report.sheets import MARGIN, PAPERS, Piece, arrange_pages, write_sheets
 from advsearch.runs.files import read_png, to_8bit
 
@@ -101,18 +101,6 @@ def test_colours_are_converted_for_a_printer(tmp_path: Path) -> None:
     for name in ("lab.icc", "a.pdf"):
         with pytest.raises(FileFormatError, match="expected the ICC profile of an RGB printer"):
             write_sheets(tmp_path / "b.pdf", [Piece("p", picture, (1.0, 1.0))], "t", profile=tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    ("piece", "paper", "message"),
-    [
-        (Piece("p", noise(4000, 8), (100.0, 100.0)), "a4", "size"),
-        (Piece("p", noise(200, 8), (100.0, 100.0)), "a4", r"takes 800 sheets of a4, and up to 200 .*`sheets=800`"),
-    ],
-)
-def test_what_cannot_be_printed_is_refused(tmp_path: Path, piece: Piece, paper: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        write_sheets(tmp_path / "a.pdf", [piece], "t", paper=paper)
 
 
 @pytest.fixture(scope="module")

@@ -155,12 +155,3 @@ def test_a_whole_attack_is_told_as_it_is_stored(tmp_path: Path, told: Told, name
     assert [kind for kind, *_ in rows].count("search") > 2
     assert objectives(told) == rows
     assert told[-1][0] in ("end_run", "close", "finish")
-
-
-def test_what_is_told_decides_no_numbers(tmp_path: Path, told: Told) -> None:
-    """A run goes on with another tracker, or without one."""
-    run_of(tmp_path / "run", "mlflow")
-    config = AttackConfig(object="mug", run=str(tmp_path / "run"))
-    with RunDirectory.open(config, tmp_path / "run") as run:
-        run.append_rows(Row("search", 2))
-    assert told[-1] == ("end_run",)

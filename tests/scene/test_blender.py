@@ -92,10 +92,3 @@ def test_without_blender_the_command_to_type_is_said(folder: Path, monkeypatch: 
     monkeypatch.setenv(programs.BLENDER, "nowhere/blender")
     with pytest.raises(FileFormatError, match="ADVSEARCH_BLENDER"):
         import_object(folder / "room.blend")
-
-
-def test_another_file_is_not_given_to_blender(folder: Path) -> None:
-    (folder / "room.blend").write_bytes(b"%PDF-1.7")
-    with pytest.raises(FileFormatError, match="a PDF document"):
-        import_object(folder / "room.blend")
-    assert not (folder / "seen.json").exists()

@@ -182,11 +182,6 @@ def test_a_key_that_makes_another_picture_is_refused_by_name(kind: str, key: str
     assert read(tmp_path, KINDS[kind] | {key: 0.0}).numbers == read(tmp_path, KINDS[kind]).numbers
 
 
-def test_a_panorama_of_kalibr_looks_ahead_in_its_middle(tmp_path: Path) -> None:
-    found = read(tmp_path, {"cam0": KINDS["kalibr"]["cam0"] | {"distortion_model": "equirectangular"}})
-    assert found.kind == "equirectangular" and found.numbers[:5] == (1.0, 1.0, 0.5, 0.5, 0.0)
-
-
 @pytest.mark.parametrize(
     ("roi", "whole"),
     [

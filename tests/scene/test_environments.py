@@ -233,17 +233,6 @@ def test_a_map_is_the_same_in_both_formats(tmp_path: Path) -> None:
     assert np.array_equal(one.radiance, other.radiance) and one.photographed and other.photographed
 
 
-@pytest.mark.parametrize("kind", [np.float16, np.float32])
-@pytest.mark.parametrize("names", ["RGB", "RGBA", "RGBZ"])
-def test_exr_channels(tmp_path: Path, kind: type, names: str) -> None:
-    image: np.ndarray = light().astype(kind)
-    channels = {name: image[:, :, min(k, 2)].copy() for k, name in enumerate(names)}
-    got = import_environment(write_exr(tmp_path / "room.exr", channels))
-    assert got.name == "room" and got.warnings == ()
-    assert got.radiance.dtype == np.float32
-    assert np.array_equal(got.radiance, image.astype(np.float32))
-
-
 # --- sizes ----------------------------------------
 
 

@@ -17,7 +17,7 @@ from PIL import Image, PngImagePlugin
 
 import advsearch
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import EnvironmentAsset, Material
+from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.gltf_parts import EDGES_NOTE
 from advsearch.scene.importing.objects import import_object, read_parts
@@ -118,24 +118,6 @@ def area(part: ImportedPart) -> np.ndarray:
 # --- materials ----------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("given", "wanted"),
-    [
-        ({}, Material(1.0, 1.0)),
-        ({"roughnessFactor": 0.3}, Material(0.3, 1.0)),
-        ({"metallicFactor": 0.25}, Material(1.0, 0.25)),
-    ],
-)
-def test_what_a_material_leaves_out_is_the_formats_default(
-    given: dict[str, float] | None, wanted: Material, tmp_path: Path
-) -> None:
-    file = File(**({} if given is None else {"pbrMetallicRoughness": given}))
-    file.primitive()
-    asset = import_object(file.write(tmp_path))
-    assert asset.material == wanted and asset.base_color.min() > 0.999 and asset.emission is None
-    assert asset.warnings == ()
-
-
 def test_an_emissive_texture_alone_is_dark_and_mask_cuts_at_a_half(tmp_path: Path) -> None:
     file = File(alphaMode="MASK")
     alpha = np.full((1, 4, 4), 200, np.uint8)
@@ -150,21 +132,6 @@ def test_an_emissive_texture_alone_is_dark_and_mask_cuts_at_a_half(tmp_path: Pat
 
 
 # --- geometry ----------------------------------------
-
-
-@pytest.mark.parametrize("indexed", [False, True])
-@pytest.mark.parametrize(("mode", "order"), [(5, [0, 1, 5, 2, 4, 3]), (6, [0, 1, 2, 3, 4, 5])])
-def test_strips_and_fans_are_triangles(mode: int, order: list[int], indexed: bool, tmp_path: Path) -> None:
-    angles = np.arange(6) * np.pi / 3.0
-    corners = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
-    file = File()
-    if indexed:
-        file.primitive(corners, np.array([*order, order[-1]]), mode=mode)  # ends in a face without area
-    else:
-        file.primitive(corners[order], None, mode=mode)
-    (part,), notes = parts_of(file, tmp_path)
-    assert len(part.faces) == 4 and notes == []
-    assert area(part) == pytest.approx([0.0, 0.0, 1.5 * np.sqrt(3.0)])  # of a hexagon, all faces the same way
 
 
 def test_faces_without_normals_are_flat_and_others_stay_smooth(tmp_path: Path) -> None:
@@ -221,22 +188,6 @@ def test_sparse_accessors_are_read(based: bool, tmp_path: Path) -> None:
 
 
 # --- colours and textures ----------------------------------------
-
-
-@pytest.mark.parametrize("kind", ["f4", "u1", "u2"])
-@pytest.mark.parametrize("width", [3, 4])
-def test_vertex_colors_are_interpolated_in_linear_light(kind: str, width: int, tmp_path: Path) -> None:
-    file = File(pbrMetallicRoughness={"metallicFactor": 0.0}, alphaMode="BLEND")
-    colors = np.repeat([[0.0], [1.0], [1.0], [0.0]], width, axis=1)
-    colors[:, 3:] = 1.0
-    file.primitive(attributes={"COLOR_0": file.values(colors, kind, normalized=kind != "f4")})
-    asset = import_object(file.write(tmp_path))
-    assert len(asset.warnings) == 1 and "baked" in asset.warnings[0]
-    share = np.random.default_rng(0).dirichlet([1.0] * 3, 50)
-    for face in asset.mesh.faces:
-        x = share @ (asset.mesh.vertices[face, 1] + 0.5)
-        got = srgb_to_linear(sample_texture(asset.base_color, share @ asset.mesh.uvs[face].astype(np.float64)))
-        assert got == pytest.approx(np.repeat(x[:, None], 3, axis=1), abs=0.01)
 
 
 def test_sharp_texels_stay_sharp(tmp_path: Path) -> None:

@@ -60,14 +60,6 @@ def test_a_file_is_read_as_it_says(box: Path) -> None:
     np.testing.assert_allclose(ahead, (0, 0, -1, 0), atol=1e-9)
 
 
-def test_contents_are_named(box: Path) -> None:
-    found = read_contents(box)
-    assert found.objects == ("light", "floor", "largebox", "ball")
-    assert dict(found.unchanged) == {"white": "diffuse"}
-    assert found.lights == ("light",)
-    assert found.cameras == ("front",)
-
-
 def test_the_object_stands_and_the_rest_is_kept(box: Path) -> None:
     found = import_mitsuba_scene(box, "largebox")
     vertices = found.object.mesh.vertices

@@ -120,13 +120,3 @@ def loss(scene: Scene, controls: dict[str, dict[str, object]]) -> tuple[float, f
 def test_derivatives_reach_the_floor(controls: dict[str, dict[str, object]]) -> None:
     adjoint, difference = loss(load_scene("mug", room()), controls)
     assert adjoint == pytest.approx(difference, rel=GRADIENT_TOLERANCE)
-
-
-def test_photographed_environments_show_their_floor_unless_a_table_is_asked_for() -> None:
-    assert load_description("mug").photograph is None
-    assert load_description("mug", setting_values={"ground.kind": "photograph"}).photograph is not None
-    assert load_description("mug", room()).photograph is not None
-    for given in ({"ground.kind": "table"}, {"ground.size": 2.0}, {"ground.red": 0.2}, {"ground.size": 0.0}):
-        assert load_description("mug", room(), setting_values=given).photograph is None, given
-    assert replace(load_description("mug", room()), backdrop=True).photograph is None
-    assert load_scene("mug", room()).with_settings({"ground.kind": "table"}).description.photograph is None

@@ -71,13 +71,6 @@ def test_below_the_horizon_there_is_ground_all_around(place: str) -> None:
         assert float(seen.depth.max()) < 5.0
 
 
-def test_things_stand_on_the_table_and_beyond_it_on_the_floor() -> None:
-    scene = load_description("mug", "room", things="bottle@0.2,0.2; chair@0,1.2")
-    low = {name: float((compute_base_vertices(scene.meshes[name]) * scene.metres)[:, 2].min()) for name in scene.things}
-    assert low == pytest.approx({"bottle": 0.0, "chair": room.LOW[2]}, abs=1e-4)
-    assert load_description("mug", "room").meshes["furniture"].is_laid_ground
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("environment", "shining", "luminance"), [("room", "window", None), ("room-evening", "lamp", room.SHADE)]

@@ -14,7 +14,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from advsearch.cli.main import main
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import InputError
 from advsearch.scene.description import load_description
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.scenes import LUMENS
@@ -150,13 +150,6 @@ def test_a_spot_lights_in_mitsuba_as_it_is_metered() -> None:
         seen = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.3, 1.0), mi.Vector3f(0.0, 0.0, -1.0)))
         _, weight = scene.sample_emitter_direction(seen, mi.Point2f(0.5, 0.5))
         assert np.array(weight).ravel() == pytest.approx(lamp.compute_lighting(np.array([x, 0.3, 0.0]))[1], rel=1e-4)
-
-
-@pytest.mark.parametrize("cone", [{"outerConeAngle": 0.0}, {"outerConeAngle": 2.0}, {"innerConeAngle": -0.1}])
-def test_a_spot_whose_cone_is_none_is_refused(cone: dict[str, float], file: Path, data: bytes) -> None:
-    file.write_bytes(change_header(data, lambda header: shone(header, cone, DOWN)))
-    with pytest.raises(FileFormatError, match="ConeAngle"):
-        load_description(f"{file}#crate")
 
 
 @pytest.mark.medium

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import format_things
 from advsearch.scene import library
 from advsearch.scene.description import load_description
@@ -32,21 +31,6 @@ def test_text_list_and_mapping_say_the_same() -> None:
     assert parse_things(text) == (
         RequestedThing("car", 12.0, 3.5, 180.0, None, "car"), RequestedThing("chair", 6.0, -2.0, 0.0, 0.9, "chair")
     )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("text", "error", "said"),
-    [
-        ("car@1", InputError, "car@1"),
-        ("car@1,nan", InputError, "y: "),
-        ("car@1,2,head=3", UnknownNameError, "'heading'"),
-        ("car@1,2; chair@3,3,name=car", InputError, "car"),
-        (";".join(["car@1,2"] * 65), InputError, "65"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_is_refused(text: str, error: type[InputError], said: str) -> None:
-    with pytest.raises(error, match=said):
-        advsearch.load_scene("car", things=text)
 
 
 SQUARE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])

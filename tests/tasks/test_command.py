@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -129,21 +128,6 @@ def test_a_target_is_reached_within_its_envelope() -> None:
 # ---- options --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"envelope": [0.1, -1]}, "expected numbers over 0"),
-        ({"envelope": {"a": 1}}, "expected a finite number"),
-        ({"names": "a\x1b[2J"}, "expected texts"),
-        ({"state": {"a": math.nan}}, "expected a finite number"),
-        ({"state": {"a": [0.0] * 4096, "b": 1}}, "at most 4,096 numbers in all"),
-    ],
-)
-def test_options_are_checked(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make_task({"name": "command", **options})
-
-
 def test_a_state_is_read_from_a_file_that_is_not_trusted(tmp_path: Path) -> None:
     file = tmp_path / "state.json"
     file.write_text(json.dumps({"speed": 2, "joints": [0.1, 0.2]}))
@@ -182,17 +166,6 @@ def test_a_policy_gets_pictures_and_a_state(tmp_path: Path) -> None:
     torch.testing.assert_close(again(pictures), 2.0 * expected)
     with pytest.raises(ModelError, match=r"cannot be called with pictures and a state of sped \(N, 1\)"):
         advsearch.load_model(TowardsBlue(), task=make_task({**ASKED, "state": {"sped": 2}}), input_size=SIDE)
-
-
-@pytest.mark.parametrize(
-    "returned",
-    [torch.zeros(2, 3, 4), torch.zeros(3, 2), torch.zeros(2, 2, dtype=torch.int64), {"logits": torch.zeros(2, 2)}, "a"],
-)  # fmt: skip
-def test_what_is_no_action_is_refused(returned: Any) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        Command().read(returned, 2)
-    assert Command().read({"action": torch.zeros(2, 5)}, 2).shape == (2, 5)
-    assert Command().read((torch.zeros(2), None), 2).shape == (2, 1)
 
 
 def test_a_policy_with_select_action_is_called_by_it_and_forgets_each_time() -> None:

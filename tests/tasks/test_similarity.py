@@ -323,10 +323,3 @@ def test_what_is_wrong_with_references_is_said_in_a_sentence(folder: Path, model
     (folder / "red" / "notes.txt").unlink()
     (folder / "red" / "inner").mkdir()
     assert "inner: expected a picture file such as PNG, got a directory" in said(folder)
-
-
-def test_huge_and_many_references_are_refused(folder: Path, model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ADVSEARCH_LIMITS", "1e-6")  # 67 pixels
-    write(folder / "red" / "0.png", torch.zeros(100, 100, 3))
-    with pytest.raises(AdvsearchError, match="if you trust it"):
-        Similarity(references=str(folder)).on(model)

@@ -67,15 +67,6 @@ def test_a_task_with_a_loss_or_a_score_of_its_own_judges_by_it() -> None:
     assert [(one.score, one.margin) for one in shifted.judge(LOGITS[:2], (0,))] == [(-1.0, 2.0), (3.0, -2.0)]
 
 
-def test_a_prediction_is_the_largest_logit_in_words_with_its_probability() -> None:
-    first, second, *_ = NAMED.predictions(LOGITS[:1], 2)[0]
-    shares = LOGITS[0].softmax(dim=0).tolist()
-    assert (first, second) == (Prediction("mug", 0, shares[0]), Prediction("bowl", 1, shares[1]))
-    judged = NAMED.judge(LOGITS[:4], (0, 1))
-    assert [one.prediction.label for one in judged] == ["mug", "bowl", "vase", "mug"]
-    assert [one.right for one in judged] == [True, True, False, True] and judged[0].payload is None
-
-
 @pytest.mark.parametrize("logits", [[math.nan, 0.0, 1.0], [math.nan] * 3, [1.0, math.inf, 0.0], [math.inf, 0.0, 0.0]])
 def test_an_output_that_is_not_a_number_is_called_that(logits: list[float]) -> None:
     output = torch.tensor([logits])

@@ -14,12 +14,10 @@ import pytest
 from advsearch.questions.attack import wording
 from advsearch.report.figures import draw_searches
 from advsearch.report.views import NARROW_WIDTH, WIDE_WIDTH, Html, join_html, make_chart_svg, make_element
-from advsearch.report.wording import format_interval, percent
-from advsearch.runs.directory import OBJECT_FILE
+from advsearch.report.wording import percent
 from advsearch.runs.files import read_png
-from advsearch.statistics.intervals import clopper_pearson
 from advsearch.viewer.document import read_asset
-from advsearch.viewer.pages import MAX_OBJECT_BYTES, MAX_SCALED_SIZE, MAX_UNSCALED_BYTES, make_object_part, read_object
+from advsearch.viewer.pages import MAX_SCALED_SIZE, MAX_UNSCALED_BYTES
 from samples import ATTACK, EASIER, FORMATION, TARGET, attack, keep_object, make_run, rated, written_page
 
 VOID = {"meta", "img", "br", "hr", "link"}
@@ -248,29 +246,9 @@ def test_the_verdict_says_what_is_known_and_no_more(fields: dict[str, Any], sent
     assert wording.attack_verdict(attack(**fields)) == sentence
 
 
-def test_the_ends_of_an_interval_have_the_digits_that_fit_and_are_not_clamped() -> None:
-    assert format_interval(clopper_pearson(1, 120)) == "0.02-4.6 %"
-    assert format_interval(clopper_pearson(119, 120)) == "95.4-99.98 %"
-    assert format_interval(clopper_pearson(1, 10_000)) == "0.0003-0.06 %"
-    assert format_interval(clopper_pearson(60, 120)) == "41-59 %"
-
-
 @pytest.mark.parametrize(
     ("share", "text"),
     [(1.0, "100 %"), (0.9987, "99.9 %"), (0.999999999, "over 99.9999 %"), (0.8316, "83 %"), (None, "unknown")],
 )
 def test_only_certainty_is_called_100_percent(share: float | None, text: str) -> None:
     assert percent(share) == text
-
-
-def test_a_damaged_object_is_left_out(tmp_path: Path) -> None:
-    file = tmp_path / OBJECT_FILE
-    assert read_object(tmp_path) == b""
-    keep_object(tmp_path)
-    good = file.read_bytes()
-    assert read_object(tmp_path) == good
-    assert "It has fewer faces here." in make_object_part(good).note
-    for data in (b"", b"glTF", b"glTF" + bytes(40), b"GIF89a" * 9, good[:2000], good + bytes(MAX_OBJECT_BYTES)):
-        file.write_bytes(data)
-        assert read_object(tmp_path) == b""
-    assert make_object_part(b"").is_empty

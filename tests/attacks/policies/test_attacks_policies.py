@@ -26,7 +26,6 @@ from advsearch.attacks import (
     Policy,
     Query,
     Random,
-    StepRecord,
     get_objective,
     make_policy,
     search,
@@ -34,7 +33,6 @@ from advsearch.attacks import (
 from advsearch.attacks.evaluation import seeded
 from advsearch.attacks.objectives import OBJECTIVES
 from advsearch.errors import InputError
-from advsearch.seeds import stream
 from covering import once_each
 
 RATIO = 1.05  # an optimum counts as reached within this factor (STYLE, and the figure of adversarial-library)
@@ -409,41 +407,6 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
     after = np.random.get_state(legacy=False)["state"]["key"], torch.random.get_rng_state()  # noqa: NPY002
     assert np.array_equal(before[0], after[0])
     assert torch.equal(before[1], after[1])
-
-
-@battery
-def test_stored_evaluations_replay_a_search(policy: Policy[Any]) -> None:
-    """What a search was told, told again to a policy that starts afresh, leads to bitwise the same proposals."""
-    domain = domain_for(policy)
-    told: list[tuple[StepRecord, Tensor, Evaluation]] = []
-    search(
-        classifier(domain.dim, nan_at=4),
-        domain,
-        policy,
-        steps=50,
-        seed=11,
-        candidates=0,
-        on_step=lambda record, u, evaluation: told.append((record, u.clone(), evaluation)),
-    )
-    fresh = pickle.loads(pickle.dumps(policy))
-    state = fresh.start(domain, torch.Generator().manual_seed(stream(11, "search")), 50)
-    for record, u, evaluation in told:
-        (proposal,), state = fresh.propose(state, 1)
-        assert torch.equal(proposal.u, u)
-        assert min(proposal.samples, record.samples) == record.samples
-        state = fresh.update(state, [(u, evaluation)])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"step_size": math.nan}, "step_size"),
-        ({"momentum": 1.0}, "momentum"),
-    ],
-)
-def test_options_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make_policy("pgd", **options)
 
 
 # ---- what policies had to do ----------------------------------------------------------------------------------------

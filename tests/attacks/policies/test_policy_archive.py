@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
@@ -14,23 +13,6 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.policies.archive import ArchiveState, MapElites
-from advsearch.errors import InputError
-
-NAMED = Domain(
-    torch.full((5,), 0.5),
-    (
-        Block(1, name="pose.yaw", periodic=True),
-        Block(1, name="camera.elevation"),
-        Block(2, name="camera.target"),
-        Block(1, name="material.kind", options=3),
-    ),
-)
-
-
-def started(domain: Domain, **options: Any) -> ArchiveState:
-    state: ArchiveState = make_policy("archive", **options).start(domain, torch.Generator().manual_seed(0), 100)
-    return state
-
 
 SIDE = 10
 """Cells over each of the first two numbers."""
@@ -113,18 +95,6 @@ def test_a_cell_keeps_the_largest_objective_and_nothing_that_could_not_be_evalua
     assert kept["objective"].tolist() == [3.0]
     assert kept["wrong"].tolist() == [True]
     assert kept["solution"][0].tolist() == pytest.approx([0.2, 0.9])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"cells": 1}, "cells"),
-        ({"over": "pose.yaw,camera.elevation,camera.target.0", "cells": 200}, "cells"),
-    ],
-)
-def test_options_out_of_range_are_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        started(NAMED, **options)
 
 
 def test_failing_cells_are_told_with_their_ends_and_those_of_a_generation_that_is_not_whole() -> None:

@@ -101,13 +101,6 @@ def test_a_grid_of_given_size_and_a_grid_that_does_not_fit() -> None:
         Grid(points=1)
 
 
-def test_choices_alone_are_enumerated() -> None:
-    domain = Domain(torch.tensor([0.1, 0.9]), (Block(1, options=4), Block(1, options=2)))
-    seen, result = points(Grid(), domain, 20)
-    assert result.stopped is Ending.STALLED
-    assert {(int(a * 4), int(b * 2)) for a, b in seen.tolist()} == {(a, b) for a in range(4) for b in range(2)}
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("steps", [1, 7, 100, 10_000, 123_456])
 def test_one_number_takes_every_render(steps: int) -> None:
@@ -136,12 +129,6 @@ def test_chunks_continue_the_sequence(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len({tuple(u) for u in whole.tolist()}) == 50
 
 
-def test_another_seed_scrambles_otherwise() -> None:
-    domain = Domain(torch.full((3,), 0.5), (Block(3),))
-    first, second = points(Sobol(), domain, 8, 0)[0], points(Sobol(), domain, 8, 1)[0]
-    assert not torch.equal(first, second)
-
-
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_an_l2_ball_is_filled_evenly(d: int) -> None:
     """The radius to the power d is uniform, and the mean direction is nothing."""
@@ -157,12 +144,6 @@ def test_an_l2_ball_is_filled_evenly(d: int) -> None:
 def test_options_come_equally_often_and_at_their_middle() -> None:
     seen, _ = points(Sobol(), Domain(torch.tensor([0.1, 0.5]), (Block(1, options=4), Block(1))), 32)
     assert [int((seen[:, 0] == (k + 0.5) / 4).sum()) for k in range(4)] == [8, 8, 8, 8]
-
-
-def test_too_many_dimensions_are_refused() -> None:
-    domain = Domain(torch.full((21_201,), 0.5), (Block(21_201, "l2", 1.0),))
-    with pytest.raises(InputError, match="expected at most 21201 dimensions, got 21202; use policy random"):
-        points(Sobol(), domain, 2)
 
 
 def test_sobol_beats_random_in_two_dimensions() -> None:

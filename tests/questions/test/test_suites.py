@@ -364,14 +364,6 @@ def test_a_bad_suite_is_one_sentence_before_anything_is_rendered(
 # ---- for pytest -----------------------------------------------------------------------------------------------------
 
 
-def test_a_share_of_the_frames_of_a_drive_is_claimed_as_one(tmp_path: Path) -> None:
-    way = {"path": {"path": "approach", "reach": 2.0}}
-    suite = written(tmp_path, {"on-the-way": claim("right", way, at_least=0.5, pictures=20)}, confidence=0.9)
-    (found,) = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "run"))).claims
-    assert "is right in at least 50 % of the frames that the ranges span: mug, path" in found.statement
-    assert found.pictures and found.rate is not None and (found.rate == 1.0 or "path.time" in found.reason)
-
-
 def always() -> advsearch.Model:
     """Says mug to everything."""
     with pytest.warns(ModelWarning, match="hardly follow the picture"):
