@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 from torch import Tensor
 
 import advsearch
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import make_sight
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import FileFormatError
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import NUMBER_NAMES, CameraModel, make_bundled_models, make_pinhole
 from advsearch.scene.geometry import camera_to_world
@@ -105,45 +106,21 @@ def test_a_lens_that_folds_says_at_which_angle_and_is_black_beyond() -> None:
 # ---- files ----------------------------------------------------------------------------------------------------------
 
 K = [-0.28, 0.07, 0.001, -0.002]
-FILES = {
-    "opencv.yaml": (
-        "%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
-        "   dt: d\n   data: [ 9.025e+02, 0., 6.4525e+02, 0., 911.75, 352.5, 0., 0., 1. ]\n"
-        "distortion_coefficients: !!opencv-nd-matrix\n   sizes: [ 5 ]\n   dt: d\n"
-        "   data: [ -2.8e-01, 7.0e-02, 1e-3, -2.0e-03, 0. ]\n"
-    ),
-    "camchain.yaml#cam1": (
-        "cam0:\n  camera_model: pinhole\n  intrinsics: [1, 1, 1, 1]\n  resolution: [4, 4]\n"
-        f"cam1:\n  camera_model: pinhole\n  distortion_model: radtan\n  distortion_coeffs: {K}\n"
-        "  intrinsics: [902.5, 911.75, 645.25, 352.5]\n  resolution: [1280, 720]\n"
-    ),
-    "opencv.xml": (
-        '<?xml version="1.0"?>\n<opencv_storage>\n<!-- by a calibration --><image_width>1280</image_width>\n'
-        "<image_height>720</image_height>\n<fisheye_model>0</fisheye_model>\n"
-        '<camera_matrix type_id="opencv-matrix">\n  <rows>3</rows>\n  <cols>3</cols>\n  <dt>d</dt>\n  <data>\n'
-        "    9.025e+02 0. 6.4525e+02 0. 911.75\n    352.5 0. 0. 1.</data></camera_matrix>\n"
-        '<distortion_coefficients type_id="opencv-nd-matrix">\n  <sizes>\n    5</sizes>\n  <dt>d</dt>\n'
-        "  <data>\n    -2.8e-01 7.0e-02 1e-3 -2.0e-03 0.</data></distortion_coefficients>\n</opencv_storage>\n"
-    ),
-    "info.yaml": ros("plumb_bob", [*K, 0.0]),
-    "echo.yaml": (
-        f"height: 720\nwidth: 1280\ndistortion_model: plumb_bob\nd: {[*K, 0.0]}\nk: {TABLE['matrix']}\n---\nheight: 1\n"
-    ),
-    "cameras.txt#3": (
-        "# Camera list with one line of data per camera:\n1 SIMPLE_PINHOLE 640 480 500 320 240\n"
-        "3 OPENCV 1280 720 902.5 911.75 645.75 353.0 -0.28 0.07 0.001 -0.002\n"
-    ),
-}
+CAMERA_FILES: dict[str, Any] = yaml.safe_load((HERE / "camera_files.yaml").read_text("utf-8"))
+"""One camera in the files of each tool, by name, with `#` and its own name where a file has several cameras."""
+
+TEXTS: dict[str, str] = {name: file["text"] for name, file in CAMERA_FILES.items()}
 
 
-@pytest.mark.parametrize("name", list(FILES))
+@pytest.mark.parametrize("name", CAMERA_FILES)
 def test_one_camera_in_each_kind_of_file_is_the_same(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
-    path.with_name(name.partition("#")[0]).write_text(FILES[name])
+    path.with_name(name.partition("#")[0]).write_text(TEXTS[name])
     found = read_camera(str(path))
+    assert found.kind == CAMERA_FILES[name]["kind"] and found.size == (720, 1280)
+    assert not [note for note in found.reading_notes if "M2" not in note]
     wanted = {"fx": 902.5 / 1280, "fy": 911.75 / 720, "cx": 645.75 / 1280, "cy": 353.0 / 720}
-    wanted |= dict(zip(("k1", "k2", "p1", "p2"), K, strict=True))
-    assert found.kind == "brown-conrady" and found.size == (720, 1280)
+    wanted |= CAMERA_FILES[name]["numbers"]
     assert found.values == pytest.approx({**dict.fromkeys(NUMBER_NAMES, 0.0), **wanted})
 
 
@@ -212,122 +189,24 @@ def test_a_file_that_is_no_camera_is_refused_in_a_sentence(what: str, tmp_path: 
     assert str(path) in message and "\n" not in message and len(message) < 700
 
 
-# ---- files of other tools -------------------------------------------------------------------------------------------
-
-BROWN = "fx: 902.5\nfy: 911.75\ncx: 645.25\ncy: 352.5\n"
-BROWN_NUMBERS = {"fx": 902.5 / 1280, "fy": 911.75 / 720, "cx": 645.75 / 1280, "cy": 353.0 / 720}
-BENT = dict(zip(("k1", "k2", "p1", "p2"), K, strict=True))
-
-
-def orbslam(camera: str, kind: str | None, *names: str) -> str:
-    """A settings file of ORB-SLAM, with what of it is about no lens."""
-    text = '%YAML:1.0\n\n#----\nFile.version: "1.0"\n' + (f'Camera.type: "{kind}"\n' if kind else "")
-    text += "".join(f"{camera}.{line}\n" for line in BROWN.splitlines())
-    text += "".join(f"{camera}.{name}: {value}\n" for name, value in zip(names, K, strict=False))
-    text += "Camera.width: 1280\nCamera.height: 720\nCamera.fps: 20.0\nCamera.RGB: 1\nThDepth: 35.0\n"
-    return text + "ORBextractor.nFeatures: 1200\nViewer.PointSize: 2\nIMU.NoiseGyro: 1.7e-04\n"
-
-
-METASHAPE = (
-    "<calibration>\n<projection>{kind}</projection><width>1280</width><height>720</height><f>911.75</f>"
-    "<cx>5.75</cx><cy>-7</cy><b1>-9.25</b1><b2>1.5</b2>{rest}<date>2026-11-28T00:00:00Z</date></calibration>"
-)
-KITTI = (
-    "P0: 902.5 0 645.25 0 0 911.75 352.5 0 0 0 1 0\nP1: 902.5 0 645.25 -386.1 0 911.75 352.5 0 0 0 1 0\n"
-    "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\nimage_width: 1280\nimage_height: 720\n"
-)
-KITTI_RAW = (
-    "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\nS_00: 1.28e+03 7.2e+02\n"
-    "K_00: 902.5 0 645.25 0 911.75 352.5 0 0 1\nD_00: -0.28 0.07 0.001 -0.002 0\nR_00: 1 0 0 0 1 0 0 0 1\n"
-    "T_00: 0 0 0\nS_rect_00: 1280 720\nR_rect_00: 1 0 0 0 1 0 0 0 1\n"
-    "P_rect_00: 902.5 0 645.25 0 0 911.75 352.5 0 0 0 1 0\n"
-)
-FOCAL = {"focal_x": 902.5 / 1280, "focal_y": 911.75 / 1280, "c_x": 5.75 / 1280, "c_y": -7 / 1280}
-OPENSFM = {"width": 1280, "height": 720, **FOCAL}
-REALSENSE = {"width": 1280, "height": 720, "fx": 902.5, "fy": 911.75, "ppx": 645.25, "ppy": 352.5}
-BY_COLUMNS = [902.5, 0.0, 0.0, 0.0, 911.75, 0.0, 645.25, 352.5, 1.0]
-RECTIFIED: dict[str, float] = {}
-FISH = dict(zip(("k1", "k2", "k3", "k4"), K, strict=True))
-OF_OTHER_TOOLS: dict[str, tuple[str, str, dict[str, float]]] = {
-    "orbslam2.yaml": (orbslam("Camera", None, "k1", "k2", "p1", "p2"), "brown-conrady", BENT),
-    "orbslam3.yaml": (orbslam("Camera1", "PinHole", "k1", "k2", "p1", "p2"), "brown-conrady", BENT),
-    "kb8.yaml": (orbslam("Camera1", "KannalaBrandt8", "k1", "k2", "k3", "k4"), "fisheye", FISH),
-    "rectified.yaml": (orbslam("Camera1", "Rectified"), "brown-conrady", RECTIFIED),
-    "stereo.yaml#Camera2": (
-        orbslam("Camera2", "KannalaBrandt8", "k1", "k2", "k3", "k4") + "Camera1.fx: 3\nCamera1.k1: 9\nStereo.b: 0.1\n",
-        "fisheye", FISH,
-    ),
-    "stella.yaml": (
-        "Camera: {name: c, setup: monocular, model: fisheye, fx: 902.5, fy: 911.75, cx: 645.25, cy: 352.5, "
-        f"k1: {K[0]}, k2: {K[1]}, k3: {K[2]}, k4: {K[3]}, fps: 30, cols: 1280, rows: 720, color_order: RGB}}\n",
-        "fisheye", FISH,
-    ),
-    "calib.txt#P0": (KITTI, "brown-conrady", RECTIFIED),
-    "calib.txt#P1": (KITTI, "brown-conrady", RECTIFIED),
-    "calib_cam_to_cam.txt#00": (KITTI_RAW, "brown-conrady", BENT),
-    "calib_cam_to_cam.txt#rect_00": (KITTI_RAW, "brown-conrady", RECTIFIED),
-    "opencv_stereo.yaml": (
-        f"image_size: [1280, 720]\nM1: {TABLE['matrix']}\nD1: {K}\nM2: {TABLE['matrix']}\n", "brown-conrady", BENT
-    ),
-    "realsense.json": (json.dumps({**REALSENSE, "model": "distortion.brown_conrady", "coeffs": [*K, 0.0]}),
-                       "brown-conrady", BENT),
-    "inverse.json": (json.dumps({**REALSENSE, "model": "Inverse Brown Conrady", "coeffs": [0.0] * 5}),
-                     "brown-conrady", RECTIFIED),
-    "t265.json": (json.dumps({**REALSENSE, "model": "kannala_brandt4", "coeffs": [*K, 0.0]}), "fisheye", FISH),
-    "open3d.json": (json.dumps({"width": 1280, "height": 720, "intrinsic_matrix": BY_COLUMNS}),
-                    "brown-conrady", RECTIFIED),
-    "arkit.json": (json.dumps({"imageResolution": [1280, 720], "intrinsics": [BY_COLUMNS[k:k + 3] for k in (0, 3, 6)]}),
-                   "brown-conrady", RECTIFIED),
-    "camera_models.json": (json.dumps({"v2 a b": {"projection_type": "brown", **OPENSFM, **BENT, "k3": 0.0}}),
-                           "brown-conrady", BENT),
-    "two.json#fish": (
-        json.dumps({"other": {"projection_type": "perspective", "width": 4, "height": 4, "focal": 1.0},
-                    "fish": {"projection_type": "fisheye_opencv", **OPENSFM, **FISH}}),
-        "fisheye", FISH,
-    ),
-    "metashape.xml": (
-        METASHAPE.format(kind="frame", rest="<k1>-0.28</k1><k2>0.07</k2><p1>-0.002</p1><p2>0.001</p2>"),
-        "brown-conrady", {**BENT, "skew": 1.5 / 1280},
-    ),
-    "metashape_fisheye.xml": (
-        METASHAPE.format(kind="fisheye", rest="<k1>-0.28</k1><k2>0.07</k2><k3>0.001</k3><k4>-0.002</k4>"),
-        "fisheye", {**FISH, "skew": 1.5 / 1280},
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", list(OF_OTHER_TOOLS))
-def test_the_same_camera_in_files_of_other_tools(name: str, tmp_path: Path) -> None:
-    text, kind, numbers = OF_OTHER_TOOLS[name]
-    path = tmp_path / name
-    path.with_name(name.partition("#")[0]).write_text(text)
-    found = read_camera(str(path))
-    assert (
-        found.kind == kind
-        and found.size == (720, 1280)
-        and not [note for note in found.reading_notes if "M2" not in note]
-    )
-    assert found.values == pytest.approx({**dict.fromkeys(NUMBER_NAMES, 0.0), **BROWN_NUMBERS, **numbers})
-
-
 @pytest.mark.parametrize(
     "text",
     [
         "# Bundle file v0.3\n2 9\n500 0 0\n",
         "[LEFT_CAM_HD]\nfx=700\nfy=700\n",
-        METASHAPE.format(kind="cylindrical", rest=""),
-        METASHAPE.format(kind="frame", rest="<k4>0.1</k4>"),
-        METASHAPE.format(kind="fisheye", rest="<p1>0.1</p1>"),
+        TEXTS["metashape.xml"].replace("frame", "cylindrical"),
+        TEXTS["metashape.xml"].replace("<date>", "<k4>0.1</k4><date>"),
+        TEXTS["metashape_fisheye.xml"].replace("<date>", "<p1>0.1</p1><date>"),
         "model_type: SCARAMUZZA\nimage_width: 9\n",
         ros("fov", [0.9]),
         "cam0: {camera_model: eucm, intrinsics: [1, 2, 3, 4, 5, 6]}\n",
         "a: {projection_type: dual, width: 4, height: 4}\n",
         "a: {projection_type: brown, width: .nan, height: 4}\n",
         "a: {projection_type: brown, height: 4}\n",
-        KITTI.replace("image_width: 1280\n", ""),
+        TEXTS["calib.txt#P0"].replace("image_width: 1280\n", ""),
         "P2: 7 0 6 0 0 7 3 0 0 0 1 0\n",
         "P2: 7 0 6 0 0 x 3 0 0 0 1 0\nimage_width: 9\nimage_height: 9\n",
-        orbslam("Camera1", "KannalaBrandt9"),
+        TEXTS["kb8.yaml"].replace("KannalaBrandt8", "KannalaBrandt9"),
     ],
 )  # fmt: skip
 def test_files_of_other_tools_that_are_not_read_are_refused(text: str, tmp_path: Path) -> None:
@@ -454,21 +333,3 @@ def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> 
 
 
 # ---- as users name it -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("camera", "settings", "control", "words"),
-    [
-        ("fisheye", {"camera.fov": 90.0}, {}, r"camera\.fov"),
-        ("fisheye", {}, {"k5": 0.1}, "k5"),
-        (None, {}, {"k1": 0.1, "aperture": 0.1}, "aperture"),
-        (None, {"camera.fov": 60.0}, {"k1": -1.5}, "background"),
-    ],
-)
-def test_what_contradicts_a_lens_is_refused(
-    camera: str | None, settings: dict[str, float], control: dict[str, object], words: str
-) -> None:
-    with pytest.raises(InputError, match=words):
-        advsearch.load_scene("mug", camera=camera, settings=settings).renderer(
-            {"camera": control, **({"background": {}} if "background" in words else STILL)}, resolution=16
-        )

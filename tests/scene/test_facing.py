@@ -10,9 +10,7 @@ import pytest
 import trimesh
 from test_gltf import File
 
-from advsearch.cli.main import _join_negative_axis
 from advsearch.engine.loading import load_scene
-from advsearch.errors import InputError
 from advsearch.scene import library
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
@@ -82,19 +80,6 @@ def test_what_is_the_front_of_a_file_faces_x(
     assert asset.front is not None and asset.front.axis == front
     assert ("facing=" in asset.front.reason) == ("facing" not in settings)
     assert asset.front.reason not in asset.notes  # told where it matters
-
-
-def test_a_facing_that_is_none_or_points_up_is_refused(tmp_path: Path) -> None:
-    path = write_car(tmp_path / "car.glb", "+z")
-    with pytest.raises(InputError, match="'ahead'"):
-        import_object(path, facing="ahead")
-    with pytest.raises(InputError, match="facing"):
-        import_object(path, facing="-y")
-    with pytest.raises(InputError, match="car is bundled"):
-        load_scene("car", facing="-x")
-    with pytest.raises(InputError, match="a scene file"):
-        load_scene(f"{path}#plate", facing="-x")
-    assert _join_negative_axis(["render", "--facing", "-z", "--up", "y"]) == ["render", "--facing=-z", "--up", "y"]
 
 
 # ---- in the lane -----------------------------------------------------------------------------------------------------

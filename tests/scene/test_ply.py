@@ -82,20 +82,7 @@ def textures(folder: Path) -> None:
         Image.new("RGB", (4, 4), color).save(folder / f"{name}.png")
 
 
-GOOD = np.array([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.2, 0.4], [0.6, 0.8, 1.0]])
 """Colours of four vertices."""
-
-
-@pytest.mark.parametrize("kind", ORDERS)
-@pytest.mark.parametrize("names", ["red green blue", "r g b", "diffuse_red diffuse_green diffuse_blue"])
-def test_colors_of_vertices(tmp_path: Path, kind: str, names: str) -> None:
-    for type_, scale in (("uchar", 255), ("ushort", 65535), ("float", 1), ("double", 255), ("int", 255)):
-        scaled = GOOD * scale
-        values = (scaled if type_ in ("float", "double") else scaled.round().astype(int)).tolist()
-        (part,), notes = square(*(f"{type_} {name}" for name in names.split()), values=values).read(tmp_path, kind)
-        assert notes == []
-        number = [[SQUARE.index(point) for point in face] for face in part.vertices[part.faces].tolist()]
-        np.testing.assert_allclose(shown(part), GOOD[number], atol=2e-3)
 
 
 def test_colors_of_faces_and_of_both(tmp_path: Path) -> None:
@@ -113,16 +100,6 @@ def test_colors_of_faces_and_of_both(tmp_path: Path) -> None:
     varied = square("uchar red", "uchar green", "uchar blue", values=[[9, 9, 9], [0, 0, 0], [1, 1, 1], [2, 2, 2]])
     varied.elements["face"] = (colors, faces)
     assert varied.read(tmp_path)[1] == ["colours of faces are left out: its vertices have some, too"]
-
-
-@pytest.mark.parametrize("names", ["s t", "u v", "texture_u texture_v"])
-def test_texture_coordinates_of_vertices(tmp_path: Path, names: str) -> None:
-    textures(tmp_path)
-    whole = square(*(f"float {name}" for name in names.split()), values=[[x, 1.0 - y] for x, y, _ in SQUARE])
-    whole.comments = ["made by hand", "TextureFile red.png"]
-    (part,), notes = whole.read(tmp_path, "binary_big_endian")
-    assert notes == [] and part.uvs is not None and part.surface.texture is not None
-    np.testing.assert_allclose(part.uvs, part.vertices[:, :2] * (1, -1) + (0, 1), atol=1e-6)
 
 
 def wedged(*more: str, rows: Rows) -> Ply:
