@@ -363,46 +363,6 @@ def test_the_process_that_reads_usd_needs_little() -> None:
 # -- what is shipped -------------------------------------------------------------------------------------------------
 
 
-NOT_MESSAGES = (
-    "advsearch.settings",
-    "advsearch.viewer.document",
-    "advsearch.trust.programs",
-    "advsearch.scene.importing.files",
-    "advsearch.scene.importing.usd.layers",
-)
-"""Modules that read or write flags themselves, also those of another program, and a style sheet."""
-
-
-def texts_of_people(source: str) -> Iterator[tuple[int, str]]:
-    """Every text in a module but docstrings and what describes a setting or an experiment: the command line's help."""
-    tree = ast.parse(source)
-    apart: set[int] = set()
-    for node in ast.walk(tree):
-        helps = isinstance(node, ast.Call) and getattr(node.func, "id", "") in (
-            "setting",
-            "experiment",
-            "BuiltIn",
-            "PositionalArgument",
-        )
-        if helps or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
-            apart.update(id(inner) for inner in ast.walk(node))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in apart:
-            yield node.lineno, node.value
-
-
-@pytest.mark.medium
-def test_messages_name_settings_as_python_has_them_and_no_flags() -> None:
-    flags = [
-        f"{path.relative_to(ROOT)}:{line}: {text}"
-        for module, path in python_files()
-        if room(module) != "cli" and not module.startswith(NOT_MESSAGES)
-        for line, text in texts_of_people(path.read_text(encoding="utf-8"))
-        if re.search(r"(?<![\w-])--[a-z]", text)
-    ]
-    assert not flags, "write `name` or `name=value`; the command line makes flags of it: " + "; ".join(flags)
-
-
 @cache
 def setup_cfg() -> configparser.ConfigParser:
     parser = configparser.ConfigParser()

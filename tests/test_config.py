@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from advsearch.cli import flags
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.errors import InputError
 from advsearch.questions.attack.settings import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.check.result import CheckConfig
 from advsearch.questions.precision.result import QUANTITIES, PrecisionConfig
@@ -27,7 +27,7 @@ from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.stability.result import StabilityConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig
-from advsearch.settings import Config, PythonOnly, Setting, are_all_finite, parse_assignment, read_yaml, settings
+from advsearch.settings import Config, PythonOnly, Setting, are_all_finite, read_yaml, settings
 from hostile import HOSTILE, shown
 
 WRONG: dict[str, Any] = {
@@ -108,37 +108,6 @@ def test_every_wrong_value_names_its_flag(setting: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "value", [0, -1, -0.5, "nan", math.nan, math.inf, "inf", "-inf", True, "much", "0.1,0", "texture=0"]
-)
-def test_epsilon_is_a_number_greater_than_zero(value: Any) -> None:
-    with pytest.raises(InputError, match="epsilon"):
-        AttackConfig(object="mug", epsilon=value)
-
-
-def test_all_problems_are_told_at_once() -> None:
-    with pytest.raises(InputError) as error:
-        AttackConfig.model_validate({"epsilon": -1, "steps": 0})
-    problems = flags.format_as_flags(str(error.value)).split("; ")
-    assert [problem.partition(":")[0] for problem in problems] == ["--object", "--epsilon", "--steps"]
-
-
-def test_an_unknown_setting_has_near_matches() -> None:
-    with pytest.raises(UnknownNameError, match="'epsilonn'") as error:
-        AttackConfig.model_validate({"object": "mug", "epsilonn": 0.1})
-    assert error.value.near[0] == "epsilon"
-
-
-@pytest.mark.parametrize("config", CONFIGS.values(), ids=lambda config: config.command)
-def test_every_setting_of_every_command_says_what_it_is(config: type[Config]) -> None:
-    known = settings(config)
-    assert {setting.field for setting in known} == set(config.model_fields) - {*config.without}
-    assert len({setting.flag for setting in known}) == len(known)
-    for setting in known:
-        assert setting.description and setting.expects and setting.group
-        assert setting.required or setting.default is not None or setting.otherwise
-
-
-@pytest.mark.parametrize(
     "config",
     [
         AttackConfig(object="mug,bowl", workers=2, cluster="local"),
@@ -210,16 +179,6 @@ def test_what_a_grid_is_typed_as(tmp_path: Path) -> None:
         "advsearch recipe --recipe pose --label '#504' --label mug='coffee mug,cup'", RecipeConfig
     )
     assert recipe.label == {"*": "#504", "mug": "coffee mug,cup"}
-
-
-@pytest.mark.parametrize(
-    ("config", "field", "value"),
-    [(RegionConfig, "around", 3.5), (RegionConfig, "vary", [1]), (SweepConfig, "trials", 1)],
-)
-def test_a_wrong_value_of_other_commands_names_its_flag(config: type[Config], field: str, value: Any) -> None:
-    with pytest.raises(InputError) as error:
-        config(**{"object": "mug", field: value})
-    assert flags.format_as_flags(str(error.value)).startswith(f"--{field}: ")
 
 
 def own_settings(config: type[Config]) -> list[Setting]:
@@ -382,31 +341,6 @@ def test_overrides_reach_inside(tmp_path: Path) -> None:
     assert config.steps == 80
     assert config.set_ == {"camera.azimuth": 1.0, "camera.elevation": 25.0}
     assert config.controls == {"texture": {"resolution": 64}, "pose": {"yaw": [0, 9]}}
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("camera.azimuth=130", ("camera.azimuth", 130)),
-        (" a = [1, 2.5] ", ("a", [1, 2.5])),
-        ("a={b: c=d}", ("a", {"b": "c=d"})),
-    ],
-)
-def test_assignments(text: str, expected: tuple[str, Any]) -> None:
-    assert parse_assignment(text, "--set") == expected
-
-
-@pytest.mark.parametrize(
-    ("given", "expected"),
-    [
-        ("0.05", 0.05),
-        ("0.01, 0.02", (0.01, 0.02)),
-        ([0.3], 0.3),
-        ("texture=0.05,geometry=0.01", {"texture": 0.05, "geometry": 0.01}),
-    ],
-)
-def test_epsilon_is_one_number_one_for_each_control_or_a_curve(given: Any, expected: Any) -> None:
-    assert AttackConfig(object="mug", epsilon=given).epsilon == expected
 
 
 @pytest.mark.parametrize("given", ["pgd={momentum: 0.9, steps: 80}", {"name": "pgd", "momentum": 0.9, "steps": 80}])

@@ -162,24 +162,6 @@ def test_a_way_of_a_file_is_followed(scene: SceneDescription, tmp_path: Path) ->
         torch.testing.assert_close(pose[:3, 2], ahead, atol=1e-5, rtol=0)
 
 
-def test_a_file_says_where_the_camera_looks_and_how_the_object_is_turned(
-    scene: SceneDescription, tmp_path: Path
-) -> None:
-    looks, turns = tmp_path / "looks.csv", tmp_path / "turns.CSV"
-    looks.write_text("time,x,y,z,look_x,look_y,look_z\n0,3,0,1,0,0,1\n1,3,0,1,3,5,1\n")
-    turns.write_text("time,heading,z,y,x\n0,0,0,0,0\n2,90,0,0,4\n")
-    ahead = placed(bound(scene, path=str(looks)), 1.0)[:3, 2]
-    torch.testing.assert_close(ahead, torch.tensor([0.0, 1.0, 0.0]), atol=1e-5, rtol=0)
-    own, pose = (
-        torch.from_numpy(object_to_world(scene)).float(),
-        placed(bound(scene, path=str(turns), moves="object"), 1),
-    )
-    torch.testing.assert_close(pose[:3, 0], torch.stack([-own[1, 0], own[0, 0], own[2, 0]]), atol=1e-5, rtol=0)
-    there = torch.cat([torch.from_numpy(compute_center(scene)).float(), torch.ones(1)])
-    shift = (pose @ torch.linalg.inv(own) @ there - there)[:3]
-    torch.testing.assert_close(shift, torch.tensor([4.0, 0.0, 0.0]), atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize(
     ("text", "when"),
     [
@@ -255,24 +237,6 @@ def test_a_file_that_is_no_way_is_refused(text: str, tmp_path: Path) -> None:
     file.write_text(text)
     with pytest.raises(FileFormatError, match=file.name):
         PathControl(path=str(file))
-
-
-def test_what_does_not_go_together_is_refused(scene: SceneDescription, tmp_path: Path) -> None:
-    file = tmp_path / "way.csv"
-    file.write_text(WAY)
-    with pytest.raises(InputError, match=r"path\.path"):
-        PathControl(path="aproach")
-    for path in (str(file), f"approach+{file}"):
-        with pytest.raises(InputError, match="path"):
-            PathControl(path=path, seconds=3.0)
-    with pytest.raises(InputError, match="path"):
-        PathControl(path=f"{file}+{file}", reach=3.0)
-    assert PathControl(path=f"approach+{file}", reach=3.0).seconds == 4.0, "the camera's way is no file's"
-    for path in ("approach+turn", "+orbit", "approach+orbit+pass"):
-        with pytest.raises(InputError, match="expected approach"):
-            PathControl(path=path)
-    with pytest.raises(InputError, match=r"approach\+orbit"):
-        PathControl(path="approach+orbit", moves="object")
 
 
 def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: SceneDescription, tmp_path: Path) -> None:

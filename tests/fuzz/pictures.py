@@ -49,18 +49,7 @@ def sample(kind: str, mode: str = "RGB") -> bytes:
     return buffer.getvalue()
 
 
-SAMPLES = (
-    ("PNG", "RGB"),
-    ("PNG", "P"),
-    ("PNG", "RGBA"),
-    ("PNG", "1"),
-    ("JPEG", "RGB"),
-    ("JPEG", "L"),
-    ("BMP", "RGB"),
-    ("TIFF", "RGB"),
-    ("GIF", "P"),
-    ("TGA", "RGB"),
-)
+SAMPLES = [one.split() for one in "PNG RGB,PNG P,PNG RGBA,PNG 1,JPEG RGB,JPEG L,BMP RGB,TIFF RGB,GIF P".split(",")]
 
 
 def picture(random: Random) -> tuple[str, bytes]:
