@@ -56,6 +56,7 @@ lint: $(STAMP) ## look for mistakes, for code that is not formatted for pages th
 	@$(BIN)/ruff format --check --quiet $(SOURCES) || { echo "not formatted: run make format"; exit 1; }
 	@$(BIN)/python tools/check_docs.py
 	@$(BIN)/python tools/check_names.py
+	@$(BIN)/python tools/check_sentences.py
 	@$(BIN)/python scenes/build.py --check
 
 format: $(STAMP) ## format the code and mend what can be mended
