@@ -46,7 +46,7 @@ EXCEPTIONS = {
 
 
 def has_words(node: ast.expr, fewest: int = 2) -> bool:
-    """Return whether an expression is a literal, or a collection of literals, with so many words in one."""
+    """Return whether a literal, or one of a collection, has so many words."""
     if isinstance(node, ast.Constant):
         return (
             isinstance(node.value, str)
@@ -61,25 +61,22 @@ def has_words(node: ast.expr, fewest: int = 2) -> bool:
 
 
 def is_sentence(node: ast.expr) -> bool:
-    """Return whether an expression is a text for people: an attribute of `SENTENCES`, or the text of an error."""
+    """Return whether it is an attribute of `SENTENCES`, or the text of an error."""
     if isinstance(node, ast.Attribute):
         return node.attr in SENTENCES
-    if isinstance(node, ast.Call) and isinstance(
-        node.func, ast.Attribute
-    ):  # of `error.reason.lower()`
+    if not isinstance(node, ast.Call):
+        return False
+    if isinstance(node.func, ast.Attribute):  # of `error.reason.lower()`
         return is_sentence(node.func.value)
-    is_text = (
-        isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
-        and node.func.id == "str"
-    )
-    return is_text and any(
-        isinstance(one, ast.Name) and one.id in ERRORS for one in node.args
-    )  # type: ignore[attr-defined]
+    is_text = isinstance(node.func, ast.Name) and node.func.id == "str"
+    errors = [
+        one for one in node.args if isinstance(one, ast.Name) and one.id in ERRORS
+    ]
+    return is_text and bool(errors)
 
 
 def is_fixed_text(node: ast.expr) -> bool:
-    """Return whether an expression is a text that is not empty, or a constant or a collection of them by its name."""
+    """Return whether it is a text that is not empty, or constants, also by name."""
     if isinstance(node, ast.Constant):
         return isinstance(node.value, str) and node.value != ""
     if isinstance(node, (ast.Tuple, ast.List, ast.Set)):

@@ -21,12 +21,6 @@ from advsearch.settings import HEADER
 PACKAGE = Path(advsearch.__file__).parent
 CORE = ("attack", "sweep", "render")
 REMOVABLE = [part for part in BUILT_INS if part.kind == "experiment" and part.name not in CORE]
-CORE_PARTS = {
-    "control": "pose camera texture material light environment geometry",
-    "policy": "random grid pgd adam cmaes nes auto sobol restarts portfolio",
-    "task": "classification detection",
-    "reader": "obj ply stl gltf glb vrm",
-}
 """Parts that are not removed, those in their modules included."""
 
 
@@ -83,37 +77,6 @@ def test_without_all_removable_experiments_the_tool_works(tmp_path: Path) -> Non
     )
     assert attacked.returncode == 0, attacked.stderr
     assert (tmp_path / "runs" / "kept" / "report.html").is_file()
-
-
-def list_removable_modules() -> dict[str, list[str]]:
-    """Return the modules of parts outside the core, each with its parts as "kind name"."""
-    found: dict[str, list[str]] = {}
-    for part in BUILT_INS:
-        is_core = part.name in CORE_PARTS.get(part.kind, "").split()
-        if part.kind not in ("experiment", "model source") and not is_core:
-            found.setdefault(part.target.partition(":")[0], []).append(f"{part.kind} {part.name}")
-    return found
-
-
-def test_without_all_removable_parts_the_tool_works(tmp_path: Path) -> None:
-    copy_package(tmp_path)
-    for module in list_removable_modules():
-        path = tmp_path.joinpath(*module.split("."))
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.with_suffix(".py").unlink()
-    listed = run_python(tmp_path, "-m", "advsearch", "list", "controls")
-    assert listed.returncode == 0, listed.stderr
-    assert [line.split()[0] for line in listed.stdout.splitlines()] == CORE_PARTS["control"].split()
-    words = ["--control", "pose", "--resolution", "32", "--spp", "2", "--run"]
-    swept = run_python(tmp_path, "-m", "advsearch", "sweep", "--object", "mug", "--samples", "2", *words, "swept")
-    assert swept.returncode == 0, swept.stderr
-    attack = ["attack", "--object", "mug", "--steps", "2", "--trials", "6", "--verify-spp", "2", "--no-baseline"]
-    attacked = run_python(tmp_path, "-m", "advsearch", *attack, *words, "attacked", "--json")
-    assert attacked.returncode == 0, attacked.stderr
-    exported = run_python(tmp_path, "-m", "advsearch", "export", "attacked", "--out", "rows.csv")
-    assert exported.returncode == 0, exported.stderr
 
 
 SETUP = """from setuptools import setup

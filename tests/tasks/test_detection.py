@@ -13,13 +13,12 @@ from torch import Tensor, nn
 from advsearch.attacks.objectives import get_objective
 from advsearch.errors import InputError
 from advsearch.models import load_model
-from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
+from advsearch.options import Outcome, get_outcome
 from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight
 from advsearch.tasks.boxes import (
     DetectionTruth,
     compute_fraction_inside,
     compute_iou,
-    suppress_class,
     to_corners,
 )
 from advsearch.tasks.detection import GOALS
@@ -65,12 +64,6 @@ def test_all_forms_of_a_box_are_the_same_corners() -> None:
     forms = {"xyxy": [1, 2, 5, 8], "xywh": [1, 2, 4, 6], "cxcywh": [3, 5, 4, 6], "yxyx": [2, 1, 8, 5]}
     for form, numbers in forms.items():
         assert to_corners(torch.tensor(numbers).float(), form).tolist() == [1, 2, 5, 8]
-
-
-def test_of_boxes_that_overlap_the_best_one_is_left() -> None:
-    boxes, scores = torch.tensor([HERE, NEAR, AWAY]), torch.tensor([0.5, 0.9, 0.6])
-    assert suppress_class(boxes, scores, 0.5).tolist() == [False, True, True]
-    assert suppress_class(boxes, scores, 0.7).all()
 
 
 # ---- what a detector returns ----------------------------------------------------------------------------------------
@@ -295,15 +288,6 @@ def test_where_nothing_of_the_object_is_seen_nothing_is_missed() -> None:
         found = judged(TASK.with_objective(seek), FOUND, hidden)
         assert found.right and not found.success and found.prediction == Prediction("out of view")
     assert judged(TASK.with_objective("create"), dense((HERE, [0.0, 0.7, 0.0])), hidden).success
-
-
-def test_a_score_that_is_no_number_is_neither_right_nor_a_success() -> None:
-    found = judged_anyway(dense((HERE, [math.nan, 0.1, 0.1])))
-    assert not found.right and not found.success and found.prediction == Prediction(NOT_A_NUMBER)
-
-
-def judged_anyway(output: list[dict[str, Tensor]]) -> Judgement:
-    return TASK.judge(output, TRUTH)[0]
 
 
 @pytest.mark.parametrize("seek", GOALS)

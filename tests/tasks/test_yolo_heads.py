@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from advsearch.errors import InputError
 from advsearch.models import ModelWarning, load_model
-from advsearch.models.labels import parse_names, read_labels
+from advsearch.models.labels import read_labels
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import DetectionTruth, compute_iou, suppress_class
 
@@ -159,13 +159,9 @@ def more(columns: int, span: float = 0.9) -> Callable[[Tensor], Tensor]:
 @pytest.mark.parametrize(
     ("form", "labels", "text"),
     [
-        (more(1, span=3.0), NAMES, r"output is \(8, 21\): it has an angle after the scores, as OBB heads have it"),
-        (lambda n: first(torch.cat([n[..., :4], 9.0 * n[..., 4:] - 4.0], dim=2)), NAMES, "apply a sigmoid to them"),
-        (
-            first,
-            ["a"],
-            "expected 4 . 1 or 5 . 1 numbers of a box for 1 class, got 7; give the `labels` of the model's",
-        ),
+        (more(1, span=3.0), NAMES, "angle"),
+        (lambda n: first(torch.cat([n[..., :4], 9.0 * n[..., 4:] - 4.0], dim=2)), NAMES, "sigmoid"),
+        (first, ["a"], "labels"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:no gradient")
@@ -267,16 +263,3 @@ def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
     assert (
         astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.doubts
     )
-
-
-@pytest.mark.parametrize(
-    ("text", "names"),
-    [
-        ("{0: 'cup', 1: \"it's\", 2: 'a\\'b'}", ("cup", "it's", "a'b")),
-        ("['cup', 'bowl']", ("cup", "bowl")),
-        ("{0: __import__('os')}", None),
-        ("[" * 5000, None),
-    ],
-)
-def test_names_in_metadata_are_plain_texts_or_nothing(text: str, names: tuple[str, ...] | None) -> None:
-    assert parse_names(text) == names

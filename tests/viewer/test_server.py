@@ -179,25 +179,6 @@ def test_those_who_say_nothing_do_not_fill_the_server(server: Dashboard, monkeyp
         assert ask(server, "/")[0].status == 200
 
 
-def test_who_waits_when_it_closes_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No worker is there to serve one that has asked."""
-    monkeypatch.setattr("advsearch.viewer.clients.N_WORKERS", 0)
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        served = clients.ConnectionPool(listening, lambda connection, address: None, None)
-        thread = threading.Thread(target=served.serve)
-        thread.start()
-        with socket.create_connection(listening.getsockname()) as asking:
-            asking.sendall(b"GET / HTTP/1.0\r\n\r\n")
-            while served._ready.empty():
-                time.sleep(0.01)
-            served.close()
-            asking.settimeout(120.0)
-            with suppress(ConnectionResetError):  # what it has said was never read
-                assert asking.recv(1) == b""
-            assert served._ready.empty()
-        thread.join()
-
-
 @contextmanager
 def slow_clients(server: Dashboard, count: int, begun: bytes) -> Iterator[list[socket.socket]]:
     """Clients that have begun to ask, and go on with a letter now and then."""
@@ -357,18 +338,6 @@ def test_a_client_that_goes_away_does_no_harm(server: Dashboard) -> None:
         with socket.create_connection(("127.0.0.1", server.server_port)) as connection:
             connection.sendall(data)
     assert ask(server, "/")[0].status == 200
-
-
-def test_a_damaged_or_missing_run_is_told(tmp_path: Path) -> None:
-    damaged, gone = make_sweep(tmp_path / "damaged", ended=False), make_sweep(tmp_path / "gone", ended=False)
-    with serving(damaged, gone) as server:
-        (damaged / "results.sqlite").write_bytes(b"no database")
-        (gone / "results.sqlite").unlink()
-        for name in ("damaged", "gone"):
-            answer, data = ask(server, f"/runs/{name}/rows")
-            assert answer.status == 500
-            assert b"expected" in data
-        assert ask(server, "/")[0].status == 200
 
 
 def test_a_port_that_is_taken_is_told(server: Dashboard) -> None:
