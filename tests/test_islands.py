@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from advsearch.catalog import BUILT_INS
-from test_architecture import PACKAGE, ROOT, imports, python_files
+from test_architecture import ROOT, imports, python_files
 
 CORE = {
     "experiment": {"attack", "sweep", "render"},
@@ -106,23 +106,6 @@ def test_the_core_imports_no_island() -> None:
         if find_island(name) is not None
     ]
     assert broken == []
-
-
-def test_the_interface_states_each_name_once_for_editors_and_once_for_python() -> None:
-    tree = ast.parse((PACKAGE / "extend.py").read_text("utf-8"))
-    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
-    for_editors = {
-        alias.name: f"{node.module}.{alias.name}"
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    from advsearch import extend
-
-    for_python = {name: f"{module}.{name}" for name, module in extend._MODULE_OF_NAME.items()} | extend._MODULES
-    assert for_editors == for_python
-    assert len(for_python) <= 60
-    assert all(getattr(extend, name) is not None for name in extend.__all__)
 
 
 USE_WITHOUT = """

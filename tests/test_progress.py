@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from advsearch.attacks import Evaluation, Query, make_policy
+from advsearch.attacks import make_policy
 from advsearch.cli.flags import format_as_flags
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import RunState
@@ -18,13 +18,12 @@ from advsearch.experiment import run_experiment as answered
 from advsearch.progress import Stages
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.precision.result import PrecisionConfig
-from advsearch.questions.region import boxes
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config
-from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
+from stand_ins import StandInProblem, attack_on, configuration
 
 JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
 """Words of our own, which nobody who waits should have to know."""
@@ -111,31 +110,6 @@ def test_the_smallest_change_counts_what_it_says() -> None:
     assert progress.named("trying smaller changes")[0].done > 6
 
 
-def test_the_samples_of_the_smallest_change_are_those_of_the_clean_scene() -> None:
-    """It lies at the decision, where its own margin settles at no count."""
-    problem = Easy()
-    blocks = tuple(block for block in problem.domain.blocks if block.epsilon is not None)
-    problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
-    config = configuration(smallest=True).model_copy(update={"verify_spp": None})
-    _, findings = attacked(config, problem)
-    assert findings.bracket is not None and findings.verification is not None and findings.sample_count is not None
-    assert {row.name for row in findings.sample_count.table} == {"clean"} and findings.spp == 16
-
-
-@pytest.mark.parametrize("most", [boxes.MAX_PROBED, 60])
-def test_the_pictures_of_growing_a_box_have_a_bound(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    generator, pictures, checked = torch.Generator().manual_seed(0), 0, list[int]()
-
-    def same(u: torch.Tensor, number: int) -> bool:
-        nonlocal pictures
-        pictures += 1
-        return float(u.mean()) + 0.05 * float(torch.randn((), generator=generator)) < 0.6
-
-    monkeypatch.setattr(boxes, "MAX_PROBED", most)
-    boxes.grow_box(same, torch.full((3,), 0.5), seed=0, samples=20, on_check=lambda: checked.append(pictures))
-    assert 100 < checked[0] <= 3 * most and 1 <= len(checked) <= boxes.ATTEMPTS
-
-
 # ---- with the renderer ----------------------------------------------------------------------------------------------
 
 
@@ -165,32 +139,6 @@ def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, confi
 
 
 # ---- what is stored is not rendered again ---------------------------------------------------------------------------
-
-
-def test_a_resumed_run_takes_its_probes_from_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = configuration().model_copy(update={"verify_spp": None})
-    whole = carry_out(tmp_path / "whole", config)
-    rendered: list[tuple[int, bool]] = []
-    once = StandInProblem.evaluate
-
-    def evaluate(self: Any, query: Query) -> Evaluation:
-        if query.phase is None:
-            rendered.append((query.spp, query.draws_conditions))
-            if len(rendered) == stop:
-                raise KeyboardInterrupt
-        return once(self, query)
-
-    monkeypatch.setattr(StandInProblem, "evaluate", evaluate)
-    stop = 4 + 10  # the first look, then in the middle of the probes
-    assert carry_out(tmp_path / "run", config).interrupted
-    stop, before = 0, len([one for one in rendered if not one[1]])
-    rendered.clear()
-    resumed = carry_out(tmp_path / "run", config, resume=True)
-    again = len([one for one in rendered if not one[1]])
-    assert resumed.sample_count == whole.sample_count and whole.sample_count is not None
-    assert before - 1 + again == whole.sample_count.renders  # the one that was interrupted is rendered again
-    assert resumed.verification_renders == whole.verification_renders
-    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
 @pytest.mark.medium

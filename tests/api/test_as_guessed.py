@@ -163,19 +163,3 @@ def _other() -> Callable[..., float]:
 
 
 # ---- what is shown --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.medium
-def test_rows_are_there_without_a_folder(
-    scene: advsearch.Scene, model: advsearch.Model, attacked: AttackResult
-) -> None:
-    held = advsearch.attack(scene, model, controls="texture", epsilon=1.0, metrics={"red": red}, **FAST)
-    assert held.run is None
-    kept, rows = list(attacked.rows()), list(held.rows())
-    assert len(rows) == len(kept) and rows[0].values and rows[0].time is not None
-    for ours, theirs in zip(rows, kept, strict=True):
-        assert (ours.id, ours.kind, ours.step, ours.seed, ours.phase) == (
-            theirs.id, theirs.kind, theirs.step, theirs.seed, theirs.phase,
-        )  # fmt: skip
-        assert ours.objective == pytest.approx(theirs.objective) and ours.metrics == pytest.approx(theirs.metrics)
-    assert [row.kind for row in held.rows("control")] == ["control"] * 6

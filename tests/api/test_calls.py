@@ -20,20 +20,6 @@ from advsearch.errors import InputError
 FUNCTIONS = [name for name in advsearch.__all__ if inspect.isfunction(getattr(advsearch, name))]
 
 
-@pytest.mark.parametrize(
-    ("name", "keyword", "meant"),
-    [
-        ("attack", "eot", "`over`"),
-        ("load_scene", "enviroment", "`environment`"),
-    ],
-)
-def test_a_keyword_of_elsewhere_is_told_what_it_is_called_here(name: str, keyword: str, meant: str) -> None:
-    with pytest.raises(
-        TypeError, match=f"{name}.. got an unexpected keyword argument '{keyword}'; did you mean {meant}"
-    ):
-        getattr(advsearch, name)("mug", **{keyword: 1})
-
-
 @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "load_run"])
 @pytest.mark.parametrize("run", [False, True, 3, [], b"x", " "])
 def test_a_run_is_a_name_or_a_folder(name: str, run: Any) -> None:

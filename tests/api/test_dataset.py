@@ -14,7 +14,6 @@ import torch
 import advsearch
 from advsearch.cli.exporters.dataset.files import find_runs
 from advsearch.cli.main import main
-from advsearch.questions.attack.carry_out import load_parts_of_run, make_problem_with_warnings
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.files import read_png
@@ -123,22 +122,6 @@ def answered(path: Path, **more: Any) -> Path:
         for kind, wrong in (("control", False), ("verification", True)):
             held.append_rows(*(Row(kind, k, seed=k, spp=1, correct=not wrong, label="a") for k in range(3)))
     return run
-
-
-@pytest.mark.medium
-def test_an_attack_has_its_adversarial_scene_and_the_clean_scene(tmp_path: Path) -> None:
-    run = answered(tmp_path / "run")
-    assert [one["file_name"] for one in exported(run, tmp_path / "a")["images"]] == ["verification-00.png"]
-    found = exported(run, tmp_path / "b", "--all")
-    assert [one["file_name"] for one in found["images"]] == ["control-00.png", "verification-00.png"]
-    assert [one["advsearch"]["right"] for one in found["images"]] == [True, False]
-    assert found["images"][1]["advsearch"]["configuration"]["pose.yaw"]["unit"] == "degrees"
-    problem, _ = make_problem_with_warnings(load_parts_of_run(run))
-    for name, u in (("control", problem.domain.start), ("verification", torch.full((6,), 0.25))):
-        picture = torch.from_numpy(read_png(tmp_path / "b" / "images" / f"{name}-00.png"))
-        assert torch.allclose(picture, problem.picture(u, 0, 1), atol=1e-6)
-    over = exported(answered(tmp_path / "over", over={"camera": {}}), tmp_path / "c")
-    assert len(over["images"]) == 3 and len({json.dumps(one["segmentation"]) for one in over["annotations"]}) == 3
 
 
 @pytest.mark.medium

@@ -7,10 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
-from advsearch.attacks import get_objective
-from advsearch.engine.judging import reduce_objectives
 from advsearch.engine.verifier import Retrials
 from advsearch.questions.attack import attack
 from advsearch.questions.attack.settings import AttackConfig
@@ -93,18 +90,6 @@ def test_an_ensemble_answers_as_its_models_do() -> None:
     assert both.input_size == (32, 32) and both.differentiable and len(both(pictures)) == 3
     for own, output in zip(models, split_by_model(both(pictures)), strict=True):
         assert torch.equal(output, own(pictures))
-
-
-@pytest.mark.parametrize(("way", "value", "slopes"), [("mean", 1.5, (0.5, 0.5)), ("worst", 1.0, (0.0, 1.0))])
-def test_objectives_are_put_together(way: Any, value: float, slopes: tuple[float, float]) -> None:
-    """Margins of 2 and 1; a gradient goes to both, or to the least."""
-    first, second = torch.tensor([[0.0, 2.0]], requires_grad=True), torch.tensor([[1.0, 0.0]], requires_grad=True)
-    objective = reduce_objectives([get_objective("margin", Classification())] * 2, way)
-    found: Tensor = objective([(first, second)], torch.zeros(1, 2, 2, 3), ((0,), (1,)))
-    assert found.tolist() == [value]
-    found.sum().backward()
-    assert first.grad is not None and second.grad is not None
-    assert (float(first.grad[0, 1]), float(second.grad[0, 0])) == slopes
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import AdvsearchError, InputError
-from advsearch.progress import NullProgress
 from advsearch.questions.attack import python
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.result import RegionConfig
@@ -205,26 +203,6 @@ def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
     with Store(run / "results.sqlite", read_only=True) as store:
         noted = store.read_json_note("made of")
     assert len(noted["objective"]) == len(noted["model bright"]) == 64
-
-
-@pytest.mark.medium
-def test_a_sweep_goes_on_with_the_weights_that_it_began_with(scene: advsearch.Scene, tmp_path: Path) -> None:
-    class Stops(NullProgress):
-        def advance(self, n: int = 1, **info: float | str) -> None:
-            if n:
-                raise KeyboardInterrupt
-
-    asked: dict[str, Any] = {"resolution": SIDE, "spp": 1, "trials": 0, "denoise": "none", "batch": 1}
-    grid = {"pose.yaw": [0, 90, 180, 270]}
-    model = victim(0.5)
-    for ends in (Stops(), NullProgress()):
-        with suppress(KeyboardInterrupt):
-            advsearch.sweep(scene, model, grid, run=tmp_path / "run", progress=ends, **asked)
-        if isinstance(ends, Stops):
-            with pytest.raises(InputError, match=r"cannot resume with .* began with: model bright;"):
-                advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
-    with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
-        assert store.count_rows("sweep") == 4
 
 
 def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:

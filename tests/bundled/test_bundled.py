@@ -94,19 +94,6 @@ def test_charts_lie_apart_in_the_atlas(name: str, seed: int | None) -> None:
     assert len(owner) == len(np.unique(owner[:, :2], axis=0)), "two charts share a texel"
 
 
-@pytest.mark.medium
-@pytest.mark.parametrize("name", sorted(OBJECTS))
-def test_seeds_decide_everything(name: str) -> None:
-    first, again, other = (OBJECTS[name].generate(np.random.default_rng(seed)) for seed in (7, 7, 8))
-    for part in ("vertices", "faces", "normals", "uvs"):
-        assert getattr(first.mesh, part).tobytes() == getattr(again.mesh, part).tobytes()
-    assert first.base_color.tobytes() == again.base_color.tobytes()
-    assert first.material == again.material
-    same_shape = first.mesh.vertices.shape == other.mesh.vertices.shape
-    assert not same_shape or not np.allclose(first.mesh.vertices, other.mesh.vertices, atol=1e-3)
-    assert not np.allclose(first.base_color, other.base_color, atol=0.02)
-
-
 def test_things_of_the_street_have_their_size_and_several_materials() -> None:
     car = library.load_object("car")
     assert car.metres == pytest.approx(4.3, abs=0.05)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from argparse import Namespace
@@ -35,16 +34,6 @@ def well(monkeypatch: pytest.MonkeyPatch) -> None:
 def process_that(code: str) -> tuple[str, ...]:
     """A command that stands for the probe."""
     return (sys.executable, "-c", code)
-
-
-def test_json_is_one_value_with_every_part(well: None, capsys: pytest.CaptureFixture[str]) -> None:
-    assert doctor.doctor.run(Namespace(json=True)) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert (answer["schema"], answer["command"], answer["ok"]) == (1, "doctor", True)
-    assert all(set(part) == {"name", "version", "status", "detail", "fix"} for part in answer["parts"])
-    names = {part["name"] for part in answer["parts"]}
-    assert names >= {"Python", "advsearch", "mitsuba", "drjit", "libLLVM", "bundled scenes", "kernel cache", "disk"}
-    assert names >= set(TRIALS)
 
 
 def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(

@@ -13,27 +13,11 @@ from torch import Tensor, nn
 import advsearch
 from advsearch import models
 from advsearch.cli.main import main
-from advsearch.errors import InputError, find_similar_names
+from advsearch.errors import InputError
 from advsearch.models import read_labels
 from advsearch.models.labels import SETS
 
 LABELS = ("pug", "coffee mug", "frying pan, frypan", "giant panda", "cup", "mosque", "crane", "crane", "glasses")
-
-
-@pytest.mark.parametrize(
-    ("word", "found"),
-    [
-        ("MUGS", ["coffee mug"]),
-        ("pan", ["frying pan", "giant panda", "frypan"]),
-        ("mug coffee", ["coffee mug"]),
-        ("fry", ["frypan", "frying pan"]),
-        ("cofee", ["coffee mug"]),
-        ("xyzzy", []),
-    ],
-)
-def test_whole_words_come_first_then_beginnings_then_parts_then_spelling(word: str, found: list[str]) -> None:
-    names = ["pug", "frypan", "coffee mug", "giant panda", "frying pan", "mosque", "glasses"]
-    assert find_similar_names(word, names) == found
 
 
 def test_labels_are_listed_from_the_file_alone(

@@ -11,7 +11,6 @@ import torch
 
 import advsearch
 from advsearch.cli.flags import format_as_flags
-from advsearch.cli.main import main
 from advsearch.controls import Space, make_control, make_space
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
@@ -19,7 +18,7 @@ from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.results import to_json_value
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, load_description
+from advsearch.scene.description import SceneDescription, load_description
 
 AZIMUTH = {"camera.azimuth": 130.0}
 
@@ -75,21 +74,6 @@ def test_a_control_that_agrees_starts_at_what_was_asked_for(
             assert (value["value"] - given[name]) % 360.0 == pytest.approx(0.0, abs=1e-4)
 
 
-@pytest.mark.medium
-def test_the_default_environment_is_asked_for_only_where_it_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    words = ["sweep", "--object", "mug", "--control", "environment={which: [noon, kitchen]}", "--run", str(run)]
-    more = "--samples 2 --resolution 16 --spp 1 --trials 0 --quiet".split()
-    assert main([*words, *more, "--environment", "studio"]) == 2
-    assert "error: --environment studio and --control environment contradict each other" in capsys.readouterr().err
-    assert main([*words, *more]) == 0
-    (run / "summary.json").unlink()  # as if it had been stopped
-    assert main(["resume", str(run), "--quiet"]) == 0
-    assert SweepConfig(object="mug").environment_name == DEFAULT_ENVIRONMENT
-
-
 # ---- what nobody asked for moves, and that is said ------------------------------------------------------------------
 
 
@@ -139,14 +123,6 @@ def test_an_exposure_that_is_searched_is_over_the_metered_one_and_not_over_the_o
     searched = scene.renderer({"camera": {"exposure": [-2, 2]}}, resolution=16, denoise="none")
     plain = scene.renderer({"camera": {"roll": [-1, 1]}}, resolution=16, denoise="none")
     assert torch.equal(searched(searched.start, seed=1, spp=2), plain(plain.start, seed=1, spp=2))
-
-
-def test_a_distance_that_is_set_does_not_follow_the_field_of_view() -> None:
-    near = load_description("mug", setting_values={"camera.distance": 2.0})
-    for scene, stays in ((near, True), (load_description("mug"), False)):
-        space = space_of(scene, camera={"fov": [20, 60]})
-        near_end, far_end = (space.inputs(torch.tensor([share]))["camera.to_world"][:3, 3] for share in (0.0, 1.0))
-        assert torch.allclose(near_end, far_end) is stays
 
 
 # ---- sweeps ---------------------------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from advsearch.controls import corruption
 from advsearch.controls.corruption import (
     CORRUPTION_NAMES,
     STEPPED_CORRUPTIONS,
-    CorruptionControl,
     apply_corruption,
     filters,
 )
@@ -137,15 +136,6 @@ def test_poisson_numbers_are_those_of_the_distribution() -> None:
     assert float(sample_poisson(torch.zeros(9), torch.linspace(0.0, 0.9999, 9)).max()) == 0.0
 
 
-def test_impulse_noise_has_the_slope_of_its_average() -> None:
-    image, weights = scenery(), scenery().flip(0) - 0.5
-    at = torch.tensor(3.5, requires_grad=True)
-    (apply_corruption(image, "impulse_noise", at) * weights).sum().backward()
-    gain = filters.IMPULSE[3][0] - filters.IMPULSE[2][0]
-    assert at.grad is not None
-    assert float(at.grad) == pytest.approx(float((gain * (0.5 - image) * weights).sum()), abs=4.0)
-
-
 def test_a_point_out_of_focus_is_a_disc() -> None:
     point = torch.zeros(224, 224, 3)
     point[100, 100] = 1.0
@@ -190,16 +180,3 @@ def test_stepped_corruptions_round_the_severity_and_slope_between_the_steps(whic
     seen.sum().backward()
     step = apply_corruption(image, which, number(3.0)) - apply_corruption(image, which, number(2.0))
     assert at.grad is not None and float(at.grad) == pytest.approx(float(step.sum()), abs=0.05)
-
-
-def test_a_bound_control_corrupts_the_picture_and_says_how(scene: SceneDescription) -> None:
-    bound = CorruptionControl(which=["contrast", "jpeg"], seed=7).bind(scene)
-    image = scenery()
-    assert torch.equal(bound.apply_to_image(bound.start, image), image)
-    u = torch.tensor([0.9, 0.46], requires_grad=True)
-    assert torch.equal(bound.apply_to_image(u, image).detach(), apply_corruption(image, "jpeg", number(2.0)))
-    said = bound.describe(u)
-    assert said["corruption.which"] == {"value": "jpeg", "unit": "name"}
-    assert said["corruption.severity"]["value"] == pytest.approx(2.3)
-    assert said["corruption.applied"] == {"value": 2.0, "unit": "1"}
-    assert bound.describe(torch.tensor([0.1, 0.46]))["corruption.applied"]["value"] == pytest.approx(2.3)

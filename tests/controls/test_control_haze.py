@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.haze import DEFAULT_DENSITY, MIN_RADIUS, HazeControl
+from advsearch.controls.haze import MIN_RADIUS, HazeControl
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world
@@ -95,16 +95,6 @@ def test_the_adjoint_agrees_with_differences(density: float, steps: dict[str, tu
             for way in (1.0, -1.0)
         )
         assert found[name] == pytest.approx((above - below) / (2.0 * step), rel=tolerance), name
-
-
-def test_it_starts_without_haze_unless_its_density_is_not_searched() -> None:
-    def density(control: HazeControl) -> float:
-        bound = control.bind(plain())
-        return float(bound.inputs(bound.start)["haze.density"])
-
-    assert density(HazeControl()) == 0.0
-    assert density(HazeControl(red=[0.5, 1])) == pytest.approx(DEFAULT_DENSITY)
-    assert density(HazeControl(red=[0.5, 1], density=0.4)) == pytest.approx(0.4)
 
 
 def test_camera_and_object_are_inside() -> None:

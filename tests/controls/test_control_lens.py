@@ -63,19 +63,6 @@ def test_a_dot_mixes_light_by_the_published_profile() -> None:
         )
 
 
-def test_a_dot_is_round_in_a_picture_that_is_not_square() -> None:
-    seen = draw_dots(torch.ones(60, 120, 3), values(red=0.0, green=0.0, blue=0.0, radius=0.25))[..., 0]
-    torch.testing.assert_close(seen[29, 59 + 16], seen[29 + 16, 59], atol=1e-5, rtol=0)
-    assert float(seen[29, 59]) < 0.1 and float(seen[29, 0]) > 0.99
-
-
-def test_later_dots_lie_over_earlier_ones() -> None:
-    two = values(x=[0.5, 0.5], y=[0.5, 0.5], radius=[0.4, 0.4], red=[1.0, 0.0], green=[0.0, 1.0], blue=[0.0, 0.0])
-    two["opacity"] = torch.tensor([1.0, 1.0])
-    middle = draw_dots(torch.full((33, 33, 3), 0.5), two)[16, 16]
-    torch.testing.assert_close(middle, torch.tensor([0.0, 1.0, 0.0]), atol=2e-2, rtol=0)
-
-
 def test_the_derivatives_are_those_of_differences() -> None:
     image = 0.2 + 0.6 * random_picture(5, 7).double()
     inside = [[0.3, 0.6], [0.45, 0.7], [0.2, 0.35], [0.3, 0.8], [0.2, 0.6], [0.7, 0.4], [0.4, 0.7], 1.7]

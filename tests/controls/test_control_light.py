@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.light import DEFAULT_POWER, LightControl, compute_metered_irradiance
+from advsearch.controls.light import LightControl, compute_metered_irradiance
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
@@ -68,17 +68,6 @@ def test_size_changes_radiance_and_not_power(scene: SceneDescription) -> None:
     assert torch.allclose(small["light.radiance"] * 0.1**2, large["light.radiance"] * 0.4**2)
     assert float(small["light.ball"][0, 0]) == pytest.approx(0.05)
     assert float(large["light.ball"][2, 2]) == pytest.approx(0.2)
-
-
-def test_it_starts_dark_unless_its_power_is_not_searched(scene: SceneDescription) -> None:
-    def power(**settings: Any) -> float:
-        bound = LightControl(**settings).bind(scene)
-        return float(bound.values(bound.start)["power"])
-
-    assert power() == 0.0
-    assert power(power=[1, 50]) == 1.0
-    assert power(x=[-1, 1]) == DEFAULT_POWER
-    assert power(x=[-1, 1], power=2) == 2.0
 
 
 @pytest.mark.medium

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,11 +17,8 @@ from advsearch.controls.material import (
     make_covering,
     make_tile,
 )
-from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, translate_mesh
-from advsearch.scene.mitsuba_backend.variant import mi
 from advsearch.scene.raster import rasterize_charts
 
 BASE_COLOR = "object.base_color"
@@ -102,13 +98,6 @@ def test_a_named_material_brings_its_numbers_and_given_ones_win(scene: SceneDesc
     assert float(own["object.roughness"]) == float(steel["object.roughness"]) == pytest.approx(0.77)
     assert not torch.equal(own[BASE_COLOR].mean(), steel[BASE_COLOR].mean())
     assert bound.describe(torch.tensor([0.75]))["material.which"] == {"value": "steel", "unit": "name"}
-
-
-def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:
-    """Mitsuba makes them one where it may, so that both would change."""
-    made = translate_mesh(replace(scene.meshes["object"], material=Material()), IDLE_LOBES).plugins["object"]
-    keys = mi.traverse(made).keys()
-    assert [one for one in ("clearcoat", "sheen") if not any(key.endswith(f".{one}.value") for key in keys)] == []
 
 
 # ---- rendered -------------------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from advsearch.errors import UnknownNameError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import rasterize_charts
 
 EIGHT_BIT = 1e-4
 """Colours may differ by this much after the way to linear values and back."""
@@ -93,28 +92,6 @@ def test_a_palette_repaints_what_resembles_its_colour() -> None:
     assert float((painted[4, 2] - torch.tensor([0.3, 0.7, 0.2])).abs().max()) < 0.1
     assert float((painted[4, 6] - image[4, 6]).abs().max()) < 0.1
     assert float(painted[0, 0, 0]) < float(painted[4, 2, 0])  # the shade is still darker than the rest
-
-
-def test_the_palette_is_that_of_the_surface_and_never_by_chance(scene: SceneDescription) -> None:
-    own = torch.from_numpy(scene.object.base_color.copy())
-    area = rasterize_charts(scene.object.mesh, len(own)).compute_areas()
-    first = compute_palette(own, area, 6)
-    assert torch.equal(first, compute_palette(own, area, 6)) and first.shape == (6, 3)
-    cream, blue = torch.tensor([0.90, 0.85, 0.78]), torch.tensor([0.14, 0.37, 0.58])
-    for wanted in (cream, blue):
-        assert float((first - wanted).norm(dim=1).min()) < 0.08
-    apart = torch.cdist(first, first) + torch.eye(6)
-    assert float(apart.min()) > 0.02
-
-
-def test_waves_are_smooth_and_few(scene: SceneDescription) -> None:
-    bound = TextureControl(form="waves", waves=4, epsilon=0.1, resolution=64).bind(scene)
-    assert len(bound.start) == 4 * 4 * 3
-    u = torch.rand(bound.start.shape, generator=torch.Generator().manual_seed(2))
-    change = texels(bound, u) - texels(bound, bound.start)
-    inside = (texels(bound, u) > 0.01) & (texels(bound, u) < 0.99)
-    steps = (change[1:] - change[:-1]).abs()[(inside[1:] & inside[:-1])]
-    assert float(change.abs().max()) > 0.05 and float(steps.max()) < 0.03
 
 
 def part(scene: SceneDescription) -> MeshPart:

@@ -19,10 +19,7 @@ from advsearch.controls import CameraControl, EnvironmentControl
 from advsearch.controls.base import NumberControl
 from advsearch.controls.ranges import DistributionRange
 from advsearch.distributions import distribution_to_setting
-from advsearch.engine.loading import controls_to_settings, list_session_only_controls, load_scene, make_controls
-from advsearch.errors import InputError
-from advsearch.questions.attack.carry_out import make_attack_controls
-from advsearch.questions.attack.settings import AttackConfig
+from advsearch.engine.loading import load_scene
 
 MUG = load_scene("mug").description
 NORM = {"distribution": "norm", "loc": 30.0, "scale": 10.0}
@@ -131,48 +128,3 @@ def test_weights_are_shares(weights: dict[str, float], counts: dict[str, int]) -
     assert bound.groups[0].options == size if len(counts) > 1 else True
     places = (torch.arange(size) + 0.5) / size
     assert Counter(bound.describe(one[None])["environment.which"]["value"] for one in places) == counts
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (Normal(torch.zeros(2), 1.0), "distribution norm: expected one of a single number"),
-        (stats.poisson(3), "distribution poisson: expected one of real numbers, got one of whole ones"),
-        ({"distribution": "norm", "loc": float("nan")}, r"got norm\(loc=nan\)"),
-        (lambda share: -share, "camera.azimuth"),
-        (lambda share: 1e9, "camera.azimuth"),
-        ({"distribution": "nrom"}, "'nrom'"),
-        ({"distribution": "norm", "sigma": 3}, "expected {distribution: norm} with numbers for loc, scale"),
-        ({"distribution": "norm", "loc": 3600, "scale": 9}, "50 % of norm.* lies outside of -3600 to 3600"),
-        ({"distribution": "from Python", "name": "f"}, "drawn by f, which only the Python session .* pass it again"),
-        ({"choices": [1, 2], "weights": [1]}, "expected a weight of at least 0 for each of 2 values"),
-        ({1: 1e-6, 2: 1.0}, "camera.azimuth"),
-        ([350, 10], r"write \[-10, 10\] for the 20 degrees from 350 through 0 to 10, or \[10, 350\] for the other 340"),
-    ],
-)
-def test_what_is_no_distribution_is_told(given: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        CameraControl(azimuth=given)
-
-
-def test_a_search_refuses_what_says_how_likely_values_are() -> None:
-    given = {"camera": {"azimuth": NORM}}
-    config = AttackConfig(object="mug", controls=given)
-    with pytest.raises(InputError, match=r"camera\.azimuth"):
-        make_attack_controls(config, given, {})
-    drawn = make_attack_controls(AttackConfig(object="mug", controls={"pose": {}}, over=given), {"pose": {}}, given)[1]
-    assert [one.name for one in drawn] == ["camera"]
-
-
-def test_a_run_says_what_only_python_has_and_repeats_the_rest() -> None:
-    over = {"camera": {"azimuth": Normal(30.0, 10.0), "elevation": lambda share: 20.0 + share}}
-    settings = controls_to_settings(over)
-    assert list_session_only_controls(over) == ["camera.elevation (drawn by <lambda>)"]
-    config = AttackConfig(object="mug", controls={"pose": {}}, over=settings)
-    assert config.over["camera"]["azimuth"] == NORM
-    elevation = config.over["camera"]["elevation"]
-    assert elevation == {"distribution": "from Python", "name": "<lambda>", "quantiles": [20.05, 20.5, 20.95]}
-    (control,) = make_controls(config.over)
-    bound = control.bind(MUG)
-    assert isinstance(bound, NumberControl)
-    assert float(bound.values(torch.tensor([0.5, 0.5]))["elevation"]) == pytest.approx(20.5, abs=1e-4)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ import advsearch
 from advsearch.cli.flags import make_config
 from advsearch.cli.main import _parse
 from advsearch.engine.gradients import make_smooth_loss
-from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
@@ -82,24 +80,6 @@ def test_a_plain_number_changes_recorded_renders(box: advsearch.Scene) -> None:
     shown = [float(renderer.radiance(torch.tensor([share]), 1, 16).mean()) for share in (0.0, 0.9, 0.0, 0.9)]
     assert shown[0] == shown[2] and shown[1] == shown[3] and abs(shown[0] - shown[1]) > 0.1 * shown[0]
     assert renderer.plan.groups[0].estimator == "differences"
-
-
-@pytest.mark.parametrize(
-    ("controls", "message"),
-    [
-        ({"mitsuba:red.reflektance.value": [0, 1]}, r"Did you mean 'red\.reflectance\.value'"),
-        ({f"mitsuba:{RED}": [0.9, 0.1]}, r"\[0\.9, 0\.1\] is reversed"),
-        ({"mitsuba:floor.to_world": [0, 1]}, "expected a number or a colour, and Mitsuba has a AffineTransform4f"),
-        ({f"mitsuba:{RED}": {}}, "expected a range, as in mitsuba:red"),
-        ({f"mitsuba:{RED}": [0, 1], "mitsuba": {RED: [0, 1]}}, "each of Mitsuba's names once"),
-        ({f"mitsuba:{RED}": 0.5}, r"every parameter is fixed.* such as mitsuba:KEY=\[0\.2, 0\.8\]"),
-        ({f"mitsuba:{RED}": {"choices": [0.1, 0.9]}}, rf"because it is a colour; .* such as mitsuba:{RED}\.red"),
-        ({f"mitsuba.{RED}": {}}, "expected a range, as in mitsuba:red"),
-    ],
-)
-def test_what_cannot_be_varied_is_said(box: advsearch.Scene, controls: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        box.renderer(controls, resolution=SIZE)
 
 
 def test_the_command_line_gathers_ranges_by_key() -> None:

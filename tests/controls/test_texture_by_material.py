@@ -15,7 +15,6 @@ from trimesh.visual.material import PBRMaterial
 
 import advsearch
 from advsearch.controls import make_control, make_space
-from advsearch.engine.judging import mean_variation, printable_distance
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.raster import find_exclusive_texels, find_read_texels, look_up_texture
@@ -124,19 +123,6 @@ def linear_to_display(color: Sequence[float]) -> np.ndarray:
     return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
 
 
-def test_materials_of_one_colour_are_told_apart_too(tmp_path: Path) -> None:
-    """Each has the whole unit square for itself in the file, as exporters write it, so that it is unwrapped anew."""
-    lines = ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
-    for number, name in enumerate(("left", "right")):
-        x = 2 * number
-        lines += [f"v {x} 0 0", f"v {x + 1} 0 0", f"v {x + 1} 1 0", f"v {x} 1 0", f"usemtl {name}"]
-        lines.append("f " + " ".join(f"{4 * number + corner}/{corner}" for corner in (1, 2, 3, 4)))
-    (tmp_path / "two.obj").write_text("mtllib two.mtl\n" + "\n".join(lines) + "\n")
-    (tmp_path / "two.mtl").write_text("newmtl left\nKd 0.2 0.4 0.6\nnewmtl right\nKd 0.2 0.4 0.6\n")
-    mesh = import_object(tmp_path / "two.obj").mesh
-    assert [find_exclusive_texels(mesh, faces, (256, 256))[1] for faces in mesh.materials.values()] == [1.0, 1.0]
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_the_texels_that_lookups_read_are_all_there(seed: int) -> None:
     """Against lookups at many random places in a triangle; some have corners on texel centres."""
@@ -215,16 +201,3 @@ def test_materials_beside_each_other_on_one_picture_share_no_texel(tmp_path: Pat
 
 
 # ---- what takes part in a search -------------------------------------------------------------------------------------
-
-
-def test_print_terms_count_what_is_painted() -> None:
-    """A fourth channel leaves pixels out, and the steps to and from them."""
-    colors = torch.full((4, 5, 3), 0.5)
-    colors[:2, 2] = 0.9
-    colors[3] = torch.rand(5, 3)
-    where = torch.zeros(4, 5, 1)
-    where[:2, :3] = 1.0
-    masked = torch.cat([colors, where], dim=-1)
-    assert float(printable_distance(masked)) == pytest.approx(float(printable_distance(colors[:2, :3]))) == 0.0
-    assert float(mean_variation(masked)) == pytest.approx(2 * 0.4 / 6)
-    assert float(mean_variation(torch.cat([colors, torch.ones(4, 5, 1)], dim=-1))) == float(mean_variation(colors))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +19,6 @@ from advsearch.engine.gradients import (
     measure_reference,
     restrict_plan,
 )
-from advsearch.errors import UnknownNameError
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.gradients import Group
@@ -194,31 +192,6 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
 # ---- settings of controls -------------------------------------------------------------------------------------------
 
 
-def test_naming_one_parameter_searches_only_that() -> None:
-    scene = load_scene("mug")
-    for asked, names in (
-        ({"pose": {"yaw": [0, 90]}}, ["pose.yaw"]),
-        (["pose.yaw", "pose.x"], ["pose.yaw", "pose.x"]),
-        ({"pose": {"yaw": 30}}, ["pose.pitch", "pose.roll", "pose.x", "pose.y", "pose.scale"]),
-        ({"far": {"kind": "pose", "yaw": [0, 90]}}, ["far.yaw"]),
-        (["light:near.power"], ["near.power"]),
-    ):
-        render = scene.renderer(asked, resolution=16)
-        assert [one.name for one in render.plan.groups] == names
-    with pytest.raises(UnknownNameError, match="unknown parameter of control pose 'yow'"):
-        scene.renderer(["pose.yow"], resolution=16)
-
-
-@pytest.mark.medium
-def test_the_start_is_the_scene_as_it_is() -> None:
-    scene = load_scene("mug")
-    plain = scene.renderer({"texture": {"resolution": 256}}, resolution=32, denoise="none")
-    expected = plain(plain.start, seed=0, spp=64)
-    for controls in (["pose"], ["camera"], ["environment"], ["pose", "camera", "environment"]):
-        render = scene.renderer(controls, resolution=32, denoise="none")
-        assert float((render(render.start, seed=0, spp=64) - expected).abs().mean()) < 2e-3, controls
-
-
 def test_a_rotation_vector_is_a_rotation_with_a_derivative_at_zero() -> None:
     from advsearch.scene.geometry import make_euler_rotation, make_vector_rotation
 
@@ -245,23 +218,3 @@ def test_a_lens_keeps_what_it_frames() -> None:
 
 
 # ---- how fast things move -------------------------------------------------------------------------------------------
-
-
-def azimuth_speed(**fixed: float) -> float:
-    """Pixels a degree of azimuth."""
-    scene = load_scene("mug", settings={name.replace("_", ".", 1): value for name, value in fixed.items()})
-    made = scene.renderer({"camera": {"azimuth": [30, 50]}}, resolution=SIZE, denoise="none")
-    return 1.0 / made.plan.groups[0].pixel / 20.0
-
-
-def test_the_camera_follows_what_is_seen_behind_the_object() -> None:
-    open_air = azimuth_speed(ground_size=0.0, camera_elevation=5.0)
-    focal = SIZE / 2.0 / math.tan(math.radians(35.0 / 2.0))
-    assert 1.0 <= open_air / math.radians(focal) <= 1.2  # what is far turns with the camera, faster at the edges
-    below = azimuth_speed(ground_size=0.0, camera_elevation=30.0)
-    assert below > 0.8 * math.radians(focal) * math.cos(math.radians(30.0))
-
-
-def test_what_the_ground_hides_is_not_followed() -> None:
-    hidden = azimuth_speed(ground_size=1000.0, camera_elevation=45.0)
-    assert hidden < 0.7 * azimuth_speed(ground_size=0.0, camera_elevation=45.0)

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.attacks.domain import NET, ProductIndex, SampleSequence, split_into_batches
+from advsearch.attacks.domain import NET, ProductIndex, SampleSequence
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.judging import make_domain
@@ -156,15 +156,6 @@ def test_digits_and_numbers_are_inverse(sizes: tuple[int, ...], data: st.DataObj
     assert product.index(digits) == index
 
 
-@pytest.mark.parametrize("first", [0, 3, 4, 9, 10, 11])
-def test_batches_are_those_of_one_who_started_at_the_beginning(first: int) -> None:
-    whole = [list(part) for part in split_into_batches(0, 10, 4)]
-    assert whole == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
-    rest = [list(part) for part in split_into_batches(first, 10, 4)]
-    assert [n for part in rest for n in part] == list(range(first, 10))
-    assert all(part in whole for part in rest[1:])
-
-
 @pytest.mark.parametrize("sampler", ["sobol", "random"])
 def test_a_draw_is_the_same_from_wherever_it_is_asked(sampler: str) -> None:
     numbers = [0, 1, 100, NET - 1, NET, NET + 5, 3 * NET + 7, 10**12]
@@ -252,19 +243,6 @@ def test_the_fast_way_says_what_the_control_says(scene: advsearch.Scene, control
     u = points.make_configurations(3, 10)
     for one, said in zip(u, points.describe_images(u, 3), strict=True):
         assert said == space.describe(one)
-
-
-def test_what_a_row_says_is_true_of_the_picture_that_its_model_was_shown() -> None:
-    wide = advsearch.load_model(Brightness(), labels=LABELS, input_size=(SIZE, 2 * SIZE), name="wide")
-    drawn: dict[str, Any] = {"camera": {}}
-    both = advsearch.sweep("mug", [model(), wide], controls=drawn, samples=2, trials=0)
-    alone = [
-        row.values["camera.distance"]
-        for one in (model(), wide)
-        for row in advsearch.sweep("mug", one, controls=drawn, samples=2, trials=0).rows()
-    ]
-    found = [row.values["camera.distance"] for row in both.rows()]
-    assert [found[0], found[2], found[1], found[3]] == alone and found[0] != found[1]
 
 
 def test_draws_stay_in_their_budget_and_cover_it(scene: advsearch.Scene) -> None:
@@ -596,13 +574,3 @@ def test_a_model_that_looks_is_told_from_one_that_does_not_really_rendered(tmp_p
     assert sum("may not be looking" in text for text in swept.summary.warnings) == 3
     row = next(iter(swept.rows()))
     assert set(row.metrics) == {f"{claim} {when}" for claim, names in CHANGES.items() for when in names.split(",")}
-
-
-def test_changes_of_a_stopped_sweep_are_counted_from_its_rows(tmp_path: Path) -> None:
-    asked: dict[str, Any] = {"trials": 0, "batch": 1, "run": tmp_path / "run", "must_change": "black"}
-    FakeRenderer.stops_at = 3
-    first = advsearch.sweep("mug", model(), {"pose.yaw": "0:360:6"}, **asked).summary
-    assert first.ending == "interrupted" and first.changes is not None and first.changes[0].configurations == 3
-    FakeRenderer.stops_at = None
-    (one,) = advsearch.sweep("mug", model(), {"pose.yaw": "0:360:6"}, **asked).summary.changes or []
-    assert (one.configurations, one.correct) == (6, 6 if one.row is None else one.correct)

@@ -13,9 +13,7 @@ import torch
 from torch import Tensor
 
 import advsearch
-from advsearch.errors import ModelError
 from advsearch.models import Model, load_model
-from advsearch.models.zoo import transformers as own
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -198,15 +196,6 @@ def test_a_prompt_that_is_read_both_ways_does_not_see_the_name(tmp_path: Path) -
             likely = network(**told).logits[0, -count - 1 : -1].log_softmax(dim=-1)
         asked = float(likely.gather(1, told["input_ids"][0, -count:, None]).sum())
         assert float(shown(model)[0, number]) == pytest.approx(asked, abs=1e-4)
-
-
-def test_weights_larger_than_the_memory_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = published(tmp_path / "net", llava())
-    told = tmp_path / "meminfo"
-    told.write_text("MemTotal: 99 kB\nMemAvailable: 10 kB\nSwapFree: 2 kB\n")
-    monkeypatch.setattr(own, "MEMORY_FILE", told)
-    with pytest.raises(ModelError, match=r"its weights take 5.*e-05 GB, and 1.23e-05 GB of memory are free"):
-        load_model(spec, labels=NAMES)
 
 
 def spoken(folder: Path, picture: Any, count: int) -> str:

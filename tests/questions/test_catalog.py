@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -13,24 +11,12 @@ from pathlib import Path
 import pytest
 
 import advsearch
-from advsearch import registry
-from advsearch.catalog import BUILT_INS, is_present
-from advsearch.experiment import Experiment
-from advsearch.settings import HEADER
+from advsearch.catalog import BUILT_INS
 
 PACKAGE = Path(advsearch.__file__).parent
 CORE = ("attack", "sweep", "render")
 REMOVABLE = [part for part in BUILT_INS if part.kind == "experiment" and part.name not in CORE]
 """Parts that are not removed, those in their modules included."""
-
-
-def test_every_part_of_the_catalog_is_there_and_is_what_it_says() -> None:
-    for part in BUILT_INS:
-        assert is_present(part.target.partition(":")[0]), part
-        assert not part.help.endswith("."), part
-    for name, experiment in registry.EXPERIMENTS.items():
-        assert isinstance(experiment, Experiment)
-        assert experiment.settings.command == name and experiment.result.command == name
 
 
 def copy_package(folder: Path, without: tuple[str, ...] = ()) -> None:
@@ -77,48 +63,3 @@ def test_without_all_removable_experiments_the_tool_works(tmp_path: Path) -> Non
     )
     assert attacked.returncode == 0, attacked.stderr
     assert (tmp_path / "runs" / "kept" / "report.html").is_file()
-
-
-SETUP = """from setuptools import setup
-
-setup(
-    name="advsearch-count",
-    version="1",
-    py_modules=["advsearch_count"],
-    entry_points={"advsearch.experiments": ["count = advsearch_count:count"]},
-)
-"""
-
-
-@pytest.mark.medium
-def test_the_experiment_of_the_docs_is_a_package_of_its_own(tmp_path: Path) -> None:
-    """The package is installed in a folder of the Python path; command, page and Python know the experiment."""
-    design = (Path(__file__).parents[2] / "docs" / "design.md").read_text()
-    (code,) = [block for block in re.findall(r"```python\n(.*?)```", design, re.DOTALL) if "@experiment" in block]
-    source, site = tmp_path / "source", tmp_path / "site"
-    source.mkdir()
-    (source / "advsearch_count.py").write_text(code)
-    (source / "setup.py").write_text(SETUP)
-    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*install, "--target", str(site), str(source)], check=True, capture_output=True)
-    for name in ("first", "second"):
-        (tmp_path / "runs" / name).mkdir(parents=True)
-        (tmp_path / "runs" / name / "run.yaml").write_text(HEADER)
-
-    def run(*words: str) -> str:
-        environment = {**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{PACKAGE.parent}"}
-        done = subprocess.run(
-            [sys.executable, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    assert "  count       count the files that runs have" in run("-m", "advsearch", "--help")
-    counted = run("-m", "advsearch", "count", "--runs", "first,second", "--json", "--run", "kept")
-    assert json.loads(counted)["files"] == {"first": 1, "second": 1}
-    assert "There are 2 files." in run("-m", "advsearch", "show", "kept")
-    repeated = run("-m", "advsearch", "run", "runs/kept/run.yaml", "runs=first", "--json", "--run", "again")
-    assert json.loads(repeated)["files"] == {"first": 1}
-    called = "import advsearch, inspect; from advsearch import count; print(inspect.signature(count)); "
-    python = run("-c", f"{called} print(count('first', run='third'), advsearch.load_run('third'))")
-    assert "(runs: 'str | Path'" in python and python.count("files={'first': 1}") == 2

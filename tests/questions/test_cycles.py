@@ -8,9 +8,7 @@ import os
 import stat
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ import advsearch
 from advsearch.questions.replay import cycles
 from advsearch.questions.replay.cycles import BlenderError, Cycles
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.parts import HazePart
 from advsearch.scene.renderer import Renderer
 from advsearch.trust.programs import BLENDER
 
@@ -111,17 +108,3 @@ def test_what_blender_can_not_render_is_said(
     inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
     with pytest.raises(BlenderError, match=words):
         by_cycles(renderer.scene.definition[0]).radiance(inputs, 0, 1)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"parts": (HazePart("haze", 3.0),)}, "the scene has haze, which is not carried over"),
-        ({"backdrop": True, "thin_lens": True}, "a lens, a plain background"),
-    ],
-)
-def test_what_is_not_carried_over_is_said(
-    folder: Path, renderer: Renderer, changes: dict[str, Any], words: str
-) -> None:
-    with pytest.raises(BlenderError, match=words):
-        by_cycles(replace(renderer.scene.definition[0], **changes))

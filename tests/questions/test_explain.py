@@ -16,17 +16,13 @@ from advsearch.cli.main import main
 from advsearch.questions.explain import renders as explaining
 from advsearch.questions.explain.importance import find_importance
 from advsearch.questions.explain.result import ExplainResult
-from advsearch.questions.explain.sweeps import is_settable, make_sweep_along, make_sweep_inside
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.stored import StoredSweep
-from advsearch.rules import (
-    RuleCondition,
-)
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.summary import read_result
 from samples import sweep
-from stored_sweeps import described, seen
+from stored_sweeps import described
 
 HIGH = 60.0
 
@@ -133,24 +129,6 @@ def test_of_predictions_without_a_law_it_is_said_that_nothing_decides_and_how_ma
         rule.rows > 600 and f"About {rule.rows:,} rows with these shares would tell it" in said
     )
     assert all(one.interval[0] == 0.0 < one.interval[1] < 0.05 for one in kept.importance)
-
-
-def test_numbers_that_follow_from_others_and_axes_are_not_asked_for_again() -> None:
-    """A row of a drive has its distance, which follows from the time; a control may be drawn beside an axis of it."""
-    row: dict[str, float | str] = {
-        "object": "mug", "environment": "noon", "model": "reference", "path.time": 1.0, "path.distance": 4.0,
-    }  # fmt: skip
-    values = {"path.time": [0.0, 1.0], "path.distance": [5.0, 4.0], "camera.fov": [30.0, 40.0]}
-    table = seen(values, np.array([False, True]))
-    drive = SweepConfig(object="mug", path="approach", fps=1.0, controls={"path": {"reach": 8.0}})
-    made = make_sweep_along(drive, row, "path.time", table, 3)
-    assert list(made.grid) == ["path.time"] and not is_settable(drive, "path.distance")
-    assert made.controls == {"path": {"reach": 8.0}}, "as far as the drive went"
-    conditions = tuple(RuleCondition(name, low=0.0) for name in values)
-    assert make_sweep_inside(drive, table, conditions, 20, 7).controls == {"path": {"reach": 8.0}}
-    beside = SweepConfig(object="mug", grid={"camera.fov": [30.0, 40.0]}, controls={"camera": {"roll": [-5, 5]}})
-    inside = make_sweep_inside(beside, table, (RuleCondition("camera.fov", low=35.0),), 20, 7)
-    assert inside.controls == {"camera": {"roll": [-5, 5]}} and inside.grid == {"camera.fov": [40.0]}
 
 
 class Read:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import shutil
 import tarfile
-import weakref
 from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,18 +16,14 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain
-from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.models import load_model
-from advsearch.questions.attack.carry_out import make_problem_on
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.carry_out import make_share
 from advsearch.questions.harden.lessons import (
     IMAGE_DIRECTORY,
     Lesson,
     RenderedLesson,
     TextureLesson,
-    make_lessons,
     negative_log_likelihood,
     sample_configurations,
     save_lesson_images,
@@ -89,23 +83,6 @@ def test_half_of_what_is_tried_has_numbers_at_the_ends_of_their_ranges() -> None
     assert set(drawn[:, 3].tolist()) == {float(value) for value in torch.tensor([1 / 6, 0.5, 5 / 6])}
 
 
-def test_lessons_of_textures_let_go_of_their_scene() -> None:
-    """There are hundreds of them; what is left says the pictures, and takes no renderer."""
-    settings = {"resolution": (16, 16), "controls": {"texture": {"resolution": 4}}}
-    config = AttackConfig(object="mug", **settings, over={"camera": {}, "environment": {}}, measure="no")
-    model = load_model("reference")
-    problem = make_problem_on(config, load_scene("mug"), model)
-    (lesson,), plain = make_lessons(problem, 1, 0), [Lesson((0,), torch.zeros((16, 16, 3), dtype=torch.uint8))]
-    scene = weakref.ref(problem.renderer.scene)
-    del problem
-    gc.collect()
-    assert scene() is None and isinstance(lesson, TextureLesson)
-    search_worse_images([lesson], model, 2)
-    assert lesson.worst_image.shape == (16, 16, 3) and not torch.equal(lesson.worst_image, lesson.plain_image)
-    for views, steps in ((6, 2), (2, 2), (1, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and 6 / views of this
-        assert course_of(student(), epochs=2, views=views).count_steps([lesson, *plain * 20]) == steps
-
-
 # ---- the split ------------------------------------------------------------------------------------------------------
 
 
@@ -140,20 +117,6 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
 
 
 # ---- what is trained ------------------------------------------------------------------------------------------------
-
-
-def test_the_model_sees_the_weights_of_a_copy_as_they_change() -> None:
-    given = Colours()
-    made = make_trainable(load_model(given, labels=LABELS, input_size=16))
-    image = torch.rand((1, 16, 16, 3), generator=torch.Generator().manual_seed(0))
-    before = made.model(image)
-    assert torch.allclose(made.logits(image), before, atol=0.02)  # bfloat16, where the processor has it
-    assert torch.equal(made.logits(image), made.evaluation_logits(image))
-    with torch.no_grad():
-        made.parameters()[-1].add_(1.0)
-    assert torch.allclose(made.model(image), before + 1.0)
-    assert not made.model(image).requires_grad and made.logits(image).requires_grad
-    assert torch.equal(given.last.bias, Colours().last.bias)
 
 
 # ---- lessons and training -------------------------------------------------------------------------------------------
@@ -231,19 +194,6 @@ def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pyt
     searched = sorted(one[:2] for one in seen if one[2])
     trained = sorted(one[:2] for one in seen if not one[2])
     assert sum(len(owners) for owners, _ in searched) == 9 and searched == trained
-
-
-def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
-    made, asked = student("last"), list[int]()
-
-    def optimiser(parameters: object) -> torch.optim.Optimizer:
-        asked.append(1)
-        return torch.optim.SGD(parameters, 0.5)  # type: ignore[arg-type]
-
-    further = [(torch.stack([coloured(2, 0.4, n) for n in range(8)]), torch.full((8,), 9))]
-    course_of(made, optimiser, further, epochs=10).round(1, pupils())
-    assert asked == [1]
-    assert (made.model(further[0][0]).argmax(dim=1) == 9).float().mean() > 0.5  # only the batches beside say 9
 
 
 # ---- the data set ---------------------------------------------------------------------------------------------------

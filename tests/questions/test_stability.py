@@ -14,7 +14,6 @@ from advsearch.cli.main import main
 from advsearch.questions.stability import scenes as suite
 from advsearch.questions.stability.result import (
     ALL_CASES,
-    FELL_SHORT,
     OK,
     Case,
     Outcome,
@@ -61,16 +60,6 @@ def made(outcome: Outcome | Exception, name: str = "made") -> Case:
     return Case(name, "noise", "It holds.", False, find)
 
 
-def test_a_row_has_what_the_design_lists() -> None:
-    numbers = [check_range("a", 1.0, most=2.0), check_range("b", 5.0, most=2.0)]
-    outcome = Outcome(numbers, relative_error=0.25, ending="stalled", measured={"c": 3.0})
-    row: Any = made(outcome).run().to_dict()
-    wanted = {"case": "made", "group": "noise", "finite": True, "relative_error": 0.25, "ending": "stalled"}
-    assert {**row, **wanted} == row
-    assert (row["status"], row["holds"], row["decides"]) == (FELL_SHORT, "It holds.", "b: 5 (expected at most 2)")
-    assert row["seconds"] >= 0.0 and row["measured"] == {"c": 3.0}
-
-
 # ---- the command ----------------------------------------------------------------------------------------------------
 
 
@@ -86,14 +75,6 @@ def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     bad = replace(made(Outcome([check_range("a", 3.0, most=2.0)]), "bad"), group="stiff")
     monkeypatch.setattr(suite, "ALL_CASES", (good, bad))
     yield
-
-
-@pytest.mark.usefixtures("two_cases")
-def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stability", "--quiet", "--json"]) == 3
-    said = json.loads(capsys.readouterr().out)
-    assert (said["schema"], said["command"]) == (1, "stability")
-    assert [(row["case"], row["status"]) for row in said["rows"]] == [("good", OK), ("bad", FELL_SHORT)]
 
 
 def uncalled() -> Outcome:

@@ -16,7 +16,7 @@ from advsearch.report.wording import (
     format_mistake_participle,
     format_prediction,
 )
-from advsearch.tasks import Mark, Prediction
+from advsearch.tasks import Mark
 
 
 def where(picture: npt.NDArray[np.float32], colour: tuple[int, int, int]) -> npt.NDArray[np.bool_]:
@@ -56,20 +56,6 @@ def test_a_mask_is_tinted_and_the_true_one_outlined() -> None:
 
 
 # ---- the same in words ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("task", "answer", "text"),
-    [
-        ("classification", Prediction("vase", 3, 0.9999999), "vase, over 99.9 %"),
-        ("detection", Prediction("cup", 46, 0.762), "cup (score 0.76)"),
-        ("segmentation", Prediction("background", 0, 0.031),
-         "accuracy over the object's pixels 3.1 %, most often background"),
-        
-    ],
-)  # fmt: skip
-def test_an_answer_in_words(task: str, answer: Prediction, text: str) -> None:
-    assert format_prediction(task, answer) == text
 
 
 def said(label: str, probability: float, **payload: object) -> SimpleNamespace:

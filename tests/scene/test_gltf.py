@@ -134,18 +134,6 @@ def test_an_emissive_texture_alone_is_dark_and_mask_cuts_at_a_half(tmp_path: Pat
 # --- geometry ----------------------------------------
 
 
-def test_faces_without_normals_are_flat_and_others_stay_smooth(tmp_path: Path) -> None:
-    roof = np.array([[0, 0, 0], [1, 0, 0.2], [2, 0, 0], [0, 1, 0], [1, 1, 0.2], [2, 1, 0.0]])
-    faces = np.array([0, 1, 4, 0, 4, 3, 1, 2, 5, 1, 5, 4])
-    up = np.tile([0.0, 0.0, 1.0], (6, 1))
-    for normals, spread in ((None, 0.19), (up, 0.0)):
-        file = File()
-        file.primitive(roof, faces, attributes={} if normals is None else {"NORMAL": file.values(normals)})
-        asset = import_object(file.write(tmp_path), up="z")
-        sideways = asset.mesh.normals[asset.mesh.faces][:, :, 0]
-        assert np.abs(sideways) == pytest.approx(np.full((4, 3), spread), abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("positions", "kind", "normalized"),
     [

@@ -11,7 +11,6 @@ import torch
 import advsearch
 from advsearch.controls import Space
 from advsearch.engine.loading import Scene, fit_camera, make_renderer
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.headlamps import CUT_OFF, EGO_LAMP_POSITION, HEADLAMP_CANDELA, TAILLAMP_CANDELA, compute_candela
@@ -193,15 +192,3 @@ def test_a_texture_in_a_beam_has_the_gradient_of_differences() -> None:
     with torch.no_grad():
         high, low = (renderer(at + way * step, 1, 2048).mean() for way in (1.0, -1.0))
     assert float(slope.sum()) == pytest.approx(float(high - low) / 0.1, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("words", "error", "said"),
-    [
-        ({"things": "car@12,3.5,lamps=medium"}, UnknownNameError, "low"),
-        ({"environment": "street", "object.lamps": "low"}, InputError, "no unit"),
-    ],
-)
-def test_what_cannot_shine_is_refused(words: dict[str, Any], error: type[InputError], said: str) -> None:
-    with pytest.raises(error, match=said):
-        scene(**words)

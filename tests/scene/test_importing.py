@@ -22,7 +22,7 @@ from advsearch.scene import library, surface_parts
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.objects import guess_up, import_object
-from advsearch.scene.importing.pictures import average_area, load_display_image
+from advsearch.scene.importing.pictures import load_display_image
 from advsearch.scene.importing.texture import sample_colors, sample_texture
 from fuzz.pictures import plain_png
 from glb_files import join_glb, split_glb
@@ -356,15 +356,6 @@ def test_large_textures_are_averaged_down(tmp_path: Path, width: int, height: in
     assert got.shape == (*expected, 3)
     # black and white lines average to half of white's light, not to half of its code
     assert srgb_to_linear(got).mean() == pytest.approx(0.5, abs=1e-3)
-
-
-def test_area_average_is_exact() -> None:
-    image = np.random.default_rng(0).random((7, 9, 2), dtype=np.float32)
-    got = average_area(image, 3, 4)
-    assert got.mean(axis=(0, 1)) == pytest.approx(image.mean(axis=(0, 1)), rel=1e-6)
-    weights = np.array([1.0, 1.0, 1 / 3])
-    expected = np.einsum("i,ij,j->", weights, image[:3, :3, 0], np.array([1.0, 1.0, 0.25])) / (7 / 3 * 9 / 4)
-    assert got[0, 0, 0] == pytest.approx(expected, rel=1e-6)
 
 
 # --- materials ----------------------------------------

@@ -260,15 +260,6 @@ def _at(uv: np.ndarray) -> object:
     return found
 
 
-@pytest.mark.parametrize("controls", ["environment.rotation", "sky", {"environment": {"which": "noon"}}])
-def test_two_environments_clash(folder: Path, controls: object) -> None:
-    path = written(folder, "lit", SHAPES["flat"])
-    with pytest.raises(InputError, match="`environment=studio`"):
-        advsearch.load_scene(f"{path}#thing", environment="studio")
-    with pytest.raises(InputError, match="`controls`"):
-        advsearch.load_scene(f"{path}#thing").renderer(controls, resolution=16)  # type: ignore[arg-type]
-
-
 def test_a_surface_that_grows_by_its_references_is_refused(folder: Path) -> None:
     levels = "".join(
         f'<bsdf type="blendbsdf" id="b{n}"><float name="weight" value="0.5"/>' + f'<ref id="b{n + 1}"/>' * 2 + "</bsdf>"

@@ -7,9 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls import make_control, make_space
-from advsearch.errors import InputError
-from advsearch.scene.description import load_description
 from advsearch.scene.people import PARAMETERS, Person, load_body
 
 PERSON = Person(load_body())
@@ -137,12 +134,3 @@ def test_gradients_of_every_number_are_those_of_differences() -> None:
         with torch.no_grad():
             rise = float((weight * (person.pose(up) - person.pose(down))).sum()) / (2 * step)
         assert float(slope) == pytest.approx(rise, rel=1e-3, abs=1e-3), name
-
-
-def test_the_control_refuses_what_has_no_joints_and_angles_past_their_limits() -> None:
-    with pytest.raises(InputError, match="no joints"):
-        make_space([make_control("body")], load_description("mug"))
-    with pytest.raises(InputError, match=r"body\.left_elbow"):
-        make_control("body", {"left_elbow": [0, 170]})
-    space = make_space([make_control("body", {"left_elbow": [0, 140]})], load_description("person"))
-    assert len(space.start) == 1 and 40 < float(space.describe(space.start)["body.mass"]["value"]) < 90

@@ -82,9 +82,6 @@ def textures(folder: Path) -> None:
         Image.new("RGB", (4, 4), color).save(folder / f"{name}.png")
 
 
-"""Colours of four vertices."""
-
-
 def test_colors_of_faces_and_of_both(tmp_path: Path) -> None:
     colors = (*FACES, "uchar red", "uchar green", "uchar blue")
     faces: Rows = [[[0, 1, 2], 255, 0, 0], [[0, 2, 3], 0, 0, 255]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -206,18 +205,6 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
     found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]
     assert found.smallest is not None and found.smallest.epsilon is not None and found.smallest.searches > 1
     assert made == 1 and guesses >= 5
-
-
-def test_a_guess_learns_how_optimistic_a_prediction_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scores of 4 on average, 19 of 20 of them over 3.1; a prediction of 5 was 1.9 too good."""
-    monkeypatch.setattr(searching.Transport, "_predict_score", lambda self, u: float(u))
-    problem: Any = None
-    made = searching.Transport(problem, 1)
-    assert made.is_likely_success(torch.tensor(0.1)) and not made.is_likely_success(torch.tensor(-0.1))
-    made.update_score_bias(torch.tensor(5.0), [3.5, 4.5] * 4)
-    for scores in ([1.0, 2.0], [math.nan] * 6):  # too few to say anything, or none
-        made.update_score_bias(torch.tensor(9.0), scores)
-    assert not made.is_likely_success(torch.tensor(1.7)) and made.is_likely_success(torch.tensor(2.0))
 
 
 @pytest.mark.medium

@@ -55,27 +55,6 @@ class Colours(nn.Module):
         return images.mean(dim=(2, 3))
 
 
-class AsLeRobot(nn.Module):
-    """A policy by the interface of LeRobot's: a queue of actions, and a `forward` that is for training."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.queue: list[Tensor] = []
-
-    def reset(self) -> None:
-        self.queue = []
-
-    def forward(self, batch: dict[str, Tensor]) -> Tensor:
-        raise AssertionError("this is a loss")
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor]) -> Tensor:
-        if not self.queue:
-            action = torch.cat([batch["observation.image"].mean(dim=(2, 3)), batch["observation.state"]], dim=1)
-            self.queue = [action, action + 1.0]
-        return self.queue.pop(0)
-
-
 def judged(**options: Any) -> Command:
     """A task after it has seen a clean action of 0.1 and -0.2."""
     task = Command(envelope=[0.5, 0.1], names="steer,gas", units="rad,", **options) if options else Command(
@@ -166,16 +145,6 @@ def test_a_policy_gets_pictures_and_a_state(tmp_path: Path) -> None:
     torch.testing.assert_close(again(pictures), 2.0 * expected)
     with pytest.raises(ModelError, match=r"cannot be called with pictures and a state of sped \(N, 1\)"):
         advsearch.load_model(TowardsBlue(), task=make_task({**ASKED, "state": {"sped": 2}}), input_size=SIDE)
-
-
-def test_a_policy_with_select_action_is_called_by_it_and_forgets_each_time() -> None:
-    task = make_task({"name": "command", "state": {"observation.state": [0.3, 0.4]}, "envelope": 0.1})
-    with pytest.warns(advsearch.models.ModelWarning, match="no gradient"):
-        model = advsearch.load_model(AsLeRobot(), task=task, input_size=8)
-    pictures = torch.rand(2, 8, 8, 3)
-    expected = torch.cat([pictures.mean(dim=(1, 2)), torch.tensor([[0.3, 0.4]] * 2)], dim=1)
-    for _ in range(3):
-        torch.testing.assert_close(model(pictures), expected)
 
 
 @pytest.mark.medium

@@ -120,16 +120,6 @@ def test_what_the_numbers_leave_open_is_asked_for() -> None:
     assert task.inferred_order == "boxes scores labels", "what suppression leaves comes by falling scores"
 
 
-def test_an_order_says_what_is_what() -> None:
-    first = read_detections(rows(*three(), "csb"), 1, "labels scores boxes")[0]
-    assert first["boxes"].tolist() == [CUP, BOWL] and first["labels"].tolist() == [0, 1]
-    boxes, scores, classes = three()
-    (second,) = read_detections((classes, scores, boxes), 1, "labels, scores, boxes")
-    assert second["scores"].tolist() == pytest.approx([0.8, 0.6])
-    with pytest.raises(InputError, match="order"):
-        Detection(order="scores boxes")
-
-
 def three() -> Rows:
     return torch.tensor([[CUP, BOWL]]), torch.tensor([[0.8, 0.6]]), torch.tensor([[0.0, 1.0]])
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +13,6 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import Query
-from advsearch.cli.main import main
 from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.engine.record import make_trial_row, read_judgement
 from advsearch.models import load_model
@@ -112,20 +108,3 @@ def test_rows_have_what_was_said_beside_the_words(home: Path) -> None:
     with Store(home / "runs/swept/results.sqlite", read_only=True) as store:
         margins = [row.margin for row in store.rows("sweep")]
     assert len({round(margin or 0.0) for margin in margins}) > 2, "the truth is another one in every configuration"
-
-
-def test_exports_and_show_have_it_too(
-    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(home)
-    for format in ("json", "csv"):
-        assert main(["export", "swept", "--format", format, "--kind", "sweep"]) == 0
-    text = capsys.readouterr().out
-    end = text.index("\n]\n") + 3
-    nested = [one["payload"] for one in json.loads(text[:end])]
-    assert nested[0]["boxes"] == [[nested[0]["column"], 0.0, 16.0, 16.0]]
-    assert [json.loads(one["payload"]) for one in csv.DictReader(io.StringIO(text[end:]))] == nested
-    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra `parquet`, which the set-up installs")
-    assert main(["export", "swept", "--kind", "sweep", "--out", "rows.parquet"]) == 0
-    table = parquet.read_table("rows.parquet").to_pylist()
-    assert [json.loads(one["payload"]) for one in table] == nested

@@ -15,7 +15,7 @@ import advsearch
 from advsearch.attacks.objective_functions import NEARBY
 from advsearch.attacks.objectives import get_objective
 from advsearch.cli.main import main
-from advsearch.errors import AdvsearchError, InputError
+from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.tasks import Facts
@@ -307,19 +307,3 @@ def test_a_sweep_counts_what_is_not_itself_any_more(
 
 
 # ---- wrong uses -----------------------------------------------------------------------------------------------------
-
-
-def test_what_is_wrong_with_references_is_said_in_a_sentence(folder: Path, model: Model, tmp_path: Path) -> None:
-    def said(references: Path, **options: Any) -> str:
-        with pytest.raises(AdvsearchError) as error:
-            Similarity(references=str(references), **options).on(model)
-        return str(error.value)
-
-    assert "(No such file or directory); check the path" in said(tmp_path / "none")
-    (tmp_path / "empty" / "bowl").mkdir(parents=True)
-    assert "got only bowl" in said(tmp_path / "empty")
-    (folder / "red" / "notes.txt").write_text("no picture")
-    assert "notes.txt: expected a picture file such as PNG" in said(folder)
-    (folder / "red" / "notes.txt").unlink()
-    (folder / "red" / "inner").mkdir()
-    assert "inner: expected a picture file such as PNG, got a directory" in said(folder)

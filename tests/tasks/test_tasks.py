@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,10 +13,8 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, get_objective
-from advsearch.cli.main import main
-from advsearch.errors import InputError, ModelError, UnknownNameError
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import load_model
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.tasks import TASKS, Classification, Facts, Prediction, Task, make_task
 
 LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 4.0], [2.0, 2.0, 0.0], [math.nan, 0.0, 1.0]])
@@ -43,28 +40,6 @@ def test_a_score_over_zero_is_a_success(task: Classification, scores: list[float
     assert [one.margin for one in found[:4]] == [2.0, -2.0, -4.0, 0.0], "whatever is sought"
     assert math.copysign(1.0, found[3].margin) == 1.0, "no -0.0"
     assert task.goal == goal
-
-
-@dataclass(frozen=True, kw_only=True)
-class Doubled(Classification):
-    """Says a lead of its own."""
-
-    def loss(self, output: Tensor, truth: tuple[int, ...]) -> Tensor:
-        return 2.0 * super().loss(output, truth)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Shifted(Classification):
-    """Says a success of its own."""
-
-    def score(self, output: Tensor, truth: tuple[int, ...]) -> Tensor:
-        return super().score(output, truth) + 1.0
-
-
-def test_a_task_with_a_loss_or_a_score_of_its_own_judges_by_it() -> None:
-    doubled, shifted = Doubled(labels=NAMED.labels), Shifted(labels=NAMED.labels)
-    assert [(one.score, one.margin) for one in doubled.judge(LOGITS[:2], (0,))] == [(-4.0, 4.0), (4.0, -4.0)]
-    assert [(one.score, one.margin) for one in shifted.judge(LOGITS[:2], (0,))] == [(-1.0, 2.0), (3.0, -2.0)]
 
 
 @pytest.mark.parametrize("logits", [[math.nan, 0.0, 1.0], [math.nan] * 3, [1.0, math.inf, 0.0], [math.inf, 0.0, 0.0]])
@@ -171,24 +146,6 @@ def test_its_score_is_what_is_maximised_where_nothing_else_is_said() -> None:
     assert get_objective("score", NAMED)(LOGITS[:2], images, (0,)).tolist() == [-2.0, 2.0]
 
 
-def test_a_model_of_a_task_answers_with_what_the_task_reads() -> None:
-    model = load_model(Level(), input_size=8, read=Yaw().reader)
-    assert model.labels == () and repr(model) == "Model('Level', 8 x 8 pixels)"
-    pictures = torch.rand(70, 8, 8, 3)
-    assert torch.allclose(model(pictures), 100.0 * pictures.mean(dim=(1, 2, 3))[:, None], atol=1e-3)
-    with pytest.raises(ModelError, match="one score is not enough"):
-        load_model(Level(), input_size=8)
-    with pytest.raises(ModelError, match="expected a tensor with 1 rows, one for each picture, got dict"):
-        load_model(Wrapped(), input_size=8, read=Yaw().reader)
-
-
-class Wrapped(nn.Module):
-    """Answers with a list in a dictionary, as detectors do."""
-
-    def forward(self, x: Tensor) -> dict[str, list[Tensor]]:
-        return {"boxes": [image[image > 0.5] for image in x]}
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(("tolerance", "right"), [(1e3, 2), (1e-3, 0)])
 def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: int) -> None:
@@ -223,15 +180,3 @@ def test_a_task_is_made_with_options(named: None) -> None:
     for option in ("minimise", "target", "labels", "named"):
         with pytest.raises(UnknownNameError, match="unknown option of task 'classification'"):
             make_task({option: True})
-
-
-@pytest.mark.medium
-def test_options_of_an_instance_are_kept_and_a_run_with_others_is_not_gone_on_with(named: None, tmp_path: Path) -> None:
-    network, run = load_model(Level(), input_size=8, read=Yaw().reader), tmp_path / "run"
-    given: dict[str, Any] = {"controls": {"pose": {"yaw": [0, 90]}}, "policy": "random", "steps": 2, "trials": 6}
-    given |= {"spp": 1, "denoise": "none", "resolution": 16, "verify_spp": 1, "measure": "no", "run": run}
-    advsearch.attack("mug", network, task={"name": "yaw", "tolerance": 1000}, **given)
-    assert AttackConfig.from_yaml(run / "run.yaml").task == {"name": "yaw", "tolerance": 1000}
-    with pytest.raises(InputError, match="task"):
-        advsearch.attack("mug", network, task=Yaw(tolerance=5.0), resume=True, **given)
-    assert main(["show", str(run)]) == 0

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.viewer.pages import write_page
 from stored_sweeps import make_sweep
 
 
@@ -57,13 +54,3 @@ def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match="not empty"):
         write_bundle([make_sweep(tmp_path / "a")], tmp_path)
-
-
-def test_the_page_is_made_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = make_sweep(tmp_path / "a")
-    before = (run / "report.html").read_text()
-    shutil.rmtree(run / "images", ignore_errors=True)
-    (run / "report.html").unlink()
-    assert write_page(run).read_text() == before
-    assert main(["view", str(run)]) == 0
-    assert capsys.readouterr().out.strip() == str(run / "report.html")

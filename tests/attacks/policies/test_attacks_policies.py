@@ -25,7 +25,6 @@ from advsearch.attacks import (
     Evaluation,
     Policy,
     Query,
-    Random,
     get_objective,
     make_policy,
     search,
@@ -136,18 +135,6 @@ def test_pgd_reaches_the_optimum_through_noise(kind: str, norm: str, d: int) -> 
     assert sum(values) / 3 >= 1 / RATIO
 
 
-def test_random_tries_every_option_of_a_discrete_choice() -> None:
-    domain = Domain(torch.tensor([0.1, 0.5]), (Block(1, options=5), Block(1)))
-    seen: list[float] = []
-
-    def evaluate(query: Query) -> Evaluation:
-        seen.append(float(query.u[0]))
-        return Evaluation(0.0, None, False)
-
-    search(partial(map, evaluate), domain, Random(), steps=60, seed=0, candidates=0)
-    assert sorted(set(seen)) == pytest.approx([0.1, 0.3, 0.5, 0.7, 0.9])
-
-
 # ---- how pgd steps
 
 
@@ -180,28 +167,6 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
         return Evaluation(float(query.number), torch.ones(4), False)
 
     assert search(partial(map, evaluate), climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
-
-
-def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
-    """A peak that only the first steps see; then the gradient leads away from it, downhill."""
-
-    def evaluate(query: Query) -> Evaluation:
-        return Evaluation(5.0 if query.number == 2 else -0.1 * query.number, torch.ones(2), False)
-
-    seen: list[Tensor] = []
-    domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
-    search(
-        partial(map, evaluate),
-        domain,
-        PGD(step_size=0.125, momentum=0.0),
-        steps=40,
-        seed=0,
-        candidates=0,
-        on_step=lambda record, u, evaluation: seen.append(u),
-    )
-    returned = [k for k in range(3, 40) if float(seen[k][0]) < float(seen[k - 1][0]) - 1e-6]
-    assert returned, "it never went back"
-    assert float((seen[returned[0]] - seen[2]).abs().max()) <= 0.4 * 0.125 + 1e-6
 
 
 def test_a_non_finite_objective_sends_pgd_back_with_half_the_step() -> None:
@@ -410,11 +375,3 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
 
 
 # ---- what policies had to do ----------------------------------------------------------------------------------------
-
-
-def told(policy: Policy[Any], objective: Callable[[int, Tensor], Evaluation], domain: Domain, steps: int) -> Any:
-    def evaluate(query: Query) -> Evaluation:
-        found = objective(query.number, query.u)
-        return found if query.gradient else replace(found, gradient=None)
-
-    return search(partial(map, evaluate), domain, policy, steps=steps, seed=1, candidates=0)

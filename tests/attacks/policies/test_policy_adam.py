@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 
 import pytest
@@ -10,7 +9,6 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Adam, Block, Domain, Evaluation, Query, search
-from advsearch.attacks.domain import compute_half_widths
 
 
 def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor]:
@@ -42,15 +40,6 @@ def test_the_first_step_is_a_share_of_half_the_range_of_every_block(size: float)
     assert move[:4].tolist() == pytest.approx([0.025, -0.025, 0.05, 0.05], abs=1e-6)
     assert float(move[4:].norm()) == pytest.approx(0.05, abs=1e-6)
     assert float(move[5] / move[4]) == pytest.approx(4 / 3, abs=1e-4)
-
-
-def test_half_widths_are_the_units() -> None:
-    domain = Domain(
-        torch.tensor([0.5, 0.95, 0.5, 0.5, 0.5, 0.5]),
-        (Block(2, "linf", 0.1), Block(2, "l2", 0.2), Block(1, low=0.2, high=0.8), Block(1, reach=0.1)),
-    )
-    expected = [0.1, 0.075, 0.2 / math.sqrt(2), 0.2 / math.sqrt(2), 0.3, 0.1]
-    assert compute_half_widths(domain).tolist() == pytest.approx(expected)
 
 
 def test_the_rate_falls_in_a_line() -> None:

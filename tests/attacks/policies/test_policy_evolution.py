@@ -21,11 +21,9 @@ from advsearch.attacks import (
     Evaluation,
     Policy,
     Query,
-    make_policy,
     search,
     seeded,
 )
-from advsearch.attacks.policies.evolution import MAX_STEP_SIZE
 from advsearch.errors import InputError
 
 both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: policy.name)
@@ -164,25 +162,3 @@ def test_samples_come_in_mirrored_pairs() -> None:
     assert torch.allclose(seen[0] + seen[1], torch.ones(3), atol=1e-6)
     assert torch.allclose(seen[2] + seen[3], torch.ones(3), atol=1e-6)
     assert not torch.allclose(seen[0], seen[2])
-
-
-def test_nes_narrows_on_a_peak_and_widens_on_a_slope() -> None:
-    domain = Domain(torch.full((3,), 0.5), (Block(3),))
-    narrow = search(evaluator(bowl(0.5)), domain, NES(sigma=0.5), steps=300, seed=0).distribution
-    slope = search(evaluator(lambda u: float(u[0])), domain, NES(sigma=0.02), steps=60, seed=0).distribution
-    assert narrow is not None and slope is not None
-    assert float(narrow.deviation.max()) < 0.05
-    assert 0.01 < float(slope.deviation[0]) <= 0.5 * MAX_STEP_SIZE
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("nes", {"sigma": math.nan}, "sigma"),
-        ("nes", {"population": 5}, "population"),
-        ("adam", {"beta1": 1.0}, "beta1"),
-    ],
-)
-def test_options_out_of_range_are_refused(name: str, options: dict[str, float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make_policy(name, **options)

@@ -112,23 +112,6 @@ def test_one_number_takes_every_render(steps: int) -> None:
 # ---- sobol
 
 
-def test_a_power_of_two_of_points_is_balanced() -> None:
-    """Sixteen points: one in every sixteenth of every axis, and one in every cell of a 4 x 4 grid."""
-    seen, _ = points(Sobol(), Domain(torch.full((3,), 0.5), (Block(3, low=0.5),)), 16)
-    for j in range(3):
-        assert sorted(((seen[:, j] - 0.5) * 32).int().tolist()) == list(range(16))
-    assert len({(int((a - 0.5) * 8), int((b - 0.5) * 8)) for a, b, _ in seen.tolist()}) == 16
-
-
-def test_chunks_continue_the_sequence(monkeypatch: pytest.MonkeyPatch) -> None:
-    domain = Domain(torch.full((3,), 0.5), (Block(3),))
-    whole, _ = points(Sobol(), domain, 50)
-    monkeypatch.setattr("advsearch.attacks.policies.sampling.MAX_CHUNK_NUMBERS", 24)
-    parts, _ = points(Sobol(), domain, 50)
-    assert torch.equal(whole, parts)
-    assert len({tuple(u) for u in whole.tolist()}) == 50
-
-
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_an_l2_ball_is_filled_evenly(d: int) -> None:
     """The radius to the power d is uniform, and the mean direction is nothing."""
@@ -139,11 +122,6 @@ def test_an_l2_ball_is_filled_evenly(d: int) -> None:
     assert float((seen - 0.5).mean(dim=0).abs().max()) < 0.002
     angles = sum(bool(u[0] > 0.5) for u in seen)
     assert abs(angles - 512) < 16
-
-
-def test_options_come_equally_often_and_at_their_middle() -> None:
-    seen, _ = points(Sobol(), Domain(torch.tensor([0.1, 0.5]), (Block(1, options=4), Block(1))), 32)
-    assert [int((seen[:, 0] == (k + 0.5) / 4).sum()) for k in range(4)] == [8, 8, 8, 8]
 
 
 def test_sobol_beats_random_in_two_dimensions() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
@@ -18,19 +17,11 @@ from advsearch.attacks import (
     Evaluation,
     Query,
     Restarts,
-    make_policy,
     search,
     seeded,
 )
-from advsearch.attacks.policies import choices
-from advsearch.errors import InputError, UnknownNameError
 
 # ---- races
-
-
-@pytest.mark.parametrize(("n", "rounds"), [(1, 1), (2, 2), (3, 3), (4, 3), (5, 4), (8, 4), (9, 5)])
-def test_rounds(n: int, rounds: int) -> None:
-    assert choices.count_rounds(n) == rounds
 
 
 # ---- restarts
@@ -82,23 +73,3 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
 
 
 # ---- names
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "error", "message"),
-    [
-        (
-            "restarts",
-            {"policy": {"name": "pgd", "speed": 1}},
-            UnknownNameError,
-            "unknown option of policy 'pgd': 'speed'",
-        ),
-        ("restarts", {"times": 0}, InputError, "times"),
-        ("portfolio", {"policies": [3]}, InputError, "policies of portfolio"),
-    ],
-)
-def test_wrong_nested_policies_say_what_is_wrong(
-    name: str, options: dict[str, Any], error: type[Exception], message: str
-) -> None:
-    with pytest.raises(error, match=message):
-        make_policy(name, **options)

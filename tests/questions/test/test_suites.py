@@ -31,7 +31,6 @@ from advsearch.questions.test import result as words
 from advsearch.questions.test.counterexamples import (
     counterexample_directory,
     decide_trials,
-    read_counterexamples,
 )
 from advsearch.questions.test.result import ClaimResult, SuiteResult
 from advsearch.questions.test.settings import SuiteConfig
@@ -256,21 +255,6 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
     assert known.status == 0 and [one.expected for one in known.claims] == ["failed", "undecided"]
     skipped = ElementTree.fromstring(words.format_junit(known).partition("\n")[2])
     assert (skipped.get("failures"), skipped.get("errors"), skipped.get("skipped")) == ("0", "0", "2")
-
-
-def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Path, tmp_path: Path) -> None:
-    suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
-    carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
-    file = counterexample_directory(suite) / "found.json"
-    kept = json.loads(file.read_text())
-    file.write_text(json.dumps({**kept, "settings": {**kept["settings"], "environment": "loft"}}))
-    other = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "other")))
-    assert other.claims[0].answer == "undecided" and "its scene is another one now" in other.claims[0].reason
-    (block,) = kept["blocks"]
-    for change, message in (({"offsets": "%%"}, "expected a counterexample"), ({"numbers": 3}, "expected 3 numbers")):
-        file.write_text(json.dumps({**kept, "blocks": [{**block, **change}]}))
-        with pytest.raises(AdvsearchError, match=message):
-            read_counterexamples(suite)
 
 
 @pytest.mark.parametrize(
