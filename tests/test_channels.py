@@ -12,8 +12,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-import advsearch
-
 ROOT = Path(__file__).parents[1]
 ACTION = yaml.safe_load((ROOT / "action.yml").read_text())
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
@@ -61,19 +59,4 @@ def test_container_and_action_install_what_the_set_up_does() -> None:
     assert extras and set(extras[1].split(",")) <= set(config["options.extras_require"])
 
 
-ON_CONDA = {"matplotlib": "matplotlib-base", "openexr": "openexr-python", "torch": "pytorch"}
 """What conda-forge calls a package otherwise."""
-
-
-def test_the_recipe_for_conda_needs_what_the_package_does() -> None:
-    recipe = yaml.safe_load((ROOT / "tools/conda/recipe.yaml").read_text())
-    config = ConfigParser()
-    config.read(ROOT / "setup.cfg")
-    needed = {"libllvm19", f"python {config['options']['python_requires']}"}
-    for line in config["options"]["install_requires"].split():
-        name, bounds = re.fullmatch(r"([\w.-]+)(.*)", line.lower()).groups()  # type: ignore[union-attr]
-        needed.add(f"{ON_CONDA.get(name, name)} {bounds}")
-    assert set(recipe["requirements"]["run"]) == needed
-    assert recipe["about"]["license"] == config["metadata"]["license"]
-    assert recipe["about"]["summary"] == config["metadata"]["description"]
-    assert str(recipe["context"]["version"]) == advsearch.__version__

@@ -82,23 +82,6 @@ def of_command_line(line: str, config: type[Given] = AttackConfig) -> Given:  # 
     return flags.make_config(args, config)
 
 
-@pytest.mark.parametrize("flag", ["control", "over"])
-def test_several_controls_with_settings_may_stand_in_one_flag(flag: str) -> None:
-    written = 'pose, camera={azimuth: [0, 90], elevation: 20}, environment={which: [a, "b, {c"]},texture'
-    config: AttackConfig = of_command_line(
-        f"advsearch attack --object mug --control light --{flag} {shlex.quote(written)}"
-    )
-    expected = {
-        "pose": {},
-        "camera": {"azimuth": [0, 90], "elevation": 20},
-        "environment": {"which": ["a", "b, {c"]},
-        "texture": {},
-    }
-    assert (config.over if flag == "over" else config.controls) == (
-        expected if flag == "over" else {"light": {}, **expected}
-    )
-
-
 @pytest.mark.parametrize("setting", settings(AttackConfig), ids=lambda setting: setting.name)
 def test_every_wrong_value_names_its_flag(setting: Any) -> None:
     with pytest.raises(InputError) as error:
@@ -341,12 +324,6 @@ def test_overrides_reach_inside(tmp_path: Path) -> None:
     assert config.steps == 80
     assert config.set_ == {"camera.azimuth": 1.0, "camera.elevation": 25.0}
     assert config.controls == {"texture": {"resolution": 64}, "pose": {"yaw": [0, 9]}}
-
-
-@pytest.mark.parametrize("given", ["pgd={momentum: 0.9, steps: 80}", {"name": "pgd", "momentum": 0.9, "steps": 80}])
-def test_a_policy_has_options_and_its_steps_are_the_runs(given: Any) -> None:
-    config = AttackConfig(object="mug", policy=given)
-    assert (config.policy_name, config.policy_options, config.steps) == ("pgd", {"momentum": 0.9}, 80)
 
 
 @pytest.mark.parametrize("given", ["yaw={tolerance: 5}", {"name": "yaw", "tolerance": 5}])

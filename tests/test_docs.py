@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from check_docs import DOCS, PAGES, ROOT, blocks, name_of, script
+from check_docs import PAGES, ROOT, blocks, name_of, script
 
 import advsearch
 import advsearch.config
@@ -221,23 +221,3 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     for block in blocks(PAGES[0], "python"):
         exec(compile(block, "README.md", "exec"), names)
     assert names["result"].search.renders == count_planned_renders(40)
-
-
-@pytest.mark.medium
-@pytest.mark.docs
-def test_the_page_about_losses_of_ones_own_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every block, after those before it, with smaller pictures and fewer steps than on the page."""
-    page = DOCS / "own-loss.md"
-    small: dict[str, Any] = {"steps": 2, "trials": 6, "spp": 2, "verify_spp": 4, "denoise": "none", "measure": "no"}
-    small |= {"baseline": False}
-    names: dict[str, Any] = {}
-    endings: list[str] = []
-    attacked = advsearch.attack
-    monkeypatch.setattr(advsearch, "attack", lambda *asked, **given: attacked(*asked, **{**given, **small}))
-    for block in blocks(page, "python"):
-        names.pop("result", None)
-        exec(compile(block.replace("resolution=48", "resolution=16"), page.name, "exec"), names)
-        names.setdefault("quick", {})["resolution"] = 24
-        endings += [names["result"].summary.ending] if "result" in names else []
-    assert len(endings) == 7 and not {"already wrong"} & {*endings}
-    assert names["wrong"] and float(names["u"].grad.abs().max()) > 0.0 and float(names["derivative"].abs().max()) > 0.0

@@ -12,7 +12,6 @@ from torch import Tensor
 
 import advsearch
 from advsearch import maite
-from advsearch.errors import InputError
 
 LABELS = {0: "mug", 1: "bowl"}
 
@@ -76,15 +75,6 @@ def test_boxes_are_those_of_the_object() -> None:
     rows, columns = np.nonzero(scenes.renderer.mask(scenes.configurations[0]).numpy())
     assert isinstance(target, maite.Detections) and target.labels.tolist() == [1] and target.scores.tolist() == [1.0]
     assert target.boxes.tolist() == [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
-
-
-def test_what_has_no_protocol_is_told() -> None:
-    with pytest.raises(InputError, match="task"):
-        maite.load_model(Shade(), input_size=16, task="depth")
-    with pytest.raises(InputError, match="'mug'"):
-        maite.Scenes("mug", "camera", 2, labels=("bowl", "vase"))
-    with pytest.raises(InputError, match="count"):
-        maite.Scenes("mug", "camera", 0, labels=("mug", "vase"))
 
 
 @pytest.mark.medium

@@ -10,7 +10,6 @@ import reference_training as training
 import torch
 from torch import Tensor
 
-from advsearch.errors import InputError
 from advsearch.models import reference
 from advsearch.questions.harden.networks import Augmentation
 
@@ -64,23 +63,6 @@ def test_augmentation_is_seeded_bounded_and_leaves_its_input_alone() -> None:
     torch.testing.assert_close(still(batch, generator), batch, rtol=0, atol=1e-5)
     mirrored = Augmentation(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)(batch, generator)
     torch.testing.assert_close(mirrored, batch.flip(3), rtol=0, atol=1e-5)
-
-
-def test_evaluate_asks_for_float_images_in_batches() -> None:
-    data, labels = _coloured(7)
-    seen: list[tuple[int, ...]] = []
-
-    def brightest(x: Tensor) -> Tensor:
-        seen.append(tuple(x.shape))
-        assert x.dtype == torch.float32 and float(x.max()) <= 1.0
-        return 50 * x.mean(dim=(1, 2))
-
-    assert calibration.evaluate(brightest, data.numpy(), labels, batch_size=4).accuracy == 1.0
-    assert seen == [(4, 32, 32, 3), (3, 32, 32, 3)]
-    with pytest.raises(InputError, match="images"):
-        calibration.evaluate(brightest, data.float(), labels)
-    with pytest.raises(InputError, match="labels"):
-        calibration.evaluate(brightest, data, labels[:3])
 
 
 @pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])

@@ -148,7 +148,7 @@ def test_metrics_are_columns_of_a_sweep_and_of_one_that_goes_on(
         with suppress(KeyboardInterrupt):
             advsearch.sweep(scene, model, metrics={"both": both}, run=run, progress=progress, **asked)
         if isinstance(progress, Stops):
-            with pytest.raises(InputError, match=r"cannot resume with .* began with: metric both;"):
+            with pytest.raises(InputError, match="metric both"):
                 advsearch.sweep(scene, model, metrics={"both": _other()}, run=run, **asked)
     again = advsearch.load_run(run)
     assert isinstance(again, SweepResult)

@@ -43,7 +43,7 @@ def test_u_may_be_an_array_or_a_batch(scene: advsearch.Scene) -> None:
     pictures.sum().backward()
     assert several.grad is not None and several.grad.shape == (2, 1) and bool((several.grad != 0.0).all())
     assert render(np.array([[0.5], [0.75]]), spp=1).shape == (2, 8, 8, 3)
-    with pytest.raises(InputError, match="expected u as a tensor or an array of numbers, got str"):
+    with pytest.raises(InputError, match="got str"):
         render("start", spp=1)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"expected u of shape \(1,\), got \(2,\)"):
         render(np.zeros((3, 2)), spp=1)

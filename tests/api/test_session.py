@@ -90,7 +90,7 @@ def test_a_renderer_and_a_model_that_were_made_in_inference_mode_are_differentia
     with torch.inference_mode():
         assert render(u, spp=1).requires_grad
         assert float(render.gradient(lambda image: image.mean(), u, 0, 1)[1].abs().sum()) > 0.0
-        with pytest.raises(InputError, match=r"u was made in `torch\.inference_mode\(\)`, so that nothing can be"):
+        with pytest.raises(InputError, match="inference_mode"):
             render(render.start.clone().requires_grad_(), spp=1)
     with torch.no_grad():
         assert not render(u, spp=1).requires_grad, "as any function of torch"
@@ -195,7 +195,7 @@ def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
     assert advsearch.attack(scene, model, objective=Loss(1.0), run=run, **SMALL).summary.ending == "interrupted"
     patch.undo()
     again: dict[str, Any] = {**SMALL, "run": run, "resume": True}
-    with pytest.raises(InputError, match=r"cannot resume with something else than the run began with: objective;"):
+    with pytest.raises(InputError, match="objective"):
         advsearch.attack(scene, model, objective=Loss(-1.0), **again)
     with pytest.raises(InputError, match="began with"):
         advsearch.attack(scene, victim(level + 0.05), objective=Loss(1.0), **again)

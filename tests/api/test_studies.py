@@ -11,16 +11,12 @@ from typing import Any
 import pytest
 
 from advsearch.engine.transport import CleanMatrix
-from advsearch.errors import InputError
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack import studies
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.region import boxes, region
-from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.summary import read_result
 from samples import ATTACK, AVERAGE, rated
 from samples import attack as attacked
 
@@ -99,26 +95,3 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
 
 
 # ---- rendered -------------------------------------------------------------------------------------------------------
-
-SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "denoise": "none"}
-
-
-@pytest.mark.medium
-def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(boxes, "MAX_PROBED", 20)
-    config = RegionConfig(
-        **SMALL, controls={"pose": {"yaw": [10, 50], "pitch": 0, "roll": 0, "x": 0, "z": 0}, "camera.elevation": {}},
-        vary="pose.yaw,camera.elevation", samples=8, map=2, verify_spp=2, run=str(tmp_path / "run"),
-    )  # fmt: skip
-    try:
-        result = region.run(config)
-    except InputError as error:  # sixteen pixels may leave the verdict to the noise, which is said
-        assert "depends on the noise" in str(error)
-        return
-    assert result.box and result.map and result.volume is not None and result.same is not None
-    yaw, elevation = result.box
-    assert (yaw.name, yaw.unit) == ("pose.yaw", "degrees") and 10 <= yaw.low <= yaw.centre <= yaw.high <= 50
-    assert elevation.unit == "degrees" and 0.0 <= result.volume <= 1.0
-    assert result.samples == 8 and result.same <= 8 and len(result.map.margins) == 2
-    assert (tmp_path / "run" / "images" / "map.png").is_file()
-    assert read_result(tmp_path / "run").to_dict() == result.to_dict()

@@ -73,13 +73,6 @@ def test_an_end_that_passed_by_luck_moves_out_until_it_passes_again() -> None:
     assert confirm_bracket(nothing, lambda u, _: False, domain) is nothing
 
 
-def test_without_a_flip_the_whole_budget_is_the_lower_end() -> None:
-    domain, _, _ = linear(5, "linf", 1.0)
-    bracket = find_smallest_change(lambda inside, _: inside.start, lambda u, _: False, domain)
-    assert (bracket.low, bracket.high, bracket.u, bracket.searches) == (1.0, math.inf, None, 1)
-    assert not bracket.is_closed
-
-
 def test_a_region_fills_the_box_in_which_the_prediction_stays() -> None:
     low, high = torch.tensor([0.2, 0.0, 0.3]), torch.tensor([0.7, 1.0, 0.6])
     region = grow_box(lambda u, _: bool(((u >= low) & (u <= high)).all()), torch.tensor([0.5, 0.5, 0.4]), seed=1)

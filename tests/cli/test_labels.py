@@ -60,7 +60,7 @@ def test_an_object_without_a_label_is_shown_to_the_model(question: str, tmp_path
     )
     with pytest.raises(InputError, match=message):
         getattr(advsearch, question)(mesh, model, controls="pose", resolution=16)
-    with pytest.raises(InputError, match=r"the label of mug itself does not fit .* 'coffee mug' .* calls a clean"):
+    with pytest.raises(InputError, match="coffee mug"):
         getattr(advsearch, question)("mug", model, controls="pose", resolution=16)
 
 

@@ -140,19 +140,3 @@ def test_a_sweep_refuses_what_contradicts_its_scenes(options: dict[str, Any], na
     with pytest.raises(InputError) as error:
         sweep_from_config(SweepConfig(**{"object": "mug", "trials": 0, **options}))
     assert named in format_as_flags(str(error.value))
-
-
-@pytest.mark.medium
-def test_a_row_names_the_environment_that_lights_it() -> None:
-    plain: dict[str, Any] = {"resolution": 8, "spp": 1, "trials": 0}
-
-    def lit_by(**options: Any) -> list[Any]:
-        found = advsearch.sweep("mug", **options, **plain)
-        named = [row.values["environment"]["value"] for row in found.rows()]
-        assert found.summary.environment == (named[0] if len(set(named)) == 1 else "studio")
-        return named
-
-    assert lit_by(grid={"environment.which": ["noon", "own"]}) == ["noon", "studio"]
-    assert lit_by(controls={"environment": {"which": "noon", "rotation": [0, 90]}}, samples=1) == ["noon"]
-    assert lit_by(controls=["sky"], samples=1) == ["sky"]
-    assert lit_by(grid={"pose.yaw": [0]}) == ["studio"]

@@ -10,9 +10,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls import make_space
 from advsearch.controls.contents import FILL_LIMIT, INGREDIENTS, ContentsControl, find_interior
-from advsearch.controls.pose import PoseControl
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.library import load_object
@@ -100,12 +98,6 @@ def test_the_vertices_are_differentiable_in_the_level(scene: SceneDescription) -
     filled.inputs(u)["contents.offsets"][:, 2].mean().backward()
     step = (surface(filled, 0.613 + 0.01) - surface(filled, 0.613 - 0.01))[:, 2].mean() / 0.02
     assert u.grad is not None and float(u.grad) == pytest.approx(float(step), rel=1e-3)
-
-
-def test_it_moves_with_the_object_whatever_the_order(scene: SceneDescription) -> None:
-    space = make_space([ContentsControl(level=[0, 1]), PoseControl(x=[0, 1])], scene)
-    inputs = space.inputs(torch.tensor([0.5, 0.7]))
-    assert torch.equal(inputs["contents.to_world"], inputs["object.to_world"])
 
 
 # ---- proportions ----------------------------------------------------------------------------------------------------

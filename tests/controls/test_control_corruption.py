@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy import stats
 from torch import Tensor
 
 from advsearch.controls import corruption
@@ -20,7 +19,6 @@ from advsearch.controls.corruption import (
     apply_corruption,
     filters,
 )
-from advsearch.controls.corruption.filters import sample_poisson
 from advsearch.scene.description import SceneDescription, load_description
 
 every_corruption = pytest.mark.parametrize("which", CORRUPTION_NAMES)
@@ -126,14 +124,6 @@ def test_the_noises_are_as_strong_as_published(whole: int) -> None:
     seen = apply_corruption(image, "impulse_noise", severity)
     assert float((seen != 0.5).float().mean()) == pytest.approx(lost, rel=0.05)
     assert float((seen == 1.0).float().mean()) == pytest.approx(lost / 2.0, rel=0.1)
-
-
-def test_poisson_numbers_are_those_of_the_distribution() -> None:
-    generator = torch.Generator().manual_seed(3)
-    mean, share = torch.rand(500, generator=generator) * 60.0, torch.rand(500, generator=generator)
-    expected = stats.poisson.ppf(share.double().numpy(), mean.double().numpy())
-    assert np.array_equal(sample_poisson(mean, share).numpy(), expected.astype(np.float32))
-    assert float(sample_poisson(torch.zeros(9), torch.linspace(0.0, 0.9999, 9)).max()) == 0.0
 
 
 def test_a_point_out_of_focus_is_a_disc() -> None:

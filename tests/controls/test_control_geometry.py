@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-import trimesh
 from torch import Tensor
 
 import advsearch
@@ -19,7 +17,6 @@ from advsearch.controls.geometry import (
     compute_shape_modes,
     get_welded_mesh,
 )
-from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, load_description
 
 OFFSETS = "object.offsets"
@@ -115,44 +112,6 @@ def test_the_derivative_of_the_limits_is_exact(scene: SceneDescription) -> None:
     for scale in (0.01, 1.0, 30.0):
         at = scale * torch.randn(4, generator=generator, dtype=torch.float64)
         assert torch.autograd.gradcheck(total, (at.requires_grad_(),), eps=1e-6, atol=1e-5, rtol=1e-4)
-
-
-def blocks(*corners: tuple[float, float, float]) -> Mesh:
-    """Cubes of side 0.3, not connected."""
-    boxes = []
-    for corner in corners:
-        box = trimesh.creation.box((0.3, 0.3, 0.3))
-        box.apply_translation(corner)
-        boxes.append(box)
-    whole = trimesh.util.concatenate(boxes)
-    count = len(whole.vertices)
-    normals = np.asarray(whole.vertex_normals, dtype=np.float32)
-    vertices = np.asarray(whole.vertices, dtype=np.float32)
-    return Mesh(vertices, np.asarray(whole.faces, dtype=np.uint32), normals, np.zeros((count, 2), dtype=np.float32))
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_coarse_and_unconnected_meshes_are_taken(scene: SceneDescription, form: str) -> None:
-    mesh = blocks((0.0, 0.0, 0.2), (0.6, 0.0, 0.2), (0.6, 0.7, 0.2))
-    parts = SceneDescription(ObjectAsset("blocks", mesh, scene.object.base_color), scene.environment, scene.values)
-    control = bound(parts, form=form)
-    for u in wild(len(control.start)):
-        offsets = control.inputs(u)[OFFSETS]
-        assert bool(torch.isfinite(offsets).all()) and float(offsets.norm(dim=1).max()) < 0.03
-    assert float(control.inputs(wild(len(control.start))[1])[OFFSETS].abs().max()) > 0.005
-
-
-def test_the_mesh_is_kept_as_a_file(scene: SceneDescription) -> None:
-    control = bound(scene, epsilon=0.1)
-    u = wild(len(control.start))[1]
-    files = control.get_artifact_files(u)
-    (name,) = files
-    assert name == "geometry.obj"
-    read = trimesh.load(io.BytesIO(files[name]), file_type="obj", process=False, maintain_order=True)
-    wanted = scene.object.mesh.vertices + control.inputs(u)[OFFSETS].numpy()
-    np.testing.assert_allclose(read.vertices, wanted, atol=1e-5)
-    np.testing.assert_array_equal(read.faces, scene.object.mesh.faces)
-    np.testing.assert_allclose(read.visual.uv, scene.object.mesh.uvs, atol=1e-5)
 
 
 @pytest.mark.medium

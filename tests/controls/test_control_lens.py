@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.lens import LensControl, draw_dots, spread_positions
+from advsearch.controls.lens import LensControl, draw_dots
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
 
@@ -41,15 +41,6 @@ def test_the_start_is_the_picture_as_it_is_and_opacity_has_a_slope_there(scene: 
     seen.sum().backward()
     assert u.grad is not None and len(u) == 7 * dots
     assert bool((u.grad[6 * dots :].abs() > 1e-3).all()), "every dot can be faded in"
-
-
-def test_the_dots_start_apart_and_the_first_in_the_middle() -> None:
-    assert torch.equal(spread_positions(1), torch.full((2, 1), 0.5))
-    for count in (4, 16, 64):
-        places = spread_positions(count).T
-        assert float(places.min()) >= 0.1 and float(places.max()) <= 0.9
-        gaps = torch.cdist(places, places) + 9.0 * torch.eye(count)
-        assert float(gaps.min()) > 0.35 / math.sqrt(count)
 
 
 def test_a_dot_mixes_light_by_the_published_profile() -> None:

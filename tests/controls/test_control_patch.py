@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -174,15 +173,6 @@ def test_derivatives_are_those_of_differences(scene: SceneDescription) -> None:
 
 
 # ---- what may be asked for -------------------------------------------------------------------------------------------
-
-
-def test_a_printers_gamut_narrows_the_pixels(scene: SceneDescription) -> None:
-    control = bound(scene, pixels=[0.2, 0.8], norm="l2", resolution=4)
-    for value in (0.0, 1.0):
-        (name, kept) = list(control.get_artifact_images(torch.full_like(control.start, value)).items())[1]
-        assert name == "patch-pixels"
-        torch.testing.assert_close(kept, torch.full((4, 4, 3), 0.2 + 0.6 * value))
-    assert control.groups[0].budget.epsilon == pytest.approx(0.1 * math.sqrt(48) / 0.6)
 
 
 @pytest.mark.medium

@@ -175,42 +175,6 @@ def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_p
     assert torch.equal(renderer(u, seed=5, spp=8), again(torch.ones(1), seed=5, spp=8))
 
 
-class Glare(nn.Module):
-    """Class 1 where the middle of the picture is brighter than a threshold."""
-
-    def __init__(self, threshold: float) -> None:
-        super().__init__()
-        self.threshold = threshold
-
-    def forward(self, images: Tensor) -> Tensor:
-        light = 40.0 * (images[:, :, 6:10, 6:10].mean(dim=(1, 2, 3)) - self.threshold)
-        return torch.stack([-light, light], dim=1)
-
-
-@pytest.fixture(scope="module")
-def glare() -> advsearch.Model:
-    return advsearch.load_model(Glare(0.8), labels=("mug", "glare"), input_size=16, name="glare")
-
-
-@pytest.mark.medium
-def test_the_result_says_in_which_ambient_light_it_ends(glare: advsearch.Model, tmp_path: Path) -> None:
-    result = advsearch.attack(
-        "mug", glare, controls={"projector": {"resolution": 4}}, resolution=16, steps=16, trials=6,
-        verify_spp=16, baseline=False, measure="no", run=tmp_path / "run",
-    )  # fmt: skip
-    light = result.summary.ambient
-    assert result.found and light is not None and light.lux == DEFAULT_AMBIENT_LUX
-    assert [point.lux for point in light.points] == sorted(point.lux for point in light.points)
-    assert light.points[0].verified == result.summary.verified
-    assert light.ends_at is not None and light.lux < light.ends_at <= 1.2 * light.holds_to
-    last = [point for point in light.points if point.lux > light.holds_to]
-    assert last and not last[0].holds and last[-1].verified.successes == 0
-    page = (tmp_path / "run" / "report.html").read_text("utf-8")
-    assert f"Works up to {light.holds_to:.3g} lux" in page
-    kinds = {row.kind for row in result.rows()}
-    assert any(kind.startswith("ambient ") for kind in kinds)
-
-
 @pytest.mark.medium
 def test_the_export_has_the_picture_marks_and_what_to_set(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"resolution": 4, "lumens": 10}

@@ -104,19 +104,6 @@ def test_nothing_stands_in_anything_else(scene: SceneDescription) -> None:
     assert 10 < pushed < 50
 
 
-@pytest.mark.medium
-def test_the_object_and_other_things_may_be_moved_by_other_controls(scene: SceneDescription) -> None:
-    object_moves = {"x": [0.3, 0.9]}
-    others: dict[str, Any] = {"pose": object_moves, "pose:chair": {"y": [-0.6, 0.6]}}
-    space = space_of(scene, {"stop-sign.x": [-2, 2], "stop-sign.y": [-2, 2]}, **others)
-    for seed in range(20):
-        u = torch.rand(len(space.start), generator=torch.Generator().manual_seed(seed))
-        prints = {name: compute_footprint(vertices(space, u, name)) for name in ("object", "chair", "stop-sign")}
-        assert not any(is_overlapping(prints["stop-sign"], prints[other]) for other in ("object", "chair"))
-    with pytest.raises(InputError, match=r"chair\.to_world"):
-        space_of(scene, **{"pose:chair": {"y": [0.0, 1.0]}}).inputs(torch.full((10,), 0.5))
-
-
 def test_nothing_stands_where_the_camera_is() -> None:
     scene = load_description(
         "car",

@@ -109,15 +109,6 @@ def test_a_control_is_finite_in_every_corner(kind: str) -> None:
             assert gradient is None or bool(torch.isfinite(gradient).all())
 
 
-@every_control
-def test_a_bound_control_says_its_configuration_in_values_with_units(kind: str) -> None:
-    control = bound(kind)
-    said = control.describe(control.start)
-    assert said
-    for name, value in said.items():
-        assert name.startswith(control.name + ".") and value["unit"] and isinstance(value["value"], (float, str))
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("kind", ["light", "projector", "spot", "shadow", "occlusion", "patch"])
 def test_two_of_a_kind_live_side_by_side(kind: str) -> None:

@@ -9,10 +9,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.cli.flags import make_config
-from advsearch.cli.main import _parse
 from advsearch.engine.gradients import make_smooth_loss
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene, write_xml
@@ -80,14 +77,6 @@ def test_a_plain_number_changes_recorded_renders(box: advsearch.Scene) -> None:
     shown = [float(renderer.radiance(torch.tensor([share]), 1, 16).mean()) for share in (0.0, 0.9, 0.0, 0.9)]
     assert shown[0] == shown[2] and shown[1] == shown[3] and abs(shown[0] - shown[1]) > 0.1 * shown[0]
     assert renderer.plan.groups[0].estimator == "differences"
-
-
-def test_the_command_line_gathers_ranges_by_key() -> None:
-    words = ["attack", "--scene", "box.xml", "--object", "large-box"]
-    words += ["--control", f"pose,mitsuba:{RED}=[0.1,0.9]", "--control", f"mitsuba:{WIDE}=40"]
-    args = _parse(words, "attack")
-    config = make_config(args, AttackConfig)
-    assert config.controls == {"pose": {}, "mitsuba": {RED: [0.1, 0.9], WIDE: 40}}
 
 
 def test_one_channel_of_a_colour_varies_and_the_others_stay(box: advsearch.Scene) -> None:

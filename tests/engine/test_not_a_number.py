@@ -12,20 +12,11 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import Trials
-from advsearch.engine.record import make_control_group, make_rate, make_trial_row, read_judgement
+from advsearch.engine.record import make_control_group, make_rate
 from advsearch.tasks import Judgement, Prediction
 
 NOTHING = Judgement.of(math.nan, math.nan, Prediction("tench", 0, math.nan))
 RIGHT, WRONG = Judgement.of(-1.0, -1.0, Prediction("mug", 1, 0.9)), Judgement.of(3.0, 3.0, Prediction("vase", 2, 0.8))
-
-
-def test_a_row_has_no_name_and_comes_back_as_what_it_was() -> None:
-    row = make_trial_row("verification", 0, 1, 4, NOTHING)
-    assert (row.label, row.label_index, row.margin, row.objective, row.probability) == (None,) * 5
-    assert row.correct is False and row.success is False
-    again = read_judgement(row)
-    assert again.is_non_finite and again.prediction == NOTHING.prediction == Prediction("not a number")
-    assert not read_judgement(make_trial_row("verification", 0, 1, 4, RIGHT)).is_non_finite
 
 
 def test_trials_without_a_number_are_counted_and_means_are_of_the_others() -> None:

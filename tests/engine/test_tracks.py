@@ -55,12 +55,6 @@ def test_two_that_pass_each_other_keep_their_numbers() -> None:
     assert len(numbers) == 12 and len(set(numbers)) == 1
 
 
-def test_frames_that_do_not_see_the_object_lose_nothing() -> None:
-    frames = drive([0.9] * 6)
-    frames[2:4] = [frame._replace(true=None, boxes=np.zeros((0, 4)), scores=np.zeros(0)) for frame in frames[2:4]]
-    assert track_drive(frames, ConstantVelocity, 0.5) == (0.0, 0, 0)
-
-
 class Replays(nn.Module):
     """A detector that says the boxes of a drive one after the other, and in some frames none that counts."""
 

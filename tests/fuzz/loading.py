@@ -250,25 +250,6 @@ def load_threedb(path: Path) -> None:
             read_image(picture)
 
 
-def misbehave(path: Path) -> None:
-    """Do what no loader may, as the file says; the test of the fuzz itself."""
-    import subprocess
-    import time
-
-    deeds: dict[str, Callable[[], object]] = {
-        "nothing": lambda: None,
-        "raise": lambda: int("x"),
-        "print": lambda: print("a warning"),
-        "run": lambda: subprocess.run(["true"], check=True),
-        "read outside": lambda: (path.parents[1] / "outside" / "secret.txt").read_bytes(),
-        "write outside": lambda: (path.parent / "planted").write_bytes(b"x"),
-        "take memory": lambda: bytearray(1200 << 20),
-        "crash": lambda: os.abort(),
-        "spin": lambda: [None for _ in iter(time.process_time, 0.0)],
-    }
-    deeds[path.read_text()]()
-
-
 LOADERS: dict[str, Callable[[Path], object]] = {
     "object": load_object,
     "node": load_node,
@@ -284,7 +265,6 @@ LOADERS: dict[str, Callable[[Path], object]] = {
     "answer": load_answer,
     "blend": load_blend,
     "3db": load_threedb,
-    "misbehave": misbehave,
 }
 """Each gets the path of a case's main file, and returns or raises an `AdvsearchError`."""
 

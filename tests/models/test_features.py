@@ -71,13 +71,6 @@ def test_a_module_gives_the_input_of_its_last_linear_layer() -> None:
     assert features.source == "the input of 6 (Linear), 7 numbers"
 
 
-def test_maps_before_a_convolution_are_averaged() -> None:
-    network = nn.Sequential(nn.Conv2d(3, 6, 3), nn.SiLU(), nn.Conv2d(6, 4, 1), nn.AdaptiveAvgPool2d(1), nn.Flatten())
-    features = features_of(load(network.eval()))
-    assert features.source == "the input of 2 (Conv2d), 6 numbers"
-    assert torch.allclose(features(images()), by_hand(network, 2).mean(dim=(2, 3)), atol=1e-6)
-
-
 # ---- programs -------------------------------------------------------------------------------------------------------
 
 

@@ -409,7 +409,7 @@ def test_pickles_inside_an_exported_program_are_not_executed(tmp_path: Path, exp
     with pytest.raises(FileFormatError, match=r"unpickling, which is never done"):
         load_model(tmp_path / "weights.pt2")
     _repacked(exported, tmp_path / "object.pt2", "data/constants/opaque_obj_0", pickle.dumps(SideEffect(trace)))
-    with pytest.raises(FileFormatError, match=r"holds 'data/constants/opaque_obj_0', which is a pickled object"):
+    with pytest.raises(FileFormatError, match="opaque_obj_0"):
         load_model(tmp_path / "object.pt2")
     assert not trace.exists() and "TORCH_FORCE_WEIGHTS_ONLY_LOAD" not in os.environ
 

@@ -90,7 +90,7 @@ def test_a_segmenter_answers_for_each_pixel(torchvision: Any, tmp_path: Path) ->
 def test_a_detector_finds_what_it_finds_by_itself(torchvision: Any, tmp_path: Path) -> None:
     models, name = torchvision.models, "ssdlite320_mobilenet_v3_large"
     network = models.get_model(name, weights=None, weights_backbone=None).eval()
-    with pytest.raises(ModelError, match="boxes are what a detector gives: use `task=detection`"):
+    with pytest.raises(ModelError, match="task=detection"):
         load_model(network)
     model = load_model(f"torchvision:{name}@{saved(network, tmp_path)}", task="detection", input_size=160)
     assert model.labels[:2] == ("__background__", "person") and len(model.labels) == 91
@@ -121,7 +121,7 @@ def test_a_network_of_timm_is_fed_as_timm_says(timm: Any, tmp_path: Path) -> Non
         assert model.labels[0] == "tench, Tinca tinca"
         assert_same(model(PICTURE), theirs(timm, network))
     assert_gradient(model)
-    with pytest.raises(ModelError, match=r"without a head \(num_classes is 0\), .* use `task=similarity`"):
+    with pytest.raises(ModelError, match="task=similarity"):
         load_model(timm.create_model("test_vit", num_classes=0))
 
 

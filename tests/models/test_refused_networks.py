@@ -33,13 +33,13 @@ class Answers(nn.Module):
     ids=["pixels", "logits"],
 )
 def test_chosen_classes_are_no_scores(form: Any, task: str) -> None:
-    with pytest.raises(ModelError, match=r"these are the classes that it chose \(torch.int.*before the argmax"):
+    with pytest.raises(ModelError, match="argmax"):
         load_model(Answers(form), input_size=8, task=task)
 
 
 def test_layers_without_weights_are_named() -> None:
     network = nn.Sequential(nn.Flatten(), nn.Sequential(nn.ReLU(), nn.LazyLinear(3)))
-    with pytest.raises(ModelError, match=r"its layer 1.1 \(LazyLinear\) has no weights before it has seen a picture"):
+    with pytest.raises(ModelError, match="LazyLinear"):
         load_model(network, input_size=8)
     network(torch.zeros(1, 3, 8, 8))
     assert load_model(network, input_size=8).classes == 3
@@ -61,5 +61,5 @@ class ToldInTraining(nn.Module):
 
 @pytest.mark.parametrize("network", [InTraining(), ToldInTraining()])
 def test_what_is_wanted_beside_pictures_is_named(network: nn.Module) -> None:
-    with pytest.raises(ModelError, match=r"wants targets beside pictures; wrap it in an nn.Module that is called with"):
+    with pytest.raises(ModelError, match="targets"):
         load_model(network, input_size=8)

@@ -22,7 +22,7 @@ from advsearch.questions.check import check
 from advsearch.questions.check import result as words
 from advsearch.questions.check.result import CheckConfig, CheckResult, GainRow
 from advsearch.runs.listing import is_finished
-from advsearch.runs.measurements import Measurements, OutOfTime
+from advsearch.runs.measurements import Measurements
 from advsearch.runs.results import PathLength, Result
 from advsearch.runs.summary import read_result
 
@@ -86,20 +86,6 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
     assert values(check.run(config, resumed=folder)) == values(whole) and is_finished(folder)
     assert main(["show", str(folder)]) == 0
     assert words.READING in capsys.readouterr().out
-
-
-def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
-    config = CheckConfig(**SMALL, run=str(tmp_path / "run"))
-    with RunContext(config) as context:
-        results = context.open_measurements()
-        assert results.get("a", lambda: {"x": (0.1 + 0.2, float("inf"))}) == {"x": [0.1 + 0.2, float("inf")]}
-        assert results.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
-    with RunContext(config, resumed=tmp_path / "run") as context:
-        late = context.open_measurements(seconds=0.0)
-        assert late.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
-        assert late.get("b", lambda: 1) == 1  # a sitting always gets on
-        with pytest.raises(OutOfTime):
-            late.get("c", lambda: 1)
 
 
 # ---- the plan of a search -------------------------------------------------------------------------------------------

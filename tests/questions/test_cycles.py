@@ -16,8 +16,7 @@ import torch
 import trimesh
 
 import advsearch
-from advsearch.questions.replay import cycles
-from advsearch.questions.replay.cycles import BlenderError, Cycles
+from advsearch.questions.replay.cycles import Cycles
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.renderer import Renderer
 from advsearch.trust.programs import BLENDER
@@ -91,20 +90,3 @@ def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> No
     assert arguments[:3] == ["--background", "--factory-startup", "--disable-autoexec"] and "SECRET" not in environment
     del made, theirs
     assert not Path(environment["HOME"]).exists()
-
-
-@pytest.mark.parametrize(
-    ("does", "words"),
-    [
-        ("print('no engine CYCLES'); sys.exit(3)", "Blender stopped"),
-        ("import time; time.sleep(30)", "had not rendered it after 1 seconds"),
-    ],
-)
-def test_what_blender_can_not_render_is_said(
-    folder: Path, renderer: Renderer, does: str, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cycles, "MAX_RENDER_SECONDS", 1 if "sleep" in does else cycles.MAX_RENDER_SECONDS)
-    (folder / "does.py").write_text(does)
-    inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
-    with pytest.raises(BlenderError, match=words):
-        by_cycles(renderer.scene.definition[0]).radiance(inputs, 0, 1)

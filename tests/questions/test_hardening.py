@@ -25,7 +25,6 @@ from advsearch.questions.harden.lessons import (
     RenderedLesson,
     TextureLesson,
     negative_log_likelihood,
-    sample_configurations,
     save_lesson_images,
     search_worse_images,
 )
@@ -69,18 +68,6 @@ def pupils() -> list[Lesson]:
     """Three classes by their brightest channel, of which the worst pictures show little."""
     worst = [coloured(n % 3, 0.2, 99 + n) for n in range(24)]
     return [RenderedLesson.create((n % 3,), coloured(n % 3, 0.4, n), one[None]) for n, one in enumerate(worst)]
-
-
-def test_half_of_what_is_tried_has_numbers_at_the_ends_of_their_ranges() -> None:
-    blocks = (Block(2, low=0.2, high=0.6), Block(1, periodic=True), Block(1, options=3))
-    domain = Domain(torch.tensor([0.4, 0.4, 0.5, 0.5]), blocks)
-    drawn = sample_configurations(domain, torch.Generator().manual_seed(0), 800)
-    assert torch.equal(drawn, torch.stack([domain.project(row) for row in drawn]))
-    at_ends = (drawn == domain.lower) | (drawn == domain.upper)
-    assert not at_ends[:, 2:].any()
-    assert ((at_ends[:, :2].float().mean(dim=0) - 0.25).abs() < 0.05).all()
-    assert abs(float(at_ends[:, :2].any(dim=1).float().mean()) - 0.375) < 0.06  # three of four in every second one
-    assert set(drawn[:, 3].tolist()) == {float(value) for value in torch.tensor([1 / 6, 0.5, 5 / 6])}
 
 
 # ---- the split ------------------------------------------------------------------------------------------------------

@@ -88,5 +88,5 @@ def test_a_region_ends_where_the_object_leaves_the_picture(tmp_path: Path) -> No
     found = advsearch.region("mug", model, controls={"pose": {"y": [-3.0, 3.0]}}, run=tmp_path / "run", **small)
     assert found.verdict == "right" and found.box is not None and found.same == found.samples
     assert -1.0 < found.box[0].low < found.box[0].high < 1.0, found.box
-    with pytest.raises(InputError, match=r"the object is not to be seen in 20 of 20 trials at the centre"):
+    with pytest.raises(InputError, match="20 of 20"):
         advsearch.region("mug", model, controls=BESIDE, run=tmp_path / "none", **small)

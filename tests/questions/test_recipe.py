@@ -222,21 +222,6 @@ def test_intervals_are_over_drives_where_frames_of_one_share_a_draw() -> None:
     assert row == ["noon", *together.table_cells]
 
 
-def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_overlap() -> None:
-    shown = figure(
-        {"figure": "rates", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
-    )
-    assert shown.text[0].startswith(
-        "Lowest is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); highest is studio"
-    )
-    assert shown.text[1].startswith("The difference is shown")
-    assert list(counts(shown)) == ["studio", "loft", "noon"]
-    hidden = figure({"figure": "rates", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))
-    assert hidden.text[1].startswith("No difference between the environments is shown")
-    same = figure({"figure": "rates", "by": "environment"}, rows({"noon": (8, 20), "studio": (8, 20)}))
-    assert same.text == ["All 2 environments have the same share, 40 %: no difference is shown."]
-
-
 def test_shape_and_texture_are_told_apart() -> None:
     """A model that answers by shape, one that answers by texture, and one that answers by neither."""
     pairs = [(shape, texture) for shape in ("mug", "bowl", "vase") for texture in ("zebra", "brick") for _ in range(20)]

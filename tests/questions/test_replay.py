@@ -121,7 +121,7 @@ def test_a_hostile_header_of_a_configuration_is_refused(header: bytes, tmp_path:
 @pytest.mark.parametrize("data", [[[0.5]], [2.0], [float("nan")]], ids=["two axes", "out of range", "nan"])
 def test_a_configuration_is_a_point_of_the_box(data: Any, tmp_path: Path) -> None:
     write_configuration(tmp_path, torch.tensor(data).numpy())
-    with pytest.raises(FileFormatError, match=r"expected numbers \(d,\) float32 in \[0, 1\]"):
+    with pytest.raises(FileFormatError, match="float32"):
         read_configuration(tmp_path)
     write_configuration(tmp_path, torch.tensor([0.25, 1.0]).numpy())
     assert read_configuration(tmp_path).tolist() == [0.25, 1.0]

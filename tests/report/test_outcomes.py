@@ -7,27 +7,14 @@ from typing import Any
 import numpy as np
 
 from advsearch.options import OUT_OF_VIEW, Outcome
-from advsearch.questions.attack.outcome import name_objective
 from advsearch.questions.sweep.result import OUTCOMES, Predictions, TableAxis
-from advsearch.report.wording import format_goal
 from advsearch.tasks import Judgement, Prediction
-from advsearch.tasks.depth import Depth
-from advsearch.tasks.detection import Detection
 
 
 def judged(right: bool, label: str, outcome: Outcome | None) -> Judgement:
     payload: Any = {"box": None, "found": []} | ({} if outcome is None else {"outcome": outcome.value})
     margin = 1.0 if right else -1.0
     return Judgement(-margin, margin, right, Prediction(label), payload)
-
-
-def test_a_goal_in_the_task_is_named_as_one_in_the_objective_is() -> None:
-    """`detection={seek: create}` looks for what the objective `create` looks for, and not for a miss."""
-    created = name_objective(Detection(seek="create"), "score")
-    assert created == "create" == name_objective(Detection(), "create")
-    assert format_goal(created, "this mug") == "makes the model see beside this mug what is not there"
-    assert name_objective(Detection(), None) == "score" == name_objective(Depth(), "score")
-    assert name_objective(Depth(seek="nearer"), None) == "nearer"
 
 
 def test_rows_of_a_sweep_are_counted_by_outcome() -> None:

@@ -43,13 +43,6 @@ def test_pictures_that_differ_in_noise_alone_are_one_unit(frames: int | None) ->
     assert units.name == ("configuration" if frames is None else "drive")
 
 
-def test_older_notes_do_not_say_that_samples_are_noise_and_the_sampler_does(tmp_path: Path) -> None:
-    with Store(tmp_path / STORE) as store:
-        store.write_note(UNITS_NOTE, '{"sizes": [3, 5], "frames": 1, "samples": 4, "models": 2, "again": 0}')
-        assert read_units(store) == Units((3, 5), 1, 4, 2)
-        assert read_units(store, is_sampled=False) == Units((3, 5), 1, 1, 2, noise=4)
-
-
 def test_a_run_notes_its_units_and_what_is_none_is_refused(tmp_path: Path) -> None:
     with Store(tmp_path / STORE) as store:
         assert read_units(store) is None

@@ -308,7 +308,7 @@ def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value:
     for wanted in ("one", "another", "one"):
         Path(file).write_text(wanted)
         if wanted == "another":
-            with pytest.raises(InputError, match=f"than the run began with: {Path(file).parts[0]};"):
+            with pytest.raises(InputError, match=Path(file).parts[0]):
                 RunDirectory.resume("first", config)
         else:
             (RunDirectory.resume("first", config) if Path("runs").is_dir() else RunDirectory.create_for(config)).close()
@@ -475,17 +475,6 @@ def test_json_and_parquet_have_the_same_rows(filled: Store, tmp_path: Path) -> N
     table = pyarrow.parquet.read_table(out)
     assert table.column_names == COLUMNS and table.to_pylist() == rows
     assert str(table.schema.field("seed").type) == "int64" and str(table.schema.field("success").type) == "bool"
-
-
-def test_parquet_takes_more_rows_than_one_group(
-    run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("advsearch.runs.export.ROWS_PER_GROUP", 4)
-    run.append_rows(*(Row("sweep", step, values={"p": {"value": step / 3, "unit": ""}}) for step in range(11)))
-    write_rows(run.store, "parquet", tmp_path / "rows.parquet", io.BytesIO())
-    file = pyarrow.parquet.ParquetFile(tmp_path / "rows.parquet")
-    assert file.num_row_groups == 3
-    assert file.read().column("p").to_pylist() == [step / 3 for step in range(11)]
 
 
 # ---- the runs at a glance ----

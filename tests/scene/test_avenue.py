@@ -7,27 +7,11 @@ import pytest
 import torch
 
 from advsearch.engine.loading import load_scene
-from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.grounds import LUMINANCE, is_enclosed, is_paved
+from advsearch.scene.description import load_description
+from advsearch.scene.grounds import LUMINANCE
 from scenes.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
 from scenes.places.paint import FRONTS
 from scenes.places.road import KERBS
-
-
-def laid(scene: SceneDescription) -> set[str]:
-    return {name for name, part in scene.surrounding_meshes.items() if part.is_laid_ground}
-
-
-@pytest.mark.medium
-def test_an_avenue_comes_and_goes_with_its_ground() -> None:
-    scene = load_scene("car", "avenue")
-    assert {"road", "houses", "trees", "posts"} <= laid(scene.description)
-    assert is_paved(scene.description)
-    assert is_enclosed(scene.description)
-    assert laid(scene.with_settings({"ground.kind": "road"}).description) == {"road"}
-    assert not laid(scene.with_settings({"ground.size": 0.0}).description)
-    assert not is_enclosed(load_description("car", "street"))
-    assert is_enclosed(load_description("mug", "noon", setting_values={"ground.kind": "avenue"}))
 
 
 @pytest.mark.medium

@@ -14,7 +14,7 @@ from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
-from advsearch.scene.transport.lights import BasisMaps, BasisRenderer, find_lighting
+from advsearch.scene.transport.lights import BasisRenderer, find_lighting
 from stand_ins import Impatient, rows
 
 SIZE = 32
@@ -98,13 +98,6 @@ def test_its_derivative_is_that_of_its_pictures(predicted: BasisRenderer) -> Non
             at[number] += side
             ends.append(float(loss(predicted(at))))
         assert float(slope[number]) == pytest.approx((ends[1] - ends[0]) / (2.0 * step), rel=0.05, abs=1e-4)
-
-
-def test_weights_are_those_of_the_nearest_map() -> None:
-    maps = torch.rand(3, 6, 12, 3, generator=torch.Generator().manual_seed(0))
-    weights = torch.tensor([[1.0, 0.5, 2.0], [-0.3, 0.0, 0.1], [0.0, 4.0, 0.2]])
-    span = BasisMaps(maps)
-    assert torch.allclose(span.fit_weights(span.compose(weights)), weights, atol=1e-4)
 
 
 @pytest.mark.medium

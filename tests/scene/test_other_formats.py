@@ -26,14 +26,3 @@ def test_it_says_what_the_file_is_and_then_what_to_do(ending: str, what: str, do
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert message.index(what) < message.index(do)
-
-
-@pytest.mark.parametrize("ending", [".obj", ".glb"])
-@pytest.mark.parametrize(("content", "what"), [(b"PXR-USDC\x00", "a USD scene"), (b"<?xml version='1.0'?>", "XML")])
-def test_a_file_under_another_ending_is_told_by_what_it_holds(
-    content: bytes, what: str, ending: str, tmp_path: Path
-) -> None:
-    path = tmp_path / f"thing{ending}"
-    path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=what):
-        import_object(path)

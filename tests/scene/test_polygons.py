@@ -62,13 +62,6 @@ def test_a_comb_a_hole_and_corners_in_line(tilt: float) -> None:
         assert (doubled(flat[triangles]) > 1e-9).all()  # each corner of a line is used, so that no seam opens
 
 
-def test_a_convex_polygon_is_a_fan() -> None:
-    square = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0.1), (0, 1, 0)], dtype=np.float64)
-    assert triangulate(square, np.array([4]))[0].tolist() == [[0, 1, 2], [0, 2, 3]]
-    dart = np.array([(0, 0, 0), (2, 1, 0), (0, 2, 0), (0.5, 1, 0)], dtype=np.float64)
-    assert sorted(map(sorted, triangulate(dart, np.array([4]))[0].tolist())) == [[0, 1, 3], [1, 2, 3]]
-
-
 def test_what_crosses_itself_is_counted_and_work_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
     star = np.array([(np.cos(4 * np.pi * k / 5), np.sin(4 * np.pi * k / 5), 0.0) for k in range(5)])
     triangles, _, wrong = triangulate(star, np.array([5]))

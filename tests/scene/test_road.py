@@ -14,7 +14,6 @@ from advsearch.scene.description import load_description
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.grounds import is_paved
 from advsearch.scene.raster import find_exclusive_texels
-from scenes.places.road import reflectance
 
 SIZE = 16
 
@@ -40,15 +39,6 @@ def test_another_environment_brings_its_own_ground() -> None:
     assert damp.material.roughness < dry.material.roughness
     assert damp.base_color.mean() < dry.base_color.mean()
     assert not is_paved(street.with_environment(load_scene("mug", "noon").description.environment).description)
-
-
-def test_a_road_has_its_size_in_metres_whatever_stands_on_it() -> None:
-    car, sign = (load_scene(name, "street").description for name in ("car", "stop-sign"))
-    extents = [np.ptp(one.surrounding_meshes["road"].mesh.vertices, axis=0) * one.metres for one in (car, sign)]
-    np.testing.assert_allclose(extents[0], extents[1], rtol=1e-5)
-    assert extents[0][0] == pytest.approx(120.0)
-    lane, line, pavement = reflectance(np.array([4.0, 1.0, 0.3]), np.array([0.0, 1.75, -4.2]))
-    assert lane.max() < 0.12 < pavement.max() < line.max()
 
 
 @pytest.mark.parametrize(("name", "metres"), [("car", 4.3), ("chair", 0.92)])

@@ -9,28 +9,16 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.options import format_things
 from advsearch.scene import library
 from advsearch.scene.description import load_description
 from advsearch.scene.geometry import compute_base_vertices, compute_footprint, find_overlap_interval, is_overlapping
 from advsearch.scene.outlines import find_visible_meshes
-from advsearch.scene.things import RequestedThing, parse_things
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
 VIEW = {"camera.distance": 16.0, "camera.azimuth": 20.0, "camera.elevation": 20.0, "camera.fov": 50.0}
 THREE = "car@-7,3.5,heading=160; stop-sign@3,-3,heading=-30; chair@3,2.5,size=1.1,heading=75"
 SIDE = 200
-
-
-def test_text_list_and_mapping_say_the_same() -> None:
-    text = "car@12,3.5,heading=180; chair@6,-2,size=0.9"
-    listed = [{"object": "car", "x": 12, "y": 3.5, "heading": 180}, "chair@6,-2,size=0.9"]
-    assert format_things(text) == format_things(listed) == text
-    assert format_things(None) is None and format_things(" ; ") is None
-    assert parse_things(text) == (
-        RequestedThing("car", 12.0, 3.5, 180.0, None, "car"), RequestedThing("chair", 6.0, -2.0, 0.0, 0.9, "chair")
-    )  # fmt: skip
 
 
 SQUARE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])

@@ -67,24 +67,6 @@ def test_a_predicted_change_is_the_traced_one(
 
 
 @pytest.mark.medium
-def test_a_fine_pattern_is_compared_without_the_denoiser(renderer: Renderer, predicted: linear.LinearRenderer) -> None:
-    """Which takes it for noise: with the pattern, a prediction is as near as at the start."""
-    squares = []
-    for u in (renderer.start, changed(renderer, 0.1, "signs")):
-        halves = renderer.render_halves(u, 5, 64)[:2]
-        with torch.no_grad():
-            squares.append(acceptance.compute_squared_error(predicted(u), halves, renderer.mask(u)))
-    assert squares[1] < squares[0] + 1.0
-
-
-@pytest.mark.medium
-def test_what_it_starts_from_is_the_traced_picture(renderer: Renderer, predicted: linear.LinearRenderer) -> None:
-    with torch.no_grad():
-        one, other = (renderer(renderer.start, seed=seed, spp=256) for seed in (11, 12))
-        assert levels(predicted(renderer.start), one) < 1.5 * levels(one, other)
-
-
-@pytest.mark.medium
 def test_its_derivative_is_that_of_the_adjoint(renderer: Renderer, predicted: linear.LinearRenderer) -> None:
     def loss(picture: Tensor) -> Tensor:
         return (picture * picture).mean()
@@ -170,13 +152,6 @@ def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for()
 def test_where_it_can_predict(controls: object, options: dict[str, object], can_predict: bool) -> None:
     made = advsearch.load_scene("mug").renderer(controls, resolution=16, **options)  # type: ignore[arg-type]
     assert (lights.find_refusal(made) is None) == can_predict
-
-
-@pytest.mark.medium
-def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(linear, "MAX_BYTES", 1000)
-    with pytest.raises(linear.TransportTooLargeError, match="would take"):
-        linear.LinearRenderer(renderer, renderer.start, seed=1)
 
 
 # ---- searches -------------------------------------------------------------------------------------------------------

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_wavefront import MAPPED, picture, read
+from test_wavefront import picture, read
 
-from advsearch.scene.importing import mtl_surfaces
 from advsearch.scene.importing.texture import average_over_faces
 
 RED, BLUE = np.full((4, 4, 3), (255, 0, 0)), np.full((4, 4, 3), (0, 0, 255))
@@ -17,8 +16,6 @@ TWO = (
     "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvt 2 0\nvt 2 1\nf 1/1 2/2 3/3 4/4\nf 2/2 5/5 6/6 3/3\n"
 )
 """Two squares side by side, in 1001 and 1002."""
-SHARED = "mtllib a.mtl\nusemtl m\n" + MAPPED.replace("vt 1 ", "vt 0.5 ") + "f 1/1 2/2 3/3 4/4\n"
-"""A square that shows the left half of its picture."""
 
 
 @pytest.mark.parametrize("name", ["skin.1001.png", "skin.<UDIM>.png", "skin_1001.png", "-s 1 1 1 skin.1001.png"])
@@ -37,29 +34,7 @@ def test_each_square_has_its_own_picture(name: str, tmp_path: Path) -> None:
     assert {part.surface.name for part in parts} == {"m"}
 
 
-def test_squares_are_numbered_as_udim_has_them() -> None:
-    at = np.array([[0.5, 0.5], [9.5, 0.5], [0.5, 1.5], [2.5, 3.5], [-0.5, 0.5], [10.5, 0.5]])
-    assert mtl_surfaces.compute_squares(at[:, None].repeat(3, axis=1)).tolist() == [1001, 1010, 1011, 1033, 0, 0]
-    assert [mtl_surfaces.get_square_corner(one) for one in (1001, 1010, 1033, 0)] == [(0, 0), (9, 0), (2, 3), (0, 0)]
-
-
 # ---- means ----------------------------------------------------------------------------------------------------------
-
-
-def halves(left: int, right: int) -> np.ndarray:
-    """A picture whose left half is of one value, and a part of the right half of another."""
-    found = np.full((32, 32, 3), left)
-    found[:, 20:28] = right  # away from the seams, where it would be filtered
-    return found
-
-
-def test_a_mean_is_over_what_faces_show(tmp_path: Path) -> None:
-    """In a material file; the right half of the picture is on no face."""
-    picture(tmp_path, "rough.png", halves(204, 0))
-    parts, notes = read(tmp_path, SHARED, a="newmtl m\nmap_Pr rough.png\nmap_Pm rough.png\n")
-    assert parts[0].surface.roughness == pytest.approx(0.8, abs=0.01)
-    assert parts[0].surface.metallic == pytest.approx(0.8, abs=0.01)
-    assert len(notes) == 1 and "roughness and metallic" in notes[0]
 
 
 def test_a_mean_weighs_faces_by_their_area() -> None:

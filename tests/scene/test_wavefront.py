@@ -80,15 +80,6 @@ def test_options_and_names_of_maps(rest: str, name: str | None, options: dict[st
     assert use is None or options is None or use.options == options
 
 
-@pytest.mark.parametrize("line", ["map_Kd -s 2 3 1 -o 0.5 0.25 my wood.png", "map_Kd my wood.png -o .5 .25 -s 2 3"])
-def test_scale_and_offset_of_a_map_move_texture_coordinates(tmp_path: Path, line: str) -> None:
-    pixels = picture(tmp_path, "my wood.png")
-    part, notes = material(tmp_path, "Kd 1 1 1", line)
-    assert notes == [] and part.uvs is not None and same(part.surface.texture, pixels)
-    corners = part.vertices[:, :2] * (2.0, 3.0) + (0.5, 0.25)
-    np.testing.assert_allclose(part.uvs, corners)
-
-
 def test_values_and_channels_of_maps(tmp_path: Path) -> None:
     pixels = picture(tmp_path, "wood.png")
     part, notes = material(tmp_path, "map_Kd -mm 0.25 0.5 wood.png", "map_d -imfchan g wood.png")

@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-import advsearch
 from advsearch.attacks.objectives import get_objective
 from advsearch.cli.main import main
 from advsearch.options import NOT_A_NUMBER
@@ -99,12 +98,6 @@ def test_nearer_and_farther_have_a_sign_and_a_mixture_has_neither() -> None:
     assert replace(TASK, minimise=True).judge(said(INVERSE), TRUTH)[0].success
 
 
-def test_near_does_not_become_far_by_a_negative_scale() -> None:
-    (found,) = TASK.judge([{DISPARITY: -INVERSE}], TRUTH)
-    payload: Any = found.payload
-    assert not found.right and payload["relief"] < 0.5
-
-
 def test_where_nothing_is_seen_nothing_is_wrong_and_where_numbers_are_none_nothing_is_right() -> None:
     unseen = DepthTruth(torch.zeros_like(MASK), TRUTH.z)
     (found,) = TASK.judge(said(GROUND), unseen)
@@ -144,7 +137,7 @@ def test_a_model_is_read_in_every_form() -> None:
         ((found),) = TASK.read(answer, 1)
         assert list(found) == [kind] and found[kind].equal(INVERSE)
     for other in (INVERSE, values.expand(2, -1, -1), {"masks": values}, values[:, None].expand(-1, 2, -1, -1), ()):
-        with pytest.raises(ValueError, match=r"expected a number for each pixel, \(N, height, width\)"):
+        with pytest.raises(ValueError, match=r"\(N, height, width\)"):
             TASK.read(other, 1)
 
 
@@ -235,14 +228,3 @@ def test_a_sweep_counts(asked: list[str], capsys: pytest.CaptureFixture[str], tm
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         payloads: list[Any] = [row.payload for row in store.rows("sweep")]
     assert [one["fitted"] for one in payloads] == ["beside the object", "in the whole picture"]
-
-
-def test_the_bundled_ground_says_the_scale() -> None:
-    """A model that knows every distance along the axis by a scale and a shift is right, and one along rays is not."""
-    scene = advsearch.load_scene("mug")
-    render = scene.renderer(["pose"], resolution=24)
-    seen = render.surfaces(render.start)
-    truth = DepthTruth(seen.visible_mask("object"), seen.z_depth)
-    assert truth.determines_scale and int(truth.outside_object.sum()) > 100
-    margins = [float(TASK.loss(said(one.reciprocal()), truth)) for one in (seen.z_depth, seen.depth)]
-    assert margins[0] == pytest.approx(-math.log(1.25), abs=1e-5) and margins[1] > margins[0] + 1e-3

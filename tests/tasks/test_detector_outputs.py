@@ -17,7 +17,6 @@ from advsearch.models import load_model
 from advsearch.options import NOT_A_NUMBER
 from advsearch.tasks import Detection, Prediction
 from advsearch.tasks.boxes import Detections, DetectionTruth
-from advsearch.tasks.detector_outputs import read_detections, resolve_detections
 
 CUP, BOWL = [20.0, 40.0, 60.0, 90.0], [65.0, 10.0, 90.0, 35.0]
 NAMES = ("cup", "bowl")
@@ -122,19 +121,6 @@ def test_what_the_numbers_leave_open_is_asked_for() -> None:
 
 def three() -> Rows:
     return torch.tensor([[CUP, BOWL]]), torch.tensor([[0.8, 0.6]]), torch.tensor([[0.0, 1.0]])
-
-
-@pytest.mark.parametrize(
-    ("answer", "text"),
-    [
-        (lambda b, s, c: (b, s, s), "expected for each box a score in"),
-        (lambda b, s, c: {"boxes": b, "labels": c + 0.5, "scores": s}, "classes that are whole numbers"),
-        (lambda b, s, c: torch.cat([b, s[..., None]], dim=-1)[0], "expected boxes"),
-    ],
-)
-def test_what_cannot_be_a_score_and_a_class_is_refused(answer: Callable[..., Any], text: str) -> None:
-    with pytest.raises(ValueError, match=text):
-        resolve_detections(read_detections(answer(*three()), 1)[0])
 
 
 # ---- unit and form --------------------------------------------------------------------------------------------------

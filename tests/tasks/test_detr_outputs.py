@@ -72,7 +72,7 @@ def test_names_say_how_logits_are_read(form: str, nothing: bool) -> None:
 
 
 def test_a_tuple_is_read_as_is_said() -> None:
-    with pytest.raises(ModelError, match=r"apply a sigmoid .*, or say `task='detection=\{order: boxes logits\}'` or"):
+    with pytest.raises(ModelError, match="boxes logits"):
         load_model(Bright(lambda logits, boxes: (logits[..., :3], boxes)), input_size=32, task="detection")
     network = Bright(lambda logits, boxes: (logits, boxes))
     task = Detection(order=CHOSEN)
@@ -80,7 +80,7 @@ def test_a_tuple_is_read_as_is_said() -> None:
     task = task.on(model)
     (found,) = task.judge(model(torch.full((32, 32, 3), 0.6)), TRUTH)
     assert found.right and not task.remarks
-    with pytest.raises(InputError, match="expected 3 logits of a box for 3 classes"):
+    with pytest.raises(InputError, match="3 classes"):
         Detection(order=ALONE).on(model)
 
 

@@ -173,10 +173,10 @@ def named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_task_is_made_with_options(named: None) -> None:
     assert make_task("yaw") == make_task({"name": "yaw"}) == Yaw()
     assert make_task({"name": "yaw", "tolerance": 5}) == Yaw(tolerance=5.0)
-    with pytest.raises(UnknownNameError, match=r"unknown option of task 'yaw': 'tolerence'. Did you mean 'tolerance'"):
+    with pytest.raises(UnknownNameError, match="'tolerance'"):
         make_task({"name": "yaw", "tolerence": 5})
-    with pytest.raises(InputError, match=r"tolerance of task yaw: expected a finite number .*, got 'wide'"):
+    with pytest.raises(InputError, match="tolerance"):
         make_task({"name": "yaw", "tolerance": "wide"})
     for option in ("minimise", "target", "labels", "named"):
-        with pytest.raises(UnknownNameError, match="unknown option of task 'classification'"):
+        with pytest.raises(UnknownNameError, match="'classification'"):
             make_task({option: True})

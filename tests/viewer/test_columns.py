@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from advsearch.options import Value
-from advsearch.runs.store import NAME, Row, Store
+from advsearch.runs.store import Row
 from advsearch.runs.tables import make_sweep_frame
 from advsearch.viewer.columns import pack_columns, read_columns
 from advsearch.viewer.thumbnails import find_thumbnails, thumbnail_path
@@ -60,13 +60,3 @@ def test_what_is_packed_is_what_the_rows_are() -> None:
     assert (yaw["name"], yaw["unit"], yaw["levels"]) == ("yaw", "degrees", None)
     assert list(columns["parameter 0"]) == [0, 10, 20, 30, 40]
     assert [environment["levels"][k] for k in columns["parameter 1"]] == ["a", "b", "a", "b", "a"]
-
-
-def test_rows_are_read_in_parts(tmp_path: Path) -> None:
-    with Store(tmp_path / NAME) as store:
-        store.append([row(k, yaw=float(k)) for k in range(10)])
-        store.append([Row("verification", 0)])
-    first = read_columns(tmp_path, max_rows=4)
-    assert (first["step"].tolist(), first["id"].iloc[-1]) == ([0, 1, 2, 3], 4)
-    assert read_columns(tmp_path, after=4)["step"].tolist() == [4, 5, 6, 7, 8, 9]
-    assert read_columns(tmp_path, after=10)["step"].tolist() == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,21 +11,12 @@ from test_browser import browser, faults, opened, until  # noqa: F401  the fixtu
 import advsearch
 import small_models
 from advsearch.questions.sweep.page import write_bundle
-from advsearch.viewer.columns import Boxes
 from stored_sweeps import make_sweep, serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 HOSTILE = "<img src=x onerror=document.title='planted'>"
-
-
-def test_boxes_of_all_rows_are_one_list_with_an_end_for_each_row() -> None:
-    boxes = Boxes()
-    found = [{"box": [1.0, 2.0, 3.5, 4.0], "label": "car", "score": 0.25}]
-    boxes.add({"box": None, "found": found, "things": {"near": {"box": [0, 0, 9000.0, 2]}, "hidden": {"box": None}}})
-    assert list(boxes.values) == [0, 0, 65534, 16, 0, 65535, 8, 16, 28, 32, 1, 2500]
-    assert boxes.names == {"near": 0, "car": 1} and copy.deepcopy(boxes) is boxes
 
 
 def sought(page: Page, text: str) -> int:

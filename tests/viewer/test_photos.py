@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
-import os
-import socket
 import ssl
 import struct
-import tempfile
 import zlib
 from collections.abc import Iterator
 from contextlib import closing
@@ -17,7 +13,6 @@ from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
 from pathlib import Path
 from urllib.parse import unquote
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -27,10 +22,8 @@ from advsearch.questions.photographs.result import find_photo, find_rendering, s
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.statistics.intervals import clopper_pearson
-from advsearch.trust.network import make_https_context
 from advsearch.viewer.clients import MAX_BODY_BYTES
 from advsearch.viewer.server import Dashboard
-from samples import make_run
 from stored_sweeps import make_sweep, serving
 
 
@@ -168,18 +161,6 @@ def test_photographs_are_judged_by_the_runs_model_and_counted(tmp_path: Path, ta
     assert photo_agreement(run) == table
 
 
-def test_what_the_model_says_of_a_photograph_of_a_rendering_is_what_it_says_of_the_rendering(
-    tmp_path: Path, taker: Photographs
-) -> None:
-    run = make_run(tmp_path / "attack")
-    noise = np.random.default_rng(0).random((128, 128, 3))
-    with RunDirectory.resume(run) as held:
-        held.save_image("adversarial", noise)
-    table = taker.add(run, "adversarial", (run / "images/adversarial.png").read_bytes())
-    assert table.renderings[0].labels == [table.renderings[0].label]
-    assert table.agreement == 1.0
-
-
 def test_a_run_at_work_takes_no_photographs(tmp_path: Path, taker: Photographs) -> None:
     run = make_sweep(tmp_path / "going", keep="all", ended=False)
     with RunDirectory.resume(run), pytest.raises(InputError, match="working on"):
@@ -279,30 +260,3 @@ def test_beyond_this_machine_it_is_https_with_a_token(run: Path, taker: Photogra
         with pytest.raises((ConnectionError, OSError, ssl.SSLError)):
             post(server, PATH, picture())  # no HTTP beside it
         assert post(server, f"{PATH}?token={server.token}", picture(), secure=True)[0].status == 200
-
-
-def test_https_is_there_on_this_machine_when_asked_for(run: Path) -> None:
-    with serving(run, https=True) as server:
-        assert server.address.startswith("https://127.0.0.1")
-        assert server.token is None
-        with socket.create_connection(("127.0.0.1", server.server_port)) as plain:
-            context = ssl._create_unverified_context()
-            with context.wrap_socket(plain) as talk:
-                data = talk.getpeercert(binary_form=True)
-        assert data is not None
-        assert hashlib.sha256(data).hexdigest() == str(server.fingerprint).replace(":", "").lower()
-
-
-def test_the_key_is_for_this_user_alone_and_does_not_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[tuple[int, int]] = []
-    original = ssl.SSLContext.load_cert_chain
-
-    def looked_at(self: ssl.SSLContext, certfile: Path, keyfile: Path) -> None:
-        seen.append((os.stat(keyfile).st_mode & 0o777, os.stat(keyfile.parent).st_mode & 0o777))
-        original(self, certfile, keyfile)
-
-    monkeypatch.setattr(ssl.SSLContext, "load_cert_chain", looked_at)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    make_https_context(["127.0.0.1", "localhost"])
-    assert seen == [(0o600, 0o700)]
-    assert list(tmp_path.iterdir()) == []

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -94,27 +92,3 @@ def test_this_machine_has_a_usable_one_and_it_tells_the_version_of_its_name() ->
     chosen = llvm.ensure_llvm()
     assert chosen.version[0] >= llvm.MIN_VERSION
     assert llvm.query_version(str(chosen.path))[: len(chosen.version)] == chosen.version
-
-
-def test_command_prints_the_choice_or_fails_with_the_message(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "advsearch.scene.mitsuba_backend.llvm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "libLLVM" in done.stdout or "LLVM-C" in done.stdout
-    environ = os.environ | {llvm.ENVIRONMENT_VARIABLE: str(tmp_path / "none.so")}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environ)
-    assert (done.returncode, done.stdout) == (3, "")
-    assert "does not exist" in done.stderr
-
-
-def test_mitsuba_comes_with_our_variant_few_messages_and_all_threads() -> None:
-    from advsearch import threads
-    from advsearch.scene.mitsuba_backend.variant import VARIANT, import_mitsuba
-
-    mi = import_mitsuba()
-    import drjit as dr
-
-    assert mi.variant() == VARIANT
-    assert dr.log_level() == dr.LogLevel.Warn
-    assert threads.configure(1) == dr.thread_count() == 1
-    assert threads.configure() == dr.thread_count() >= 1
-    assert import_mitsuba() is mi

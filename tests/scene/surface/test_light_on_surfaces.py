@@ -12,7 +12,6 @@ from torch import Tensor
 
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene.library import load_object
-from advsearch.scene.mitsuba_backend.texel_rays import measure_lobes
 from advsearch.scene.predictor import RefusalCause
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import arrangement, texels
@@ -104,21 +103,6 @@ def test_pictures_through_a_lens_are_those_that_are_traced(camera: str | None, f
         assert float(light(u)[:2, :2].max()) == 0.0
 
 
-def test_pictures_of_several_cameras_at_once_are_those_of_each(light: SurfaceRenderer) -> None:
-    """Two of them under one light, one under another."""
-    renderer = light.path_renderer
-    first, second = drawn(renderer, 0), drawn(renderer, 1)
-    third = second.clone()
-    for group in renderer.space.groups:
-        if group.control == "environment":
-            third[group.coordinates] = first[group.coordinates]
-    wholes = [first, second, third]
-    with torch.no_grad():
-        inputs = [light.compute_inputs(one) for one in wholes]
-        together = light.compose_images(light.trace_views(inputs), inputs, light.get_color(inputs[0]), wholes)
-        assert torch.equal(together, torch.stack([light(one) for one in wholes]))
-
-
 @pytest.mark.medium
 def test_the_derivative_is_that_of_differences(traced: Renderer) -> None:
     """Of radiance in the texture, in which it is linear but for the curve between both."""
@@ -197,23 +181,6 @@ def test_light_between_surfaces_follows_the_texture_when_it_is_renewed(traced: R
         made.update_base_color(black)
         after = made(white).mean()
     assert float(after) < float(before)
-
-
-@pytest.mark.medium
-def test_a_surface_is_measured() -> None:
-    """The bundled mug reflects more at grazing angles, in a lobe about the mirrored direction; a mirror all of it."""
-    shares = {}
-    for roughness, metallic in ((0.3, 0.0), (0.05, 1.0)):
-        scene = load_scene("ball", settings={"material.roughness": roughness, "material.metallic": metallic})
-        of = scene.renderer("texture", resolution=8)
-        made = SurfaceRenderer(of, of.start, seed=0).arrangement
-        lobes = measure_lobes(of.scene, {}, made.texels.grids[0], made.texels.positions[9], made.texels.normals[9])
-        shares[metallic] = lobes
-    mug, mirror = shares[0.0], shares[1.0]
-    assert mug.diffuse[-1] == pytest.approx(1.0, abs=0.05)
-    assert mug.gloss[0] > 3.0 * mug.gloss[-1]
-    middle = (np.arange(len(mug.up)) + 0.5) / len(mug.up)
-    assert np.abs(mirror.up[8:] - middle[8:]).max() < 0.2
 
 
 @pytest.mark.medium
