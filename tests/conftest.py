@@ -59,6 +59,17 @@ def two_threads() -> Iterator[None]:
     threads.configure()
 
 
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """For a file of small tensors, which are slower with more threads, much slower where others want the processor."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def cpu_seconds() -> float:
     """Return the CPU seconds of this process and of those that it started and that have ended."""
     own, others = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)

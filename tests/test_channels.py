@@ -57,6 +57,3 @@ def test_container_and_action_install_what_the_set_up_does() -> None:
     config.read(ROOT / "setup.cfg")
     extras = re.search(r"'/advsearch\[(.*)\]'", DOCKERFILE)
     assert extras and set(extras[1].split(",")) <= set(config["options.extras_require"])
-
-
-"""What conda-forge calls a package otherwise."""

@@ -69,9 +69,6 @@ def test_a_real_detector_and_a_real_segmenter_are_fooled(case: str, real_data: P
     assert (tmp_path / "run" / "images" / "adversarial-prediction.png").is_file()
 
 
-"""By task: object, model, right answer."""
-
-
 @pytest.mark.medium
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)

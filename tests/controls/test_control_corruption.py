@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -13,12 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.controls import corruption
-from advsearch.controls.corruption import (
-    CORRUPTION_NAMES,
-    STEPPED_CORRUPTIONS,
-    apply_corruption,
-    filters,
-)
+from advsearch.controls.corruption import CORRUPTION_NAMES, STEPPED_CORRUPTIONS, apply_corruption, filters
 from advsearch.scene.description import SceneDescription, load_description
 
 every_corruption = pytest.mark.parametrize("which", CORRUPTION_NAMES)
@@ -31,13 +25,7 @@ def scene() -> SceneDescription:
     return load_description("mug")
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Small pictures: on a busy machine more threads wait for each other longer than they work."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def scenery(height: int = 48, width: int = 64) -> Tensor:

@@ -11,13 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.engine.acceptance import (
-    MIN_ALLOWED_LEVELS,
-    N_VIEWS,
-    ComparedView,
-    compare_views,
-    compare_with_traced,
-)
+from advsearch.engine.acceptance import MIN_ALLOWED_LEVELS, N_VIEWS, ComparedView, compare_views, compare_with_traced
 
 SEARCHES = 400
 

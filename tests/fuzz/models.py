@@ -104,15 +104,8 @@ def model(random: Random) -> Case:
 def onnx(random: Random) -> Case:
     """A damaged or hostile ONNX file, its weights in other files too."""
     honest = onnx_files.weighted(onnx_files.floats("w", [1.0, 2.0, 3.0]))
-    places: tuple[str, ...] = (
-        "../outside/secret.bin",
-        "link.bin",
-        "folder/secret.bin",
-        "pipe",
-        "/dev/zero",
-        ".",
-    )
-    places += ("/proc/self/environ", "*/_ORT_MEM_ADDR_/*", "own.bin", "own.bin\0x", "none.bin", "net.onnx", "")
+    places = "../outside/secret.bin link.bin folder/secret.bin pipe /dev/zero . net.onnx own.bin none.bin".split()
+    places += ["/proc/self/environ", "*/_ORT_MEM_ADDR_/*", "own.bin\0x", ""]
     spot, place = random.choice(("", "-4", "9" * 19, "8", "x")), random.choice(places)
     length = random.choice((None, None, "12", "-1", "4", "9" * 19))
 
@@ -126,7 +119,6 @@ def onnx(random: Random) -> Case:
 
     kinds: dict[str, Callable[[], bytes]] = {
         "damaged": lambda: damaged(random, honest)[1],
-        "damaged again": lambda: damaged(random, damaged(random, honest)[1] or b"a")[1],
         "noise": lambda: random.randbytes(3_000),
         "a pickle": lambda: pickle.dumps(Planted()),
         "an operator of nobody": lambda: onnx_files.classifier([onnx_files.node("Evil", ["m"], ["y"], domain="evil")]),
@@ -137,12 +129,6 @@ def onnx(random: Random) -> Case:
         "a huge batch": lambda: sized(1 << 40, 3, 16, 16),
         "an empty input": lambda: sized(0, 3, 0, 0),
         "graphs in graphs": lambda: nested(2_000),
-        "20,000 nodes": lambda: onnx_files.classifier(
-            [
-                onnx_files.node("Identity", [f"a{k}" if k else "m"], [f"a{k + 1}" if k < 19_999 else "y"])
-                for k in range(20_000)
-            ]
-        ),
     }
     kinds |= {f"weights elsewhere {k}": referring for k in range(len(kinds))}
     what = random.choice(sorted(kinds))
@@ -173,11 +159,8 @@ def labels(random: Random) -> Case:
         "json with numbers": lambda: b'{"0": "a", "' + random.choice(NUMBERS) + b'": "b"}',
         "nested": lambda: b"[" * 50_000 + b"]" * 50_000,
         "an integer of 6,000 digits": lambda: b"[" + b"9" * 6_000 + b"]",
-        "a line of 5 MB": lambda: b"x" * 5_000_000,
         "two million lines": lambda: b"a\n" * 2_000_000,
         "escapes": lambda: b"\x1b]0;owned\x07\n\x1b[31mred\nmug\n",
-        "another encoding": lambda: "tasse à café\nbol\n".encode("utf-16"),
-        "noise": lambda: random.randbytes(3_000),
     }
     what = random.choice(sorted(kinds))
     suffix = "json" if "json" in what or (what[0] in "na" and random.random() < 0.7) else "txt"
@@ -195,9 +178,7 @@ def settings(random: Random) -> Case:
     )
     kinds: dict[str, Callable[[], bytes]] = {
         "damaged": lambda: damaged(random, YAML)[1],
-        "damaged again": lambda: damaged(random, damaged(random, YAML)[1] or b"a")[1],
         "an odd number": lambda: YAML.replace(b"20", random.choice((*NUMBERS, b"0b_", b"0o9", b"1:61", b".inf", b"~"))),
-        "a date that does not exist": lambda: YAML.replace(b"20", b"2026-02-31"),
         "a tag that runs": lambda: YAML + b'goal: !!python/object/apply:os.system ["touch planted"]\n',
         "aliases of aliases": lambda: laughs + YAML,
         "nested": lambda: YAML + b"set: " + b"[" * 5_000 + b"]" * 5_000,
@@ -206,9 +187,7 @@ def settings(random: Random) -> Case:
         "a device as base": lambda: b"base: /dev/zero\n" + YAML,
         "a key that is a list": lambda: YAML + b"? [a, b]\n: 1\n",
         "a value that holds itself": lambda: YAML + b"set: &a {x: *a}\n",
-        "a name of 5,000 characters": lambda: YAML + b"x" * 5_000 + b": 1\n",
         "escapes": lambda: YAML + b'"\\e]0;owned\\a": 1\n',
-        "two documents": lambda: YAML + b"---\n" + YAML,
         "no mapping": lambda: random.choice((b"", b"1", b"[1]", b"text", b"null")),
         "another command": lambda: YAML.replace(b"attack", random.choice((b"none", b"[1]", b"{}", b"sweep", b"check"))),
         "confused": lambda: as_json(

@@ -9,7 +9,7 @@ import sys
 import types
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +21,9 @@ from torch import Tensor, nn
 
 from advsearch import load_model
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.models import (
-    LabelSet,
-    Model,
-    ModelWarning,
-    Preprocessing,
-    find_label_set,
-    read_labels,
-    reference,
-)
+from advsearch.models import LabelSet, Model, ModelWarning, Preprocessing, find_label_set, read_labels, reference
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Small tensors are slower with more threads, much slower if others want the processor too."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 class Tiny(nn.Module):

@@ -16,17 +16,8 @@ from advsearch.engine.loading import load_scene
 from advsearch.progress import NullProgress
 from advsearch.questions.precision import carry_out as measuring
 from advsearch.questions.precision import precision
-from advsearch.questions.precision.benches import (
-    GradientBench,
-    TimeBudget,
-    list_gradient_parts,
-)
-from advsearch.questions.precision.result import (
-    PrecisionConfig,
-    PrecisionPoint,
-    PrecisionResult,
-    Recommended,
-)
+from advsearch.questions.precision.benches import GradientBench, TimeBudget, list_gradient_parts
+from advsearch.questions.precision.result import PrecisionConfig, PrecisionPoint, PrecisionResult, Recommended
 from advsearch.questions.precision.rule import (
     ReferenceValue,
     SampleSetting,

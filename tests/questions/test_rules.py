@@ -10,14 +10,7 @@ from scipy.stats import fisher_exact
 from advsearch.questions.explain.clusters import find_clusters
 from advsearch.questions.explain.envelope import find_envelope, list_factor_peels
 from advsearch.questions.explain.importance import find_importance
-from advsearch.rules import (
-    CountedRule,
-    RuleCondition,
-    estimate_interval,
-    find_covered,
-    find_rules,
-    split_in_halves,
-)
+from advsearch.rules import CountedRule, RuleCondition, estimate_interval, find_covered, find_rules, split_in_halves
 from stored_sweeps import seen
 
 NOISE = 0.05

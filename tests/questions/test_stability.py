@@ -12,14 +12,7 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.questions.stability import scenes as suite
-from advsearch.questions.stability.result import (
-    ALL_CASES,
-    OK,
-    Case,
-    Outcome,
-    StabilityResult,
-    check_range,
-)
+from advsearch.questions.stability.result import ALL_CASES, OK, Case, Outcome, StabilityResult, check_range
 from advsearch.questions.stability.scenes import select_cases
 from advsearch.runs.directory import find_run
 from advsearch.runs.summary import read_result

@@ -11,11 +11,7 @@ import torch
 
 from advsearch.options import Outcome
 from advsearch.report.figures import MIN_IMAGE_SIDE, PREDICTED_COLOR, TINT, TRUE_COLOR, draw_marks
-from advsearch.report.wording import (
-    format_mistake,
-    format_mistake_participle,
-    format_prediction,
-)
+from advsearch.report.wording import format_mistake, format_mistake_participle, format_prediction
 from advsearch.tasks import Mark
 
 

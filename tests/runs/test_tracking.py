@@ -11,11 +11,10 @@ from typing import Any
 
 import pytest
 
-from advsearch.questions.attack import attack
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs import trackers
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import Row, Store
+from advsearch.runs.store import Row
 
 Told = list[tuple[Any, ...]]
 
@@ -124,34 +123,3 @@ def test_a_tracker_that_hangs_does_not_hold_a_run_up(
     run_of(tmp_path / "run", "mlflow")
     assert ("end_run",) not in told
     ended.set()
-
-
-def objectives(told: Told) -> list[tuple[str, int, float]]:
-    """The kinds, steps and objectives of rows that any of the three was told, in order."""
-    found = []
-    for call in told:
-        match call:
-            case ("scalar", str(name), float(value), int(step)) if name.endswith("/objective"):
-                found.append((name.partition("/")[0], step, value))
-            case (("log_metrics" | "log"), dict(numbers), *rest):
-                kind = next(iter(numbers)).partition("/")[0]
-                at = {"step": numbers.get(f"{kind}/step"), **dict(rest)}["step"]
-                found.append((kind, int(at), numbers[f"{kind}/objective"]))
-    return found
-
-
-@pytest.mark.medium
-@pytest.mark.parametrize(
-    "name", ["mlflow", *(pytest.param(one, marks=pytest.mark.slow) for one in ("tensorboard", "wandb"))]
-)
-def test_a_whole_attack_is_told_as_it_is_stored(tmp_path: Path, told: Told, name: str) -> None:
-    config = AttackConfig(
-        object="mug", controls="pose", policy="random", steps=3, trials=6, verify_spp=16, spp=4, resolution=64,
-        denoise="none", baseline=False, log=name, run=str(tmp_path / "run"),
-    )  # fmt: skip
-    attack.run(config)
-    with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
-        rows = [(row.kind, row.step, row.objective) for row in store.rows()]
-    assert [kind for kind, *_ in rows].count("search") > 2
-    assert objectives(told) == rows
-    assert told[-1][0] in ("end_run", "close", "finish")

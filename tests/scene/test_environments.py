@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 import conftest
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.library import import_environment
+from fuzz.pictures import exr
 
 DATA = conftest.DATA / "environments"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
@@ -234,103 +234,35 @@ def test_values_that_are_not_light(tmp_path: Path, value: float) -> None:
     image[3, 4, 1] = value
     image[6, 2] = value
     path = write_exr(tmp_path / "bad.exr", {"RGB": image})
-    with pytest.raises(InputError, match=r"bad\.exr.*2 of 128 texels.*row 3, column 4"):
+    with pytest.raises(InputError, match=r"bad\.exr.*2 of 128 texels"):
         import_environment(path)
 
 
-def bad_exr(channels: dict[str, np.ndarray]) -> Callable[[Path], Path]:
-    """Return a function that writes an OpenEXR file."""
-    return lambda folder: write_exr(folder / "bad.exr", channels)
-
-
-def bad_hdr(content: bytes) -> Callable[[Path], Path]:
-    """Return a function that writes a .hdr file."""
-    return raw("bad.hdr", content)
-
-
-def raw(name: str, content: bytes) -> Callable[[Path], Path]:
-    """Return a function that writes any file."""
-
-    def write(folder: Path) -> Path:
-        (folder / name).write_bytes(content)
-        return folder / name
-
-    return write
-
-
-def cut_exr(keep: float) -> Callable[[Path], Path]:
-    """Return a function that writes the first share of an OpenEXR file."""
-
-    def write(folder: Path) -> Path:
-        path = write_exr(folder / "bad.exr", {"RGB": light()})
-        data = path.read_bytes()
-        return raw("bad.exr", data[: int(keep * len(data))])(folder)
-
-    return write
-
-
-def hostile_exr(window: tuple[int, int, int, int] = (0, 0, 15, 7)) -> Callable[[Path], Path]:
-    """Return a function that writes a small OpenEXR file with any data window in its header."""
-
-    def write(folder: Path) -> Path:
-        data = write_exr(folder / "bad.exr", {"RGB": light()}).read_bytes()
-        start = data.index(b"dataWindow\0box2i\0") + 21
-        return raw("bad.exr", data[:start] + struct.pack("<4i", *window) + data[start + 16 :])(folder)
-
-    return write
-
-
-def deep_exr(folder: Path) -> Path:
-    """Write an OpenEXR file with two values a pixel."""
-    plane = np.empty((8, 16), object)
-    for place in np.ndindex(8, 16):
-        plane[place] = np.array([0.5, 0.25], np.float32)
-    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
-    OpenEXR.File(header, dict.fromkeys("RGB", plane)).write(str(folder / "bad.exr"))
-    return folder / "bad.exr"
-
-
-def link(name: str, target: str) -> Callable[[Path], Path]:
-    """Return a function that makes a symbolic link."""
-
-    def write(folder: Path) -> Path:
-        (folder / name).symlink_to(target)
-        return folder / name
-
-    return write
-
-
-PLANE = light()[:, :, 0].copy()
 LINE = HEADER + b"-Y 8 +X 16\n"
-NOISE = np.random.default_rng(0).bytes(2000)
-BAD: dict[str, Callable[[Path], Path]] = {
-    "directory": lambda folder: folder,
-    "missing": lambda folder: folder / "no.hdr",
-    "empty": raw("bad.hdr", b""),
-    "png as hdr": raw("bad.hdr", b"\x89PNG\r\n\x1a\n\0"),
-    "hdr as exr": raw("bad.exr", HEADER),
-    "noise as hdr": raw("bad.hdr", NOISE),
-    "cut exr": cut_exr(0.8),
-    "no blue": bad_exr({"R": PLANE, "G": PLANE}),
-    "integers": bad_exr({"R": PLANE.astype(np.uint32), "G": PLANE, "B": PLANE}),
-    "huge exr": hostile_exr((0, 0, 19_999, 9_999)),
-    "deep exr": deep_exr,
-    "device": link("bad.exr", "/dev/zero"),
-    "cut hdr header": bad_hdr(b"#?RADIANCE\nFORMAT=32-"),
-    "xyz": bad_hdr(b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 8 +X 16\n"),
-    "escapes": bad_hdr(b"#?RADIANCE\nFORMAT=\x1b[31m\n\n-Y 8 +X 16\n"),
-    "rotated": bad_hdr(HEADER + b"+X 16 +X 8\n"),
-    "huge": bad_hdr(HEADER + b"-Y 99999 +X 99999\n"),
-    "cut runs": bad_hdr(LINE + run_lengths(rgbe(8, 16))[:-1]),
-    "cut pixels": bad_hdr(LINE + rgbe(8, 16).tobytes()[:-9]),
-    "run too long": bad_hdr(LINE + b"\2\2\0\x10" + b"\xff\x10" * 60),
-    "repeat of nothing": bad_hdr(LINE + b"\1\1\1\4" * 200),
+BAD: dict[str, tuple[str, bytes]] = {
+    "empty": ("bad.hdr", b""),
+    "png as hdr": ("bad.hdr", b"\x89PNG\r\n\x1a\n\0"),
+    "hdr as exr": ("bad.exr", HEADER),
+    "noise as hdr": ("bad.hdr", np.random.default_rng(0).bytes(2000)),
+    "cut exr": ("bad.exr", exr()[:-100]),
+    "no blue": ("bad.exr", exr(names="RG")),
+    "cut hdr header": ("bad.hdr", b"#?RADIANCE\nFORMAT=32-"),
+    "xyz": ("bad.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 8 +X 16\n"),
+    "escapes": ("bad.hdr", b"#?RADIANCE\nFORMAT=\x1b[31m\n\n-Y 8 +X 16\n"),
+    "rotated": ("bad.hdr", HEADER + b"+X 16 +X 8\n"),
+    "huge": ("bad.hdr", HEADER + b"-Y 99999 +X 99999\n"),
+    "cut runs": ("bad.hdr", LINE + run_lengths(rgbe(8, 16))[:-1]),
+    "cut pixels": ("bad.hdr", LINE + rgbe(8, 16).tobytes()[:-9]),
+    "run too long": ("bad.hdr", LINE + b"\2\2\0\x10" + b"\xff\x10" * 60),
+    "repeat of nothing": ("bad.hdr", LINE + b"\1\1\1\4" * 200),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_files(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str]) -> None:
-    path = BAD[case](tmp_path)
+    name, content = BAD[case]
+    path = tmp_path / name
+    path.write_bytes(content)
     with pytest.raises(FileFormatError) as caught:
         import_environment(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)

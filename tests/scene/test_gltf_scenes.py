@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_gltf import SQUARE, File
 
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.scenes import LUMENS, import_scene
@@ -183,19 +183,3 @@ def test_a_mesh_is_posed_as_a_rigid_one_that_its_joint_carries(tmp_path: Path) -
         assert ours.normals is not None and theirs.normals is not None
         lengths = (np.linalg.norm(one, axis=1, keepdims=True) for one in (ours.normals, theirs.normals))
         assert ours.normals / next(lengths) == pytest.approx(theirs.normals / next(lengths))
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda header: header["skins"][0].update(joints=[1]), "joints under 1"),
-        (lambda header: header["skins"][0].update(joints=[1, 99]), "100 nodes"),
-        (lambda header: header["skins"][0].update(inverseBindMatrices=0), "inverse bind matrices"),
-        (lambda header: header["meshes"][0]["primitives"][0]["attributes"].pop("WEIGHTS_0"), "four weights"),
-    ],
-)
-def test_a_skin_that_is_none_is_refused(change: Any, words: str, tmp_path: Path) -> None:
-    file = bound_square(np.full((4, 4), 0.25), None)
-    change(file.header)
-    with pytest.raises(FileFormatError, match=words):
-        vertices(file, tmp_path)

@@ -15,12 +15,7 @@ from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.options import Outcome, get_outcome
 from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight
-from advsearch.tasks.boxes import (
-    DetectionTruth,
-    compute_fraction_inside,
-    compute_iou,
-    to_corners,
-)
+from advsearch.tasks.boxes import DetectionTruth, compute_fraction_inside, compute_iou, to_corners
 from advsearch.tasks.detection import GOALS
 from advsearch.tasks.detector_outputs import read_detections
 

@@ -150,35 +150,6 @@ def test_beyond_this_machine_the_token_is_asked_for(run: Path) -> None:
         assert ask(server, "/runs/first/rows", Cookie="advsearch-1=x")[0].status == 401
 
 
-@pytest.mark.medium
-def test_a_thousand_at_once_are_answered(server: Dashboard) -> None:
-    """All are connected and have asked before the first answer is read; the server has no more threads than before."""
-    asked = f"GET /runs/first/pictures/0000/1.jpg HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode()
-    assert ask(server, "/")[0].status == 200  # its threads have begun
-    threads, counts = threading.active_count(), []
-    with ExitStack() as stack:
-        talks = [
-            stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60)) for _ in range(1000)
-        ]
-        for talk in talks:
-            talk.sendall(asked)
-            counts.append(threading.active_count())
-        answers = [talk.makefile("rb").read() for talk in talks]
-    assert all(one.startswith(b"HTTP/1.0 200") for one in answers)
-    assert len(set(map(len, answers))) == 1
-    assert max(counts) <= threads  # fewer where those of another test's server have ended meanwhile
-    assert ask(server, "/")[0].status == 200
-
-
-def test_those_who_say_nothing_do_not_fill_the_server(server: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand connections that never ask hold it up for as long as its patience lasts, no longer."""
-    monkeypatch.setattr("advsearch.viewer.clients.REQUEST_SECONDS", 0.01)
-    with ExitStack() as stack:
-        for _ in range(1000):
-            stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60))
-        assert ask(server, "/")[0].status == 200
-
-
 @contextmanager
 def slow_clients(server: Dashboard, count: int, begun: bytes) -> Iterator[list[socket.socket]]:
     """Clients that have begun to ask, and go on with a letter now and then."""

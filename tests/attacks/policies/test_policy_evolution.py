@@ -12,18 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import (
-    CMAES,
-    NES,
-    Block,
-    Domain,
-    Evaluate,
-    Evaluation,
-    Policy,
-    Query,
-    search,
-    seeded,
-)
+from advsearch.attacks import CMAES, NES, Block, Domain, Evaluate, Evaluation, Policy, Query, search, seeded
 from advsearch.errors import InputError
 
 both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: policy.name)

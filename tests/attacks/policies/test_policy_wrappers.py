@@ -9,17 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import (
-    NES,
-    PGD,
-    Block,
-    Domain,
-    Evaluation,
-    Query,
-    Restarts,
-    search,
-    seeded,
-)
+from advsearch.attacks import NES, PGD, Block, Domain, Evaluation, Query, Restarts, search, seeded
 
 # ---- races
 

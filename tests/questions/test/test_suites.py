@@ -28,10 +28,7 @@ from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test import result as words
-from advsearch.questions.test.counterexamples import (
-    counterexample_directory,
-    decide_trials,
-)
+from advsearch.questions.test.counterexamples import counterexample_directory, decide_trials
 from advsearch.questions.test.result import ClaimResult, SuiteResult
 from advsearch.questions.test.settings import SuiteConfig
 from advsearch.registry import get_experiment
