@@ -171,7 +171,7 @@ class CameraControl(Control):
         if bent_coefficients and scene.camera_model is None:
             scene = replace(
                 scene,
-                camera_model=make_pinhole(scene.number("camera.fov"), scene.aspect),
+                camera_model=make_pinhole(scene.get_number("camera.fov"), scene.aspect),
             )
         model = scene.camera_model
         if model is None:
@@ -227,7 +227,8 @@ class CameraControl(Control):
         place of the elevation; a distance has a multiple of its default.
         """
         parameter = adapt_length_unit(
-            super().resolve_parameter(parameter), self.scene.object.metres is not None
+            super().resolve_parameter(parameter),
+            self.scene.object.size_in_metres is not None,
         )
         scene = self.scene
         name = parameter.name
@@ -240,17 +241,17 @@ class CameraControl(Control):
             camera_position = camera_to_world(fixed_lens_scene)[:3, 3]
             offset = camera_position - compute_center(fixed_lens_scene)
             distance = float(np.linalg.norm(offset))
-            default = distance * (1.0 if name == "sizes" else scene.metres)
+            default = distance * (1.0 if name == "sizes" else scene.size_in_metres)
         elif name == "height":
             camera_height = float(camera_to_world(self._with_fixed_lens())[2, 3])
-            default = camera_height * scene.metres
+            default = camera_height * scene.size_in_metres
         elif name == "focal_length":
-            half_fov = math.radians(scene.number("camera.fov")) / 2.0
+            half_fov = math.radians(scene.get_number("camera.fov")) / 2.0
             default = SENSOR_WIDTH / 2.0 / math.tan(half_fov)
         preset = PRESETS.get(scene.preset)
         if preset is not None and name == "azimuth":
             reach = preset.search_azimuth
-            scene_azimuth = scene.number("camera.azimuth")
+            scene_azimuth = scene.get_number("camera.azimuth")
             search = (scene_azimuth - reach, scene_azimuth + reach)
             if reach >= 180.0:
                 search = (0.0, 360.0)
@@ -269,7 +270,7 @@ class CameraControl(Control):
         return equivalent_settings.get(parameter.name, super().setting_name(parameter))
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the camera's pose, lens, focus, shift and exposure.
 
@@ -288,7 +289,7 @@ class CameraControl(Control):
             or not self.has_requested_search
             or scene.values.get("camera.distance") is not None
         ):
-            distance = values["distance"] / scene.metres
+            distance = values["distance"] / scene.size_in_metres
         else:
             distance = compute_framing_distance(scene, fov, scene.aspect).float()
         inputs = {"camera.to_world": self._compute_pose(values, distance)}
@@ -301,13 +302,15 @@ class CameraControl(Control):
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
             focus = (
-                values["focus"] / scene.metres if "focus" in self.specs else distance
+                values["focus"] / scene.size_in_metres
+                if "focus" in self.specs
+                else distance
             )
             inputs["camera.focus"] = focus.reshape(1)
         if scene.camera_model is None and self._is_shifted:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
-            inputs["camera.exposure"] = values["exposure"] - scene.number(
+            inputs["camera.exposure"] = values["exposure"] - scene.get_number(
                 "camera.exposure"
             )
         return inputs
@@ -379,7 +382,7 @@ class CameraControl(Control):
                 self.scene.values.get("camera.height") is not None or is_height_searched
             )
         if keeps_height:
-            height_above_center = values["height"] / self.scene.metres - float(
+            height_above_center = values["height"] / self.scene.size_in_metres - float(
                 compute_center(self.scene)[2]
             )
             elevation = torch.asin(
