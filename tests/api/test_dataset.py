@@ -107,7 +107,7 @@ def test_boxes_are_where_vertices_are_projected(tmp_path: Path) -> None:
         pose = camera_to_world(scene, 64 / 48)
         x, y, z = ((own.meshes["object"].mesh.vertices @ own.meshes["object"].to_world[:3, :3].T
                     + own.meshes["object"].to_world[:3, 3] - pose[:3, 3]) @ pose[:3, :3]).T  # fmt: skip
-        focal = 32.0 / np.tan(np.radians(scene.number("camera.fov")) / 2.0)
+        focal = 32.0 / np.tan(np.radians(scene.get_number("camera.fov")) / 2.0)
         across, down = 32.0 - focal * x / z, 24.0 - focal * y / z
         left, top, width, height = one["bbox"]
         got = [left, top, left + width, top + height]

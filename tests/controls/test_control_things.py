@@ -55,7 +55,7 @@ def vertices(space: Space, u: torch.Tensor, name: str) -> np.ndarray:
     assembly = Assembly(space.scene)
     placed = assembly(space.inputs(u)).get(f"{name}.vertices")
     placed = assembly.meshes[name].transform_mesh(None, None)[0] if placed is None else placed
-    return np.asarray(placed.double().numpy()) * space.scene.metres
+    return np.asarray(placed.double().numpy()) * space.scene.size_in_metres
 
 
 def at(space: Space, **values: float) -> torch.Tensor:
@@ -75,7 +75,7 @@ def test_at_its_start_all_stands_where_it_was_put(scene: SceneDescription) -> No
         f"{thing}.{parameter}" for thing in ("chair", "stop-sign", "car") for parameter in ("x", "y", "heading")
     ]
     for name in scene.things:
-        before = Assembly(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.metres
+        before = Assembly(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.size_in_metres
         np.testing.assert_allclose(vertices(space, space.start, name), before, atol=CLOSE)
 
 

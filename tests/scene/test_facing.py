@@ -86,7 +86,7 @@ def test_what_is_the_front_of_a_file_faces_x(
 
 
 def place(scene: SceneDescription) -> np.ndarray:
-    return np.asarray(camera_to_world(scene)[:3, 3] * scene.metres)
+    return np.asarray(camera_to_world(scene)[:3, 3] * scene.size_in_metres)
 
 
 def dashcam(name: object, environment: str = "street", **given: Any) -> SceneDescription:
