@@ -61,6 +61,15 @@ def test_a_lamp_puts_its_power_over_the_squared_distance_on_what_faces_it(type: 
     assert torch.allclose(under, expected, rtol=0.05, atol=1e-6)
 
 
+def test_size_changes_radiance_and_not_power(scene: SceneDescription) -> None:
+    control = LightControl(size=[0.1, 0.4])
+    bound = control.bind(control.prepare(scene))
+    small, large = (bound.inputs(torch.tensor([u])) for u in (0.0, 1.0))
+    assert torch.allclose(small["light.radiance"] * 0.1**2, large["light.radiance"] * 0.4**2)
+    assert float(small["light.ball"][0, 0]) == pytest.approx(0.05)
+    assert float(large["light.ball"][2, 2]) == pytest.approx(0.2)
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize("type", ["area", "point"])
 def test_the_adjoint_of_power_and_colour_agrees_with_differences(scene: SceneDescription, type: str) -> None:
