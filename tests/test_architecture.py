@@ -352,14 +352,6 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
     assert done.stdout == "[]\n"
 
 
-def test_the_process_that_reads_usd_needs_little() -> None:
-    """Every such file starts one."""
-    pytest.importorskip("pxr")
-    code = f"import advsearch.scene.importing.usd.stage\n{SHOW_HEAVY}"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
-
-
 # -- what is shipped -------------------------------------------------------------------------------------------------
 
 

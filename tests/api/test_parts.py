@@ -76,15 +76,3 @@ def test_a_shared_study_is_the_one_that_was_made_here(tmp_path: Path, monkeypatc
         assert {one.name for one in there.iterdir()} >= {"run.yaml", "summary.json", "report.html", "images"}
         assert "advsearch-part-" not in (there / "summary.json").read_text()
         assert str(there) in [one.run for one in shared.table]
-
-
-def test_a_curve_is_a_chain_for_each_object_and_a_matrix_one_attack_for_each_model() -> None:
-    curve = make_chains(AttackConfig(object="mug,bowl", epsilon="0.2,0.1", workers=2))
-    assert [[(one.subject, one.epsilon) for one in chain] for chain in curve] == [
-        [("mug", 0.1), ("mug", 0.2)],
-        [("bowl", 0.1), ("bowl", 0.2)],
-    ]
-    matrix = make_chains(AttackConfig(object="mug", model="a,b", workers=2))
-    assert [[(one.name, one.config.model) for one in chain] for chain in matrix] == [[("00-a", "a")], [("01-b", "b")]]
-    together = make_chains(AttackConfig(object="mug", model="a,b", ensemble="worst"))
-    assert [[(one.name, one.config.model) for one in chain] for chain in together] == [[("00-all", "a,b")]]

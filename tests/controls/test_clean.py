@@ -3,7 +3,6 @@ said."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,10 +12,8 @@ import advsearch
 from advsearch.cli.flags import format_as_flags
 from advsearch.controls import Space, make_control, make_space
 from advsearch.errors import InputError
-from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs.results import to_json_value
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, load_description
 
@@ -75,32 +72,6 @@ def test_a_control_that_agrees_starts_at_what_was_asked_for(
 
 
 # ---- what nobody asked for moves, and that is said ------------------------------------------------------------------
-
-
-class Screen(NullProgress):
-    """Keeps what is said."""
-
-    def __init__(self) -> None:
-        self.said: list[str] = []
-
-    def message(self, text: str) -> None:
-        self.said.append(text)
-
-
-@pytest.mark.medium
-def test_what_moved_is_in_the_summary_in_the_report_and_on_the_screen(tmp_path: Path) -> None:
-    screen = Screen()
-    result = advsearch.attack(
-        "mug", controls={"pose": {"yaw": [90, 180]}}, policy="random", steps=1, trials=6, resolution=16, spp=1,
-        verify_spp=1, baseline=False, run=tmp_path / "run", progress=screen,
-    )  # fmt: skip
-    summary = result.summary
-    assert to_json_value(summary.clean.moved) == [
-        {"parameter": "pose.yaw", "unit": "degrees", "scene": 0.0, "used": 90.0}
-    ]
-    said = "The clean scene has pose.yaw 90 degrees instead of 0, which the control pose leaves out."
-    assert said in summary.warnings and said in screen.said
-    assert said in (tmp_path / "run" / "report.html").read_text("utf-8")
 
 
 # ---- a control says what the setting of the same name says ----------------------------------------------------------

@@ -7,13 +7,11 @@ from typing import Any
 import pytest
 import torch
 
-from advsearch import load_scene
 from advsearch.controls import CONTROLS, Control, make_control, make_space
 from advsearch.errors import InputError
 from advsearch.scene.description import load_description
 from advsearch.scene.gradients import ESTIMATORS
 from advsearch.scene.settings import SETTINGS
-from conftest import ROOT
 from hostile import SHORT, shown
 
 every_control = pytest.mark.parametrize("kind", CONTROLS)
@@ -125,27 +123,6 @@ def test_two_of_a_kind_live_side_by_side(kind: str) -> None:
 
 
 # ---- controls from elsewhere ----------------------------------------------------------------------------------------
-
-
-def worked_example() -> type:
-    """The class of the worked example in docs/controls/writing.md."""
-    page = (ROOT / "docs" / "controls" / "writing.md").read_text("utf-8")
-    source = page.split("```python\n")[1].split("```")[0]
-    namespace: dict[str, Any] = {"__name__": "worked_example"}
-    exec(compile(source, "writing.md", "exec"), namespace)
-    found = namespace["FadeControl"]
-    assert isinstance(found, type)
-    return found
-
-
-def test_the_worked_example_is_a_control_that_renders() -> None:
-    control = worked_example()
-    render = load_scene("mug").renderer([control(amount=[0, 1])], resolution=24, denoise="none")
-    with torch.no_grad():
-        plain, faded = (render(torch.tensor([share]), seed=0, spp=8) for share in (0.0, 1.0))
-    spread = [float((one.amax(dim=-1) - one.amin(dim=-1)).mean()) for one in (plain, faded)]
-    assert spread[1] < 0.8 * spread[0]
-    assert [one.estimator for one in render.plan.groups] == ["adjoint"]
 
 
 @pytest.mark.parametrize("kind", CONTROLS)

@@ -109,25 +109,6 @@ def test_a_run_that_was_killed_between_a_comparison_and_its_evaluation_goes_on(
 
 
 @pytest.mark.medium
-@pytest.mark.usefixtures("growing")
-def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there is memory for two or three, the newest are kept and nothing fails."""
-    monkeypatch.setattr(bank, "MAX_BYTES", 150_000)
-    kept: list[list[int]] = []
-    drawn = Bank._choose_conditions
-
-    def watched(self: Bank, kind: str, index: int) -> Any:
-        kept.append([one.index for one in self._conditions])
-        return drawn(self, kind, index)
-
-    monkeypatch.setattr(Bank, "_choose_conditions", watched)
-    told = advsearch.attack("mug", **SMALL).summary.transport
-    assert told is not None and told.conditions is not None and told.bytes is not None
-    assert told.conditions.dropped == 10 - len(kept[-1]) and told.bytes <= 150_000
-    assert kept[-1] == list(range(10 - len(kept[-1]), 10))
-
-
-@pytest.mark.medium
 def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Under each condition, but for noise and what a matrix leaves out; and the derivative is the weighted mean."""
     seen: list[Bank] = []

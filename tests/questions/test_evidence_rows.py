@@ -16,7 +16,6 @@ from advsearch.cli.main import main
 from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.report.evidence import (
     collect_claims,
-    describe_criterion,
     evaluate_criterion,
     list_triggering_conditions,
 )
@@ -110,12 +109,3 @@ def test_photographs_from_a_folder_agree_by_condition(tmp_path: Path, capsys: py
             assert one == 1
         else:
             assert "line 2" in told.err
-
-
-def test_a_criterion_is_met_not_met_or_open() -> None:
-    assert [evaluate_criterion(0.9, ends) for ends in ((0.91, 0.99), (0.5, 0.89), (0.85, 0.95))] == [
-        "met",
-        "not met",
-        "open",
-    ]
-    assert describe_criterion([], [], 0.9) == []

@@ -14,26 +14,13 @@ import small_models
 from advsearch.errors import InputError
 from advsearch.questions.report.evidence import count_conditions
 from advsearch.questions.sweep.display import find_detection_distance
-from advsearch.questions.sweep.result import Predictions
 from advsearch.runs.summary import read_result
 from advsearch.statistics.intervals import clopper_pearson
-from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_suite
 from advsearch.trust.code import allow_code
 from advsearch.viewer.columns import read_columns
 
 pytestmark = pytest.mark.usefixtures("two_threads")
-
-
-def test_the_worst_is_a_picture_that_shows_it() -> None:
-    found = Predictions(4)
-    for number, (label, margin) in enumerate([("car", -3.0), ("out of view", -1.0), ("no car", 2.0)]):
-        found.add(number, Judgement.of(margin, -margin, Prediction(label)))
-    assert found.is_hidden.tolist() == [False, True, False, False] and found.worst_row == 2
-    found = Predictions(2)
-    for number, (label, margin) in enumerate([("car", -3.0), ("out of view", -1.0)]):
-        found.add(number, Judgement.of(margin, -margin, Prediction(label)))
-    assert found.worst_row == 0
 
 
 @pytest.mark.medium

@@ -116,12 +116,3 @@ def test_a_hostile_header_of_a_configuration_is_refused(header: bytes, tmp_path:
     path.write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
     with pytest.raises(FileFormatError, match=r"adversarial\.npy: expected numbers"):
         read_configuration(tmp_path)
-
-
-@pytest.mark.parametrize("data", [[[0.5]], [2.0], [float("nan")]], ids=["two axes", "out of range", "nan"])
-def test_a_configuration_is_a_point_of_the_box(data: Any, tmp_path: Path) -> None:
-    write_configuration(tmp_path, torch.tensor(data).numpy())
-    with pytest.raises(FileFormatError, match="float32"):
-        read_configuration(tmp_path)
-    write_configuration(tmp_path, torch.tensor([0.25, 1.0]).numpy())
-    assert read_configuration(tmp_path).tolist() == [0.25, 1.0]

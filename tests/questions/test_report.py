@@ -115,16 +115,6 @@ def test_page_and_markdown_have_every_claim_and_exclusion_and_no_markup_of_other
     assert json.loads(to_json(evidence))["runs"][0]["claims"][0]["extent"]["of"] == 20
 
 
-def test_predictions_of_several_models_to_the_same_pictures_are_not_counted_together() -> None:
-    one = {"configurations": 20, "correct": 5, "accuracy": 0.25, "interval": (0.1, 0.5), "axis": "model", "unit": ""}
-    rows = [{**one, "value": name} for name in ("first", "second")]
-    counts = {"configurations": 40, "correct": 10, "accuracy": 0.25}
-    swept = samples.sweep(**counts, model="first,second", axes=rows, ending="finished")
-    said = [claim for claim in collect_claims(swept) if "is right in" in claim.statement]
-    assert [claim.extent and claim.extent.total for claim in said] == [20, 20]
-    assert [claim.statement.split()[2] for claim in said] == ["first", "second"]
-
-
 def test_a_criterion_is_pooled_over_what_was_drawn_only() -> None:
     counted = {"configurations": 60, "correct": 60, "accuracy": 1.0, "interval": (0.94, 1.0)}
     bad = {"configurations": 60, "correct": 30, "accuracy": 0.5, "interval": (0.37, 0.63)}

@@ -17,7 +17,6 @@ from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel
 
 FRAME = {"file_path": "a.png", "transform_matrix": [[1.0, 0.0, 0.0, 0.0]] * 4, "sharpness": 9.0}
-NERF = {"w": 640, "h": 480, "fl_x": 400.0, "fl_y": 410.0, "cx": 320.0, "cy": 240.0}
 
 KINDS: dict[str, dict[str, Any]] = yaml.safe_load(Path(__file__).with_name("camera_keys.yaml").read_text("utf-8"))
 """A camera in the files of many tools, each with every key that it has."""
@@ -108,13 +107,6 @@ def test_a_roi_is_the_whole_picture_or_refused(roi: dict[str, int], whole: bool,
         return
     with pytest.raises(FileFormatError, match="roi"):
         read(tmp_path, KINDS["ros"] | {"roi": roi})
-
-
-def test_frames_with_lenses_of_their_own_are_chosen_by_number(tmp_path: Path) -> None:
-    data = {"camera_model": "OPENCV", "frames": [FRAME | NERF, FRAME | NERF | {"k1": 0.1}]}
-    with pytest.raises(FileFormatError, match="2 cameras"):
-        read(tmp_path, data)
-    assert read(tmp_path, data, "#1").values["k1"] == 0.1 and read(tmp_path, data, "#0").values["k1"] == 0.0
 
 
 @pytest.mark.parametrize(

@@ -118,19 +118,6 @@ def area(part: ImportedPart) -> np.ndarray:
 # --- materials ----------------------------------------
 
 
-def test_an_emissive_texture_alone_is_dark_and_mask_cuts_at_a_half(tmp_path: Path) -> None:
-    file = File(alphaMode="MASK")
-    alpha = np.full((1, 4, 4), 200, np.uint8)
-    alpha[0, :, 3] = [0, 127, 128, 255]
-    file.header["materials"][0] |= {
-        "emissiveTexture": file.texture(alpha), "pbrMetallicRoughness": {"baseColorTexture": file.texture(alpha)},
-    }  # fmt: skip
-    file.primitive(attributes={"TEXCOORD_0": file.values(MAP)})
-    asset = import_object(file.write(tmp_path))
-    assert asset.emission is None and asset.opacity is not None
-    assert asset.opacity.tolist() == [[0.0, 0.0, 1.0, 1.0]]
-
-
 # --- geometry ----------------------------------------
 
 

@@ -135,21 +135,6 @@ def test_the_ground_ahead_has_the_lux_of_both_headlamps() -> None:
 
 
 @pytest.mark.medium
-def test_lamps_sit_where_the_car_has_its_glass() -> None:
-    described = scene(things="car@12,3.5,heading=180,lamps=high", **LOW).description
-    own = {lamp.name: lamp for lamp in beams(described)}
-    assert set(own) == {f"{who}-{side}-beam" for who in ("object", "car") for side in ("left", "right")}
-    left, right = (own[f"object-{side}-beam"].to_world[:3, 3] * described.size_in_metres for side in ("left", "right"))
-    assert left[1] == pytest.approx(-right[1], abs=0.02) and 0.5 < left[1] < 0.75
-    assert 0.55 < left[2] < 0.8 and 1.8 < left[0] < 2.2
-    other = own["car-left-beam"]
-    assert other.to_world[:3, 3] * described.size_in_metres == pytest.approx(
-        [12.0 - left[0], 3.5 - left[1], left[2]], abs=0.06
-    )
-    assert other.to_world[:3, 2] == pytest.approx([-1.0, 0.0, 0.0], abs=1e-6)
-
-
-@pytest.mark.medium
 def test_glass_shines_as_many_candela_as_it_says_and_rear_lamps_are_red() -> None:
     described = scene(**LOW).description
     assert described.environment is not None and described.environment.candelas is not None

@@ -253,28 +253,12 @@ def test_open_sheet_with_mixed_winding_becomes_consistent(tmp_path: Path) -> Non
     assert len(asset.warnings) == 1 and "12 faces" in asset.warnings[0]
 
 
-def test_faces_without_area_are_removed(tmp_path: Path) -> None:
-    text = CUBE + "v 0.5 0 0\nf 1 9 2\nf 1 1 2\n"
-    asset = import_object(written(tmp_path, "box.obj", text))
-    check_sound(asset)
-    assert len(asset.mesh.faces) == 12
-    assert len(asset.warnings) == 1 and "2 faces" in asset.warnings[0]
-
-
 def test_file_normals_are_kept(tmp_path: Path) -> None:
     tilted = np.array([0.6, 0.0, 0.8])
     text = QUAD_V + f"vn {3 * tilted[0]} 0 {3 * tilted[2]}\nf 1//1 2//1 3//1 4//1\n"
     asset = import_object(written(tmp_path, "tile.obj", text))
     assert asset.mesh.normals == pytest.approx(np.tile(tilted, (4, 1)), abs=1e-6)
     assert asset.warnings == ()
-
-
-def test_normals_that_all_point_inwards_are_turned_around(tmp_path: Path) -> None:
-    sphere = trimesh.creation.icosphere(subdivisions=2)
-    sphere.vertex_normals = -sphere.vertices
-    asset = import_object(exported(tmp_path, "ball.glb", sphere, include_normals=True))
-    check_sound(asset)
-    assert "normals" in asset.warnings[-1]
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e300, 0.0), (1e-30, 0.0), (1.0, 1e9)])

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import pytest
 
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
@@ -37,31 +34,3 @@ def test_a_dictionary_written_and_read_is_the_same(tmp_path: Path) -> None:
     ball = read["ball"]
     np.testing.assert_array_equal(ball.pop("to_world"), np.array(mi.ScalarTransform4f(matrix).matrix))
     assert ball == {"type": "sphere", "flip_normals": True, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
-
-
-WRITER = """
-import sys
-from pathlib import Path
-import numpy as np
-from advsearch import threads
-from advsearch.scene.mitsuba_backend.writing import write_xml
-from advsearch.scene.mitsuba_backend.variant import import_mitsuba
-threads.configure(1)
-values = np.linspace(0, 2, 8 * 16 * 4, dtype=np.float32).reshape(8, 16, 4)
-bitmaps = {f"picture-{n}": import_mitsuba().Bitmap(values[..., :n]) for n in (1, 3, 4)}
-pictures = {name: {"type": "bitmap", "bitmap": bitmap, "raw": True} for name, bitmap in bitmaps.items()}
-write_xml(Path(sys.argv[1]), {"type": "scene", **pictures}, {}, "")
-"""
-
-
-@pytest.mark.medium
-def test_pictures_are_written_in_a_pool_of_one_thread_too(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", WRITER, str(tmp_path / "scene.xml")]
-    subprocess.run(command, check=True, timeout=600)
-    values = np.linspace(0, 2, 8 * 16 * 4, dtype=np.float32).reshape(8, 16, 4)
-    for path in sorted(tmp_path.glob("*.exr")):
-        with OpenEXR.File(str(path)) as file:
-            (channel,) = file.channels().values()
-            found = channel.pixels.reshape(8, 16, -1)
-        np.testing.assert_array_equal(found, values[..., : found.shape[2]])
-    assert len(list(tmp_path.glob("*.exr"))) == 3

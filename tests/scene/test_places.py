@@ -59,19 +59,6 @@ def test_nothing_stands_where_the_object_is(place: str) -> None:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("place", PLACES)
-def test_below_the_horizon_there_is_ground_all_around(place: str) -> None:
-    given = {"camera.height": 0.3 if place == "room" else 1.6, "camera.distance": 0.5 if place == "room" else 8.0}
-    scene = load_scene(PLACES[place], place, settings=given, camera="equirectangular")
-    renderer = scene.renderer(["pose"], resolution=(32, 64), denoise="none")
-    seen = renderer.surfaces(renderer.start)
-    assert not bool((seen.id[17:] == 0).any()), "the environment is seen below the horizon"
-    if place == "room":
-        assert not bool((seen.id == 0).any()), "the room has a hole"
-        assert float(seen.depth.max()) < 5.0
-
-
-@pytest.mark.medium
 @pytest.mark.parametrize(
     ("environment", "shining", "luminance"), [("room", "window", None), ("room-evening", "lamp", room.SHADE)]
 )

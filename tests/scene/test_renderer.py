@@ -185,13 +185,6 @@ def test_the_denoiser_is_the_identity_in_the_backward_pass(raw: Renderer, denois
     assert torch.allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.medium
-def test_the_denoiser_brings_few_samples_close_to_many(raw: Renderer, denoised: Renderer) -> None:
-    with torch.no_grad():
-        many, noisy, clean = raw(raw.start, 0, 1024), raw(raw.start, 1, 8), denoised(denoised.start, 1, 8)
-    assert float((clean - many).pow(2).mean()) < 0.5 * float((noisy - many).pow(2).mean())
-
-
 def test_non_finite_radiance_is_counted_and_set_to_zero(raw: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = torch.full((SIZE, SIZE, 3), 0.5)
     broken[0, 0, 0], broken[1, 1, 1] = float("nan"), float("inf")
@@ -217,14 +210,6 @@ def test_a_picture_is_radiance_times_the_gain_through_the_curve() -> None:
     }
     for transfer, expected in shown.items():
         assert torch.allclose(ImageFormation(gain=2.5, transfer=transfer).display(radiance), expected)
-
-
-def test_the_transfer_curve_is_flat_where_it_clips_and_finite_at_black() -> None:
-    linear = torch.tensor([-0.5, 0.0, 0.5, 1.5], requires_grad=True)
-    linear_to_srgb(linear).sum().backward()
-    assert linear.grad is not None
-    assert bool(torch.isfinite(linear.grad).all())
-    assert float(linear.grad[0]) == 0.0 and float(linear.grad[3]) == 0.0 and float(linear.grad[2]) > 0.0
 
 
 @pytest.mark.medium

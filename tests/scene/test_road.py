@@ -31,16 +31,6 @@ def test_a_street_brings_its_road_and_a_table_takes_its_place() -> None:
         load_description("car", "street", setting_values={"ground.kind": "wet-road", "ground.red": 0.5})
 
 
-@pytest.mark.medium
-def test_another_environment_brings_its_own_ground() -> None:
-    street, wet = (load_scene("car", name) for name in ("street", "street-wet"))
-    lit = street.with_environment(wet.description.environment)
-    dry, damp = (one.description.surrounding_meshes["road"] for one in (street, lit))
-    assert damp.material.roughness < dry.material.roughness
-    assert damp.base_color.mean() < dry.base_color.mean()
-    assert not is_paved(street.with_environment(load_scene("mug", "noon").description.environment).description)
-
-
 @pytest.mark.parametrize(("name", "metres"), [("car", 4.3), ("chair", 0.92)])
 def test_distances_are_in_metres_where_the_object_has_a_size(name: str, metres: float) -> None:
     scene = load_description(name, setting_values={"camera.distance": 10.0})

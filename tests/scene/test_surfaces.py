@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import OpenEXR
 import pytest
 import torch
 
 from advsearch.engine.loading import load_scene
-from advsearch.runs.files import write_layers
-from advsearch.scene.formation import AOVS, CHANNELS, Surfaces
+from advsearch.scene.formation import Surfaces
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
 SIZE = 32
@@ -21,32 +17,6 @@ SIZE = 32
 def seen() -> tuple[MitsubaScene, Surfaces]:
     render = load_scene("mug").renderer(["pose"], resolution=SIZE)
     return render.scene, render.surfaces(render.start)
-
-
-def made() -> Surfaces:
-    """Two pixels: the object, and nothing."""
-    return Surfaces(
-        names=("ground", "object"),
-        id=torch.tensor([[2, 0]]),
-        depth=torch.tensor([[1.5, torch.inf]]),
-        z_depth=torch.tensor([[1.4, torch.inf]]),
-        normal=torch.tensor([[[0.0, 0.6, 0.8], [0.0, 0.0, 0.0]]]),
-        uv=torch.tensor([[[0.25, 0.75], [0.0, 0.0]]]),
-        face=torch.tensor([[7, 0]]),
-    )
-
-
-def test_layers_are_read_back_with_what_they_mean(tmp_path: Path) -> None:
-    surfaces, every = made(), tuple(AOVS)
-    path = write_layers(tmp_path / "a.exr", surfaces.make_layers(every, "object"), surfaces.describe_layers(every))
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        found, header = {name: one.pixels for name, one in file.channels().items()}, dict(file.header())
-    assert sorted(found) == sorted(f"{name}.{channel}" for name in every for channel in CHANNELS[name])
-    assert found["mask.Y"].tolist() == [[1.0, 0.0]] and found["depth.Z"].tolist() == [[1.5, np.inf]]
-    assert found["uv.V"].tolist() == [[0.75, 0.0]] and found["normal.Z"][0, 0] == np.float32(0.8)
-    assert found["id.Y"].dtype == np.uint32 and found["id.Y"].tolist() == [[2, 0]]
-    assert header["depth"].startswith("distance from the camera along the ray, metres")
-    assert header["id"].endswith("1 is ground, 2 is object")
 
 
 def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tuple[MitsubaScene, Surfaces]) -> None:

@@ -127,17 +127,6 @@ def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_ent
     assert small.bytes == bytes_an_entry * small._sharp.entries + 2 * (4 + 6) * 2
 
 
-def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for() -> None:
-    made = TextureTransport((1, 2), (CELL_SIZE, CELL_SIZE))
-    made.add_pass([vertices([(0, 0.3, 0.3, 1.0), (0, 0.8, 0.3, 3.0), (1, 0.3, 0.3, 1.0)])], fraction=1.0)
-    made.finish(lambda picture: torch.full_like(picture, 2.0))
-    ones = torch.ones(CELL_SIZE, CELL_SIZE, 3)
-    assert made.multiply(ones)[0, :, 0].tolist() == pytest.approx([2.0, 2.0], rel=HALF)
-    left = ones.clone()
-    left[:, CELL_SIZE // 2 :] = 0.0
-    assert made.multiply(left)[0, :, 0].tolist() == pytest.approx([0.5, 2.0], rel=HALF, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("controls", "options", "can_predict"),
     [

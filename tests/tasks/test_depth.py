@@ -129,18 +129,6 @@ def test_what_is_beside_the_object_has_to_say_the_scale() -> None:
     )
 
 
-def test_a_model_is_read_in_every_form() -> None:
-    values = INVERSE[None]
-    plain = [values, values[:, None], (values, None), {"predicted_depth": values}, {"depth": values}]
-    forms: list[Any] = [*((one, "") for one in plain), ({METRIC: values}, METRIC), ({DISPARITY: values}, DISPARITY)]
-    for answer, kind in forms:
-        ((found),) = TASK.read(answer, 1)
-        assert list(found) == [kind] and found[kind].equal(INVERSE)
-    for other in (INVERSE, values.expand(2, -1, -1), {"masks": values}, values[:, None].expand(-1, 2, -1, -1), ()):
-        with pytest.raises(ValueError, match=r"\(N, height, width\)"):
-            TASK.read(other, 1)
-
-
 def test_the_gradient_agrees_with_differences() -> None:
     """Of every objective, in float64, along a direction."""
     generator = torch.Generator().manual_seed(0)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
 from advsearch.attacks.evaluation import Policy, limit_to_single_thread, seeded
-from advsearch.attacks.policies.auto import LOW_DIM, make_plan
+from advsearch.attacks.policies.auto import make_plan
 from advsearch.attacks.policies.surrogate import find_box_coordinates, fit
 from covering import once_each
 
@@ -107,15 +107,6 @@ def test_it_stays_inside_and_spends_its_budget_exactly(name: str, price: tuple[i
 
 
 # ---- what the renders are for
-
-
-def test_free_gradients_end_a_search_and_lead_one_in_many_dimensions() -> None:
-    few, problem = played(domain_of(POSE), Auto(), 40)
-    assert [bool(g) for g in problem.asked[:40]] == [False] * 30 + [True] * 9 + [False]
-    many = domain_of((Block(3 * LOW_DIM),))
-    plan = make_plan(many, find_box_coordinates(many), 60)
-    assert (plan.screen, plan.ascent_start, plan.gradient) == (10, 10, True)
-    assert few.gradients == 9
 
 
 def test_a_texture_beside_a_pose_takes_free_gradients_where_there_are_some() -> None:
