@@ -100,7 +100,7 @@ FAULTS = (
         "advsearch/scene/mitsuba_backend/meshes.py",
         '"base_color": make_texture(srgb_to_linear(part.base_color)),',
         '"base_color": make_texture(part.base_color),',
-        ("tests/scene/test_renderer.py", "tests/scene/test_exposure.py"),
+        ("tests/controls/test_control_material.py",),
     ),
     Fault(
         "importing: a file outside of the folder is read",
@@ -121,7 +121,7 @@ FAULTS = (
         "advsearch/scene/glb.py",
         "_y_up(normals)",
         "_y_up(-normals)",
-        ("tests/api/test_export_scene.py",),
+        ("tests/scene/test_normal_maps.py",),
     ),
     Fault(
         "exporting: degrees for radians",
@@ -229,7 +229,7 @@ FAULTS = (
         "advsearch/engine/journal.py",
         "index = index_of_item[id(result.items[0])]",
         "index = next_index + len(waiting)",
-        ("tests/engine/test_attack_workers.py",),
+        ("tests/engine/test_sharing.py",),
     ),
     Fault(
         "sweeps: a rate of another group",

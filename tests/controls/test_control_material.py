@@ -106,6 +106,13 @@ def test_a_named_material_brings_its_numbers_and_given_ones_win(scene: SceneDesc
     assert bound.describe(torch.tensor([0.75]))["material.which"] == {"value": "steel", "unit": "name"}
 
 
+def test_a_base_colour_is_rendered_as_linear_reflectance(scene: SceneDescription) -> None:
+    """By IEC 61966-2-1, half of the range of sRGB is a reflectance of 0.2140."""
+    part = replace(scene.meshes["object"], base_color=np.full((1, 1, 3), 0.5, np.float32))
+    texels = np.array(make_principled(part)["bsdf"]["base_color"]["bitmap"])
+    np.testing.assert_allclose(texels, 0.2140, atol=1e-4)
+
+
 def test_every_way_into_a_number_has_the_same_guard(scene: SceneDescription) -> None:
     """At a specular of exactly 0 Mitsuba's metal is black, and at a metallic of exactly 1 an adjoint has the wrong
     sign: searched, fixed, of a named material, and of a surface in Mitsuba's own words."""
