@@ -8,6 +8,6 @@ from plant import FAULTS, ROOT, Fault
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda one: one.name)
 def test_a_fault_is_in_the_source_once(fault: Fault) -> None:
-    compile(fault.planted(ROOT), fault.file, "exec")
+    compile(fault.insert(ROOT), fault.file, "exec")
     assert fault.after != fault.before
     assert fault.tests and all((ROOT / one.partition("::")[0]).is_file() for one in fault.tests)

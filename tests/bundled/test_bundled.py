@@ -72,6 +72,7 @@ def test_a_mesh_is_sound(name: str, seed: int | None) -> None:
     assert volume > 0.0, "the surface is inside out"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("name", "seed"), INSTANCES)
 def test_charts_lie_apart_in_the_atlas(name: str, seed: int | None) -> None:
     mesh = instance(name, seed).mesh
@@ -124,6 +125,7 @@ def test_directions_and_irradiance_have_the_documented_conventions() -> None:
 # ------------------------------------------------------------------------------------------ what is shipped
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["road", "room"])
 def test_the_scripts_make_the_places_that_are_shipped(name: str) -> None:
     for path, made in place_files(name, PLACES[name]()).items():

@@ -100,6 +100,43 @@ def test_a_named_material_brings_its_numbers_and_given_ones_win(scene: SceneDesc
     assert bound.describe(torch.tensor([0.75]))["material.which"] == {"value": "steel", "unit": "name"}
 
 
+def test_a_base_colour_is_rendered_as_linear_reflectance(scene: SceneDescription) -> None:
+    """By IEC 61966-2-1, half of the range of sRGB is a reflectance of 0.2140."""
+    part = replace(scene.meshes["object"], base_color=np.full((1, 1, 3), 0.5, np.float32))
+    texels = np.array(make_principled(part)["bsdf"]["base_color"]["bitmap"])
+    np.testing.assert_allclose(texels, 0.2140, atol=1e-4)
+
+
+def test_every_way_into_a_number_has_the_same_guard(scene: SceneDescription) -> None:
+    """At a specular of exactly 0 Mitsuba's metal is black, and at a metallic of exactly 1 an adjoint has the wrong
+    sign: searched, fixed, of a named material, and of a surface in Mitsuba's own words."""
+    part = replace(scene.meshes["object"], material=Material(metallic=1.0, specular=0.0, clearcoat=0.0))
+    fixed = make_principled(part)["bsdf"]
+    assert (fixed["metallic"], fixed["specular"]) == (0.999, 1e-3) and "clearcoat" not in fixed
+    searched = {one.name: one for one in translate_mesh(part).inputs}
+    by_key = PluginNumber("object.bsdf.brdf_0.specular", (0.5,), "mitsuba.specular")
+    searched |= {one.name: one for one in translate_part(PluginNumbers("mitsuba", (by_key,))).inputs}
+    for name, value, rendered in (
+        ("object.metallic", 1.0, 0.999),
+        ("object.specular", 0.0, 1e-3),
+        ("object.clearcoat", 0.0, 1e-4),
+        ("object.roughness", 0.0, 0.0),
+        ("mitsuba.specular", 0.0, 1e-3),
+    ):
+        assert float(searched[name].to_rendered(torch.tensor([value]))) == pytest.approx(rendered)
+    own = to_loadable({"type": "twosided", "bsdf": {"type": "principled", "specular": 0.0, "metallic": 1.0}})["bsdf"]
+    assert own["specular"] == 1e-3
+    assert to_loadable({"type": "principled", "eta": 1})["eta"] == 1.001
+    assert to_loadable({"type": "roughplastic", "specular": 0.0})["specular"] == 0.0
+
+
+def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:
+    """Mitsuba makes them one where it may, so that both would change."""
+    made = translate_mesh(replace(scene.meshes["object"], material=Material()), IDLE_LOBES).plugins["object"]
+    keys = mi.traverse(made).keys()
+    assert [one for one in ("clearcoat", "sheen") if not any(key.endswith(f".{one}.value") for key in keys)] == []
+
+
 # ---- rendered -------------------------------------------------------------------------------------------------------
 
 

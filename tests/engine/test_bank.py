@@ -19,13 +19,13 @@ from advsearch.scene.surface import renderer as surface_renderer
 from stand_ins import Impatient, rows
 
 SMALL: dict[str, Any] = {
-    "resolution": 48,
-    "controls": {"texture": {"resolution": 8}},
+    "resolution": 32,
+    "controls": {"texture": {"resolution": 4}},
     "over": ["camera", "environment"],
     "draws": 2,
     "steps": 18,
     "trials": 6,
-    "verify_spp": 8,
+    "verify_spp": 2,
     "baseline": False,
     "deterministic": True,
 }

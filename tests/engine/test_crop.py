@@ -27,7 +27,7 @@ from stand_ins import Impatient, rows
 SMALL: dict[str, Any] = {
     "object": "mug", "environment": "noon", "controls": {"material": {"roughness": [0.1, 0.9]}}, "resolution": 64,
     "set": {"camera.distance": 0.8}, "spp": 4, "steps": 22, "policy": "pgd", "measure": "no",
-    "label": "bowl", "minimise": True, "baseline": True, "trials": 6, "verify_spp": 1,
+    "label": "bowl", "minimise": True, "baseline": False, "trials": 6, "verify_spp": 1,
 }  # fmt: skip
 
 
@@ -85,6 +85,7 @@ def test_pixels_of_the_window_are_those_of_the_whole_picture(renderer: Renderer)
     assert torch.equal(renderer(renderer.start, 6, 64).detach(), whole)  # the film is whole again
 
 
+@pytest.mark.medium
 def test_its_gradient_is_that_of_the_whole_picture_and_of_differences(renderer: Renderer) -> None:
     crop = renderer.crop_to(WINDOW, renderer.start, 3, 4)
     weights = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0))
@@ -185,6 +186,6 @@ def test_surroundings_that_change_are_rendered_again_and_then_always(monkeypatch
 
     for module in ("windows", "transport"):
         monkeypatch.setattr(f"advsearch.engine.{module}.measure_outside", measure_outside)
-    summary = attack_once(AttackConfig(**{**SMALL, "steps": 44, "baseline": False})).summary
+    summary = attack_once(AttackConfig(**{**SMALL, "steps": 44})).summary
     assert summary.transport is not None and summary.transport.renewed == 1
     assert "from evaluation 40 of the search on" in str(summary.transport.reason)

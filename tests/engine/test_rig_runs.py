@@ -51,7 +51,7 @@ def rows(run: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize(("words", "last"), [(SWEEP, 6), (ATTACK, 14)])
+@pytest.mark.parametrize(("words", "last"), [pytest.param(SWEEP, 6, marks=pytest.mark.slow), (ATTACK, 14)])
 def test_killed_between_two_cameras_it_ends_with_the_same_rows(tmp_path: Path, words: list[str], last: int) -> None:
     words = [*words, *RIG, "--camera", rig(tmp_path, PAIR)]
     assert main([*words, "--run", str(tmp_path / "whole")]) == 0
@@ -63,7 +63,7 @@ def test_killed_between_two_cameras_it_ends_with_the_same_rows(tmp_path: Path, w
     assert rows(tmp_path / "killed") == rows(tmp_path / "whole")
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_two_workers_have_the_rows_of_none(tmp_path: Path) -> None:
     words = [*SWEEP, *RIG, "--camera", rig(tmp_path, PAIR)]
     assert main([*words, "--run", str(tmp_path / "alone")]) == 0

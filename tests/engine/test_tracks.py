@@ -107,7 +107,7 @@ def test_paint_that_fools_a_detector_along_a_drive_breaks_the_track(tmp_path: Pa
     asked: dict[str, Any] = {"task": {"name": "detection", "unit": "fractions", "iou": 0.3}, "denoise": "none"}
     found = advsearch.attack(
         "mug", model, controls={"texture": {"resolution": 32}}, over={"path": NEAR}, epsilon=0.5, steps=16,
-        draws=2, trials=20, policy="pgd", baseline=False, spp=4, verify_spp=4, measure="no", run=tmp_path / "paint",
+        draws=2, trials=6, policy="pgd", baseline=False, spp=4, verify_spp=4, measure="no", run=tmp_path / "paint",
         **asked,
     )  # fmt: skip
     assert found.summary.ending == "found", found.summary

@@ -90,3 +90,42 @@ def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> No
     assert arguments[:3] == ["--background", "--factory-startup", "--disable-autoexec"] and "SECRET" not in environment
     del made, theirs
     assert not Path(environment["HOME"]).exists()
+
+
+def test_blender_gets_the_field_of_view_in_radians(folder: Path, renderer: Renderer) -> None:
+    (folder / "does.py").write_text("sys.exit(3)")
+    inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start)) | {"camera.fov": torch.tensor([60.0])}
+    with pytest.raises(BlenderError):
+        by_cycles(renderer.scene.definition[0]).radiance(inputs, 0, 1)
+    assert json.loads((folder / "scene.json").read_text())["fov"] == pytest.approx(1.0471976)
+
+
+@pytest.mark.parametrize(
+    ("does", "words"),
+    [
+        ("print('no engine CYCLES'); sys.exit(3)", "Blender stopped"),
+        ("import time; time.sleep(30)", "had not rendered it after 1 seconds"),
+    ],
+)
+def test_what_blender_can_not_render_is_said(
+    folder: Path, renderer: Renderer, does: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cycles, "MAX_RENDER_SECONDS", 1 if "sleep" in does else cycles.MAX_RENDER_SECONDS)
+    (folder / "does.py").write_text(does)
+    inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
+    with pytest.raises(BlenderError, match=words):
+        by_cycles(renderer.scene.definition[0]).radiance(inputs, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"parts": (HazePart("haze", 3.0),)}, "the scene has haze, which is not carried over"),
+        ({"backdrop": True, "thin_lens": True}, "a lens, a plain background"),
+    ],
+)
+def test_what_is_not_carried_over_is_said(
+    folder: Path, renderer: Renderer, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(BlenderError, match=words):
+        by_cycles(replace(renderer.scene.definition[0], **changes))

@@ -157,6 +157,7 @@ def codec(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
         yield store
 
 
+@pytest.mark.medium
 @settings(max_examples=50, deadline=None)
 @given(values=st.dictionaries(st.text(), VALUE, max_size=3), objective=st.floats(), label=st.none() | st.text())
 def test_any_values_come_back(codec: Store, values: dict[str, Any], objective: float, label: str | None) -> None:

@@ -197,3 +197,11 @@ def test_gltf_out_has_the_same_normals(tmp_path: Path) -> None:
     assert part.normal_map is not None and again.warnings == ()
     np.testing.assert_allclose(vectors(again.normal_map), vectors(part.normal_map), atol=0.012)
     np.testing.assert_allclose(again.mesh.uvs, part.mesh.uvs, atol=1e-5)
+    np.testing.assert_allclose(again.mesh.normals, part.mesh.normals, atol=1e-5)
+
+
+def test_no_adjoint_with_boundary_terms_is_valid(tmp_path: Path) -> None:
+    scene = advsearch.load_scene(written(card(), tmp_path), settings=SEEN)
+    groups = scene.renderer(["pose", "texture"], resolution=SIZE).plan.groups
+    assert all("material" not in group.valid for group in groups)
+    assert "adjoint" in next(group for group in groups if group.control == "texture").valid

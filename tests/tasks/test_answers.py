@@ -72,6 +72,7 @@ def test_the_text_alone_says_what_is_right() -> None:
     assert task.judge([said("cup", logits * math.nan)], ("cup",))[0].is_non_finite
 
 
+@pytest.mark.medium
 def test_a_target_is_a_word_that_is_said() -> None:
     model = advsearch.load_model(Speaker(), task="answer", input_size=8)
     task = make_task("answer").on(model, target="Bowl")

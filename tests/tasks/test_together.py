@@ -88,6 +88,17 @@ def test_tasks_are_joined_by_a_plus_or_in_a_list(asked: Any, kept: Any) -> None:
     assert isinstance(made, EnsembleTask) and [type(one) for one in made.parts] == [Detection, Depth]
 
 
+def test_all_models_have_a_derivative() -> None:
+    """Of a sum over linear models: the sum of their weights."""
+    layers = [nn.Linear(3, 2, bias=False) for _ in range(2)]
+    model = join_models(
+        [advsearch.load_model(nn.Sequential(nn.Flatten(), one), labels=("a", "b"), input_size=1) for one in layers]
+    )
+    image = torch.full((1, 1, 3), 0.5, requires_grad=True)
+    torch.stack([output.sum() for output in model(image)[0]]).sum().backward()
+    torch.testing.assert_close(image.grad, sum(one.weight.detach().sum(dim=0) for one in layers)[None, None])
+
+
 # ---- what is judged -------------------------------------------------------------------------------------------------
 
 
