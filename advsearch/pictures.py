@@ -18,9 +18,11 @@ from advsearch.errors import FileFormatError
 from advsearch.trust import stored_files
 from advsearch.trust.stored_files import make_size_error, scale_limit
 
-FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
+FORMATS = ("PNG", "JPEG", "BMP", "GIF", "PPM", "DDS", "SGI", "TIFF", "WEBP", "TGA")
 """Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs
 other programs.
+
+Tried in this order: for the sixth Pillow imports all that it knows, which takes 0.1 s.
 """
 MAX_FILE_BYTES = (
     1 << 28

@@ -4,6 +4,7 @@ ball around a road.
     python benchmarks/avenue.py [--size 300] [--spp 16] [--rounds 5] [--steps 40]
     python benchmarks/avenue.py --attacks                              # whole attacks alone
     python benchmarks/avenue.py --searches [--distances 10 30 60] [--seeds 1]
+    python benchmarks/avenue.py --loading [--rounds 5] [--environments avenue room]
 
 It prints processor time as ratios: a warm picture (a primal render with the denoiser's
 guides), the gradient of a texture, and a search of `--steps` steps with both; and the
@@ -16,6 +17,9 @@ most memory that each process has had.
 of the picture that it chooses, and with whole pictures, both by matrices of light
 transport and by renders; and in how many of the seeds whole traced pictures of what it
 found are wrong. The model is to call the car what it calls it at the start.
+
+`--loading` measures what it takes to load a car in each place, in a process of its own
+that has imported everything and loaded another scene before; and the imports.
 """
 
 from __future__ import annotations
@@ -46,6 +50,7 @@ from advsearch.questions.attack import stages
 from advsearch.questions.attack.carry_out import load_parts, make_problem
 from advsearch.questions.attack.run import choose_policy
 from advsearch.questions.attack.settings import AttackConfig
+from advsearch.scene.library import list_environments
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import LinearRenderer
 
@@ -79,6 +84,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--attacks", action="store_true", help="whole attacks alone")
     parser.add_argument("--searches", action="store_true", help="searches alone")
+    parser.add_argument("--loading", action="store_true", help="loading alone")
+    parser.add_argument(
+        "--environments",
+        nargs="+",
+        default=[*list_environments("street"), *list_environments("place")],
+        help="of `--loading` (default: all places)",
+    )
     parser.add_argument(
         "--distances",
         type=float,
@@ -94,6 +106,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="steps of searches without matrices in `--searches` (default 0: none)",
     )
     args = parser.parse_args(argv)
+    if args.loading:
+        _print_loading(args.environments, args.rounds)
+        return 0
     if args.searches:
         for distance in args.distances:
             _compare_searches(distance, args)
@@ -185,6 +200,39 @@ with tempfile.TemporaryDirectory() as folder:
 used = resource.getrusage(resource.RUSAGE_SELF)
 print(json.dumps([used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0]))
 """
+
+
+LOADING = """
+import json, sys, time
+begin = time.process_time()
+import advsearch
+advsearch.load_scene("mug").renderer("texture", resolution=48)
+imported = time.process_time()
+scene = advsearch.load_scene("car", sys.argv[1])
+described = time.process_time()
+scene.renderer("texture", resolution=48)
+loaded = time.process_time()
+print(json.dumps([imported - begin, described - imported, loaded - described]))
+"""
+
+
+def _print_loading(environments: Sequence[str], rounds: int) -> None:
+    """Print what loading takes in each environment, medians of processor seconds."""
+    print("processor seconds     imports  load_scene  renderer   both")
+    for environment in environments:
+        costs: list[list[float]] = []
+        for _ in range(rounds):
+            output = subprocess.run(
+                [sys.executable, "-c", LOADING, environment],
+                check=True,
+                stdout=subprocess.PIPE,
+                text=True,
+            ).stdout
+            costs.append(json.loads(output.splitlines()[-1]))
+        medians = [statistics.median(column) for column in zip(*costs, strict=True)]
+        both = statistics.median(cost[1] + cost[2] for cost in costs)
+        numbers = "  ".join(f"{seconds:8.2f}" for seconds in [*medians, both])
+        print(f"{environment:18} {numbers}", flush=True)
 
 
 def _camera(distance: float) -> dict[str, float]:

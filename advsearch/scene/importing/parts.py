@@ -21,6 +21,7 @@ from advsearch.scene.assets import (
     Float64Array,
     IntArray,
     group_indices,
+    multiply_rows,
 )
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import Notes
@@ -278,12 +279,12 @@ def transform_part(part: ImportedPart, matrix: Float64Array) -> ImportedPart:
     linear = matrix[:3, :3]
     normals = part.normals
     with np.errstate(all="ignore"):
-        vertices = part.vertices @ linear.T + matrix[:3, 3]
+        vertices = multiply_rows(part.vertices, linear.T) + matrix[:3, 3]
         if normals is not None:
             # Normals are transformed by the cofactors of the matrix: the inverse
             # transpose times the determinant, which singular matrices have too.
             cofactors = np.cross(linear[[1, 2, 0]], linear[[2, 0, 1]])
-            normals = normals @ cofactors.T
+            normals = multiply_rows(normals, cofactors.T)
     return replace_geometry(
         part, vertices, normals, is_mirrored=bool(np.linalg.det(linear) < 0.0)
     )

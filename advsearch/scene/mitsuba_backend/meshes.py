@@ -18,6 +18,8 @@ from advsearch.scene.assets import (
     Float64Array,
     Mesh,
     compute_area_vectors,
+    compute_lengths,
+    multiply_rows,
 )
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
@@ -241,9 +243,11 @@ def make_mitsuba_mesh(
 
     Mitsuba's bitmaps have row 0 at v = 0 while ours have it at v = 1, hence the flip.
     """
-    vertices = mesh.vertices.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
-    normals = mesh.normals.astype(np.float64) @ np.linalg.inv(to_world[:3, :3])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    linear = to_world[:3, :3]
+    vertices = multiply_rows(mesh.vertices.astype(np.float64), linear.T)
+    vertices += to_world[:3, 3]
+    normals = multiply_rows(mesh.normals.astype(np.float64), np.linalg.inv(linear))
+    normals /= np.maximum(compute_lengths(normals), 1e-12)
     uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
     properties = mi.Properties()
     # Optimizing merges equal numbers into one: both would change.

@@ -123,16 +123,16 @@ def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
     that object's parameters count. Raises RuntimeError if there are several.
     """
     prefix, asterisk, suffix = scene_input.key.partition("*")
-
-    def matches(key: str) -> bool:
-        if asterisk and not (key.startswith(prefix) and key.endswith(suffix)):
-            return False
-        if not asterisk and key != scene_input.key:
-            return False
-        owner = scene_input.owner
-        return owner is None or parameters.properties[key][2] is owner
-
-    keys = [str(key) for key in parameters.keys() if matches(key)]
+    keys = [scene_input.key] if scene_input.key in parameters else []
+    if asterisk:
+        keys = [
+            key
+            for key in parameters.keys()
+            if key.startswith(prefix) and key.endswith(suffix)
+        ]
+    owner = scene_input.owner
+    if owner is not None:
+        keys = [key for key in keys if parameters.properties[key][2] is owner]
     if len(keys) > 1:
         raise RuntimeError(
             f"expected one Mitsuba parameter {scene_input.key}, found {keys}"

@@ -27,6 +27,8 @@ from advsearch.scene.assets import (
     Material,
     Mesh,
     compute_area_vectors,
+    compute_lengths,
+    multiply_rows,
 )
 from advsearch.scene.importing import gltf_skeleton
 from advsearch.scene.importing.files import Notes, UniqueNames, check_faces, damaged
@@ -525,11 +527,11 @@ def _join(members: Sequence[ImportedPart]) -> Mesh:
         uvs.append(part_uvs)
         n_vertices += len(part.vertices)
     directions = np.concatenate(normals)
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    directions /= np.maximum(compute_lengths(directions), 1e-12)
     return Mesh(
-        (np.concatenate(vertices) @ rotation.T).astype(np.float32),
+        multiply_rows(np.concatenate(vertices), rotation.T).astype(np.float32),
         np.concatenate(faces).astype(np.uint32),
-        (directions / np.maximum(lengths, 1e-12) @ rotation.T).astype(np.float32),
+        multiply_rows(directions, rotation.T).astype(np.float32),
         np.concatenate(uvs).astype(np.float32),
     )
 
