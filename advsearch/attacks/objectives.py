@@ -108,10 +108,10 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
             "objective: expected a name or a function (output, images, "
             f"truth), got {describe_value(function)}"
         )
+    # a module is called through its `forward`
+    callee = function.forward if isinstance(function, nn.Module) else function
     try:
-        signature = inspect.signature(
-            function.forward if isinstance(function, nn.Module) else function
-        )
+        signature = inspect.signature(callee)
     except ValueError:  # built in: nothing to look at
         return ObjectiveSignature()
     parameters = signature.parameters.values()
@@ -769,8 +769,23 @@ def check_objective(
         )
     kind = _find_kind(objective)
     if kind is None:
-        read_signature(objective)  # type: ignore[arg-type]
+        read_signature(objective)  # type: ignore[arg-type]  # checks its arguments
         return
+    _check_kind(kind, task, targeted=targeted, minimise=minimise)
+
+
+def _check_kind(
+    kind: ObjectiveKind, task: str, *, targeted: bool, minimise: bool
+) -> None:
+    """Raise InputError unless a named objective is one for the task, and for what is
+    sought.
+
+    Args:
+        kind: of the objective.
+        task: name of the task.
+        targeted: whether a target is sought.
+        minimise: whether a right prediction is sought.
+    """
     if not kind.fits(task):
         fitting = [name for name, other in OBJECTIVE_KINDS.items() if other.fits(task)]
         raise InputError(

@@ -453,13 +453,7 @@ def _explore(
         proposals, state = policy.propose(state, max_proposals)
         if not proposals:
             return Ending.STALLED
-        if len(proposals) > max_proposals:
-            raise RuntimeError(
-                f"policy {name!r} proposed {len(proposals)} "
-                f"configurations; expected at most {max_proposals}"
-            )
-        for proposal in proposals:
-            _check_inside(proposal, log.domain, name)
+        _check_proposals(proposals, max_proposals, log.domain, name)
         batch = _limit_batch(proposals, log.domain, steps - log.renders)
         log.state = state
         log.evaluated_batch = []
@@ -537,6 +531,27 @@ def _repeat_candidates(log: _Log, indices: range) -> None:
         for evaluation in islice(evaluations, len(indices)):
             repeated = repeated.with_repeat(evaluation.objective, evaluation.success)
             log.pool = (*log.pool[:position], repeated, *pool[position + 1 :])
+
+
+def _check_proposals(
+    proposals: Sequence[Proposal], max_count: int, domain: Domain, name: str
+) -> None:
+    """Raise RuntimeError if a policy proposed too many configurations, or something
+    else than configurations of the domain, which is a bug.
+
+    Args:
+        proposals: of the policy.
+        max_count: how many it may propose.
+        domain: of the search.
+        name: of the policy.
+    """
+    if len(proposals) > max_count:
+        raise RuntimeError(
+            f"policy {name!r} proposed {len(proposals)} "
+            f"configurations; expected at most {max_count}"
+        )
+    for proposal in proposals:
+        _check_inside(proposal, domain, name)
 
 
 def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:

@@ -245,6 +245,33 @@ def _make_candidates(
     return box.to_configuration(offspring, x)
 
 
+def _make_archive(
+    domain: policies.Domain, measure_indices: Tensor, dims: Sequence[int], seed: int
+) -> Any:
+    """Return an empty archive of ribs: a grid over the ranges of some parameters.
+
+    Args:
+        domain: of the search.
+        measure_indices: (k,) indices in u of the parameters.
+        dims: number of cells along the axis of each.
+        seed: of the search.
+    """
+    from ribs import archives  # an extra, and it takes seconds
+
+    lower = domain.lower[measure_indices].tolist()
+    upper = domain.upper[measure_indices].tolist()
+    return archives.GridArchive(
+        solution_dim=domain.dim,
+        dims=dims,
+        seed=seeds.stream(seed, "archive"),
+        ranges=list(zip(lower, upper, strict=True)),
+        solution_dtype=np.float32,
+        objective_dtype=np.float64,
+        measures_dtype=np.float64,
+        extra_fields={"wrong": ((), np.bool_)},
+    )
+
+
 def _make_observations(domain: policies.Domain) -> policies.Observations | None:
     """Return what a surrogate is fitted to, without a point yet; None if the domain has
     norm balls, or too many numbers for a surrogate.
@@ -338,24 +365,7 @@ class MapElites(Policy[ArchiveState]):
                 f"cells: expected at most {MAX_CELLS} in all, got "
                 f"{math.prod(dims)}; set `cells` lower"
             )
-        from ribs import archives  # an extra, and it takes seconds
-
-        archive = archives.GridArchive(
-            solution_dim=domain.dim,
-            dims=dims,
-            seed=seeds.stream(seed, "archive"),
-            ranges=list(
-                zip(
-                    domain.lower[measure_indices].tolist(),
-                    domain.upper[measure_indices].tolist(),
-                    strict=True,
-                )
-            ),
-            solution_dtype=np.float32,
-            objective_dtype=np.float64,
-            measures_dtype=np.float64,
-            extra_fields={"wrong": ((), np.bool_)},
-        )
+        archive = _make_archive(domain, measure_indices, dims, seed)
         first_points = [
             domain.initial_point[None],
             domain.sample(policies.seeded(seed, 0), self.population - 1),

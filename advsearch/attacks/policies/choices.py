@@ -146,12 +146,19 @@ class Race:
             waiting = self._find_waiting(runners)
         for k, count in n_used.items():
             if count < len(proposals[k]):
-                # once more from the state before, for those that were used
-                _, state = runners[k].policy.propose(self.runners[k].state, count)
+                state = self._propose_again(k, count)
                 runners[k] = replace(runners[k], state=state)
         return tuple(batch), replace(
             self, runners=tuple(runners), runner_of_proposal=tuple(runner_of_proposal)
         )
+
+    def _propose_again(self, k: int, count: int) -> Any:
+        """Return the state of search k after it proposed no more than `count`
+        configurations, from its state before the batch.
+        """
+        runner = self.runners[k]
+        _, state = runner.policy.propose(runner.state, count)
+        return state
 
     def _find_waiting(self, runners: Sequence[Runner]) -> list[int]:
         """Return the indices of active runners that have renders left."""
