@@ -83,12 +83,14 @@ def add_candidate(
             return tuple(
                 updated if candidate is old else candidate for candidate in pool
             )
-    if len(pool) >= size and _sort_key(new) <= _sort_key(pool[-1]):
+    is_full = len(pool) >= size
+    if is_full and _sort_key(new) <= _sort_key(pool[-1]):  # no better than the worst
         return pool
     for old in pool:
-        if float((old.u - new.u).abs().amax()) < SAME:
-            if _sort_key(new) <= _sort_key(old):
-                return pool
+        is_nearly_same = float((old.u - new.u).abs().amax()) < SAME
+        if is_nearly_same and _sort_key(new) <= _sort_key(old):
+            return pool
+        if is_nearly_same:  # `new` is the better of the two and takes its place
             pool = tuple(candidate for candidate in pool if candidate is not old)
             break
     return tuple(sorted((*pool, new), key=_sort_key, reverse=True)[:size])
@@ -108,47 +110,54 @@ def replace_worst(
 
 
 def select_contenders(
-    pool: tuple[Candidate, ...], shared: int
+    pool: tuple[Candidate, ...], n_shared: int
 ) -> tuple[Candidate, ...]:
     """Return the best candidate so far and those that are not clearly worse, in order.
 
-    The last `shared` renders of all candidates have the same seeds. With fewer than two
-    of these, or of candidates, nobody is clearly worse. (The race of Maron and Moore
-    1994, with normal intervals of one standard deviation in place of Hoeffding's: a
-    search needs the better of two, not a proof.)
+    (The race of Maron and Moore 1994, with normal intervals of one standard deviation
+    in place of Hoeffding's: a search needs the better of two, not a proof.)
+
+    Args:
+        pool: the candidates.
+        n_shared: so many of the latest renders of each candidate have the same seeds as
+            those of the others, so that they can be compared seed by seed.
     """
-    if shared < 2 or len(pool) < 2:
+    # one render says nothing of the noise, and one candidate has no rival
+    if n_shared < 2 or len(pool) < 2:
         return pool
     leader = select_best(pool)
     return tuple(
         candidate
         for candidate in pool
-        if candidate is leader or not _is_clearly_worse(candidate, leader, shared)
+        if candidate is leader or not _is_clearly_worse(candidate, leader, n_shared)
     )
 
 
-def _is_clearly_worse(candidate: Candidate, leader: Candidate, shared: int) -> bool:
+def _is_clearly_worse(candidate: Candidate, leader: Candidate, n_shared: int) -> bool:
     """Return whether a candidate has no higher success rate than the leader, and the
     leader's objective is greater by more than the standard error of the difference.
 
-    Objectives are compared seed by seed in the last `shared` renders. If one of these
-    is not finite, the candidate is worse if its mean is not finite.
+    Objectives are compared seed by seed in the last `n_shared` renders, at least 2. If
+    a difference is not finite, the candidate is worse if its mean is not finite.
     """
     differences = [
         leader_objective - objective
         for leader_objective, objective in zip(
-            leader.repeat_objectives[-shared:],
-            candidate.repeat_objectives[-shared:],
+            leader.repeat_objectives[-n_shared:],
+            candidate.repeat_objectives[-n_shared:],
             strict=True,
         )
     ]
     if not all(map(math.isfinite, differences)):
         return not math.isfinite(candidate.mean_objective)
-    mean = math.fsum(differences) / shared
-    squares = math.fsum((difference - mean) ** 2 for difference in differences)
-    variance = squares / (shared - 1)
+    mean_difference = math.fsum(differences) / n_shared
+    squares = math.fsum(
+        (difference - mean_difference) ** 2 for difference in differences
+    )
+    variance = squares / (n_shared - 1)
+    standard_error = math.sqrt(variance / n_shared)
     has_higher_rate = candidate.success_rate > leader.success_rate
-    return not has_higher_rate and mean > math.sqrt(variance / shared)
+    return not has_higher_rate and mean_difference > standard_error
 
 
 def select_best(pool: tuple[Candidate, ...]) -> Candidate:
@@ -227,15 +236,18 @@ def estimate_failure_rate(
     # x_t if no unknown sample failed, and if all of them did
     lower_x = weights * (failed & ~unknown)
     upper_x = weights * (failed | unknown)
-    bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]  # (bets, 1)
+    # c of the formulas: 1, 1/2, 1/4, ...; (bets, 1)
+    bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
     # The sum over bets below is `N_BETS` times the capital, which is their mean.
     log_limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
 
     def is_too_low(p: float) -> bool:
+        """Return whether the bets that the rate is over p have won (first product)."""
         log_factors = torch.log(1.0 - bet_sizes + bet_sizes * lower_x / p)  # (bets, n)
         return float(log_factors.sum(dim=1).logsumexp(dim=0)) >= log_limit
 
     def is_too_high(p: float) -> bool:
+        """Return whether the bets that the rate is under p have won (second one)."""
         log_factors = torch.log1p(bet_sizes * (p - upper_x) / (bounds - p))
         return float(log_factors.sum(dim=1).logsumexp(dim=0)) >= log_limit
 
@@ -243,7 +255,9 @@ def estimate_failure_rate(
     effective = total**2 / float(lower_x.square().sum()) if total else 0.0
     estimate = None
     if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
+        # the mean of weighted samples may exceed 1 by chance, a rate can't
         estimate = min(1.0, total / len(lower_x))
+    # the interval is from where p is no longer too low to where it begins to be too high
     lower = find_threshold(lambda p: not is_too_low(p))
     upper = find_threshold(is_too_high)
     return FailureRate(estimate, (lower, upper), effective, draws=len(lower_x))
@@ -309,8 +323,8 @@ def select_diverse(
         is_discrete: (k,) bool, discrete choices: different options lie 1 apart.
         limit: maximum number of indices.
     """
-    # the worst first, so that the first of equally far points is the worst
-    order = sorted(range(len(points)), key=lambda number: -objectives[number])
+    # the worst first: `argmax` below returns the first of equally far points
+    order = sorted(range(len(points)), key=lambda index: -objectives[index])
     points = points[order].double()
     # (n,) distance to the nearest selected point; infinite before there is one
     nearest_distance = torch.full((len(points),), torch.inf, dtype=torch.float64)
@@ -325,7 +339,7 @@ def select_diverse(
         difference = torch.where(is_discrete, (difference > 0.0).double(), difference)
         nearest_distance = torch.minimum(nearest_distance, difference.norm(dim=1))
         nearest_distance[selected] = -1.0  # never again
-    return [order[number] for number in selected]
+    return [order[rank] for rank in selected]
 
 
 RATIO = 1.05  # the bracket is closed once high / low is at most this
@@ -394,21 +408,22 @@ def scale_domain(domain: Domain, scale: float) -> Domain:
     Raises:
         InputError: a block has no budget.
     """
-    names = [
+    # a block is called by its parameter, "pose.yaw" of the control "pose"
+    controls_without_budget = [
         block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None
     ]
-    if names:
-        unbounded = [name or "a block" for name in dict.fromkeys(names)]
+    if controls_without_budget:
+        names = [name or "a block" for name in dict.fromkeys(controls_without_budget)]
         raise InputError(
             "smallest: expected controls with a budget (texture, geometry, patch, "
-            f"...), got {', '.join(unbounded)}, "
+            f"...), got {', '.join(names)}, "
             "whose parameters have ranges and no epsilon; leave it out"
         )
-    blocks = tuple(
-        replace(block, epsilon=float(block.epsilon or 0.0) * scale)
-        for block in domain.blocks
-    )
-    return replace(domain, blocks=blocks)
+    scaled_blocks = []
+    for block in domain.blocks:
+        assert block.epsilon is not None
+        scaled_blocks.append(replace(block, epsilon=block.epsilon * scale))
+    return replace(domain, blocks=tuple(scaled_blocks))
 
 
 def shrink_towards_start(domain: Domain, u: Tensor, scale: float) -> Tensor:
@@ -448,33 +463,40 @@ def find_smallest_change(
         passed in the full budget, its `low` is 1 and its `u` None.
     """
     u = search(domain, 0)
-    # after one search and one configuration that goes through the trials
-    state = Bracket(0.0, math.inf, None, 1, 1)
+    bracket = Bracket(low=0.0, high=math.inf, u=None, searches=1, checks=1)
     if not passes(u, 0):
-        return replace(state, low=1.0)
-    state = _shorten(state, u, 1.0, passes, domain, likely)
+        return replace(bracket, low=1.0)
+    bracket = _shorten(bracket, u, 1.0, passes, domain, likely)
     while (
-        state.searches < MAX_SEARCHES
-        and state.high > RATIO * state.low
-        and state.high > SMALLEST_SCALE
+        bracket.searches < MAX_SEARCHES
+        and bracket.high > RATIO * bracket.low  # not closed
+        and bracket.high > SMALLEST_SCALE
     ):
-        if state.low == 0.0:
-            scale = state.high / 2.0
-        else:
-            scale = math.sqrt(state.low * state.high)
-        # Near the end, take the scale that closes the bracket if nothing is found.
-        if state.high <= RATIO**2 * state.low:
-            scale = max(scale, state.high / RATIO)
-        u = search(scale_domain(domain, scale), state.searches)
-        has_passed = passes(u, state.checks)
+        scale = _choose_next_scale(bracket)
+        search_index = bracket.searches
+        u = search(scale_domain(domain, scale), search_index)
+        has_passed = passes(u, bracket.checks)
+        bracket = replace(bracket, searches=search_index + 1, checks=bracket.checks + 1)
         if has_passed:
-            state = replace(state, found_by=state.searches)
-        state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
-        if has_passed:
-            state = _shorten(state, u, scale, passes, domain, likely)
+            bracket = replace(bracket, found_by=search_index)
+            bracket = _shorten(bracket, u, scale, passes, domain, likely)
         else:
-            state = replace(state, low=scale)
-    return state
+            bracket = replace(bracket, low=scale)
+    return bracket
+
+
+def _choose_next_scale(bracket: Bracket) -> float:
+    """Return the scale of the budgets at which to search next, inside the bracket.
+
+    It is the geometric mean of both ends; half the upper end if no search has failed
+    yet. Near the end it is the scale that closes the bracket if nothing is found.
+    """
+    if bracket.low == 0.0:
+        return bracket.high / 2.0
+    scale = math.sqrt(bracket.low * bracket.high)
+    if bracket.high <= RATIO**2 * bracket.low:
+        scale = max(scale, bracket.high / RATIO)
+    return scale
 
 
 def confirm_bracket(
@@ -485,35 +507,35 @@ def confirm_bracket(
 
     What lies exactly on the edge passes its trials by chance. If it fails, its change
     is lengthened by the square root of `RATIO`, about 2.5 %, and it is tried again. The
-    scale never exceeds 1. After `MAX_CONFIRMATIONS` the bracket is returned unconfirmed, with a
-    configuration that was lengthened once more and not tried.
+    scale never exceeds 1. After `MAX_CONFIRMATIONS` the bracket is returned
+    unconfirmed, with a configuration that was lengthened once more and not tried.
     """
     if bracket.u is None:
         return bracket
     shortest_u = bracket.u
     shortest_scale = bracket.high
-    growth = 1.0
+    growth = 1.0  # of the change, since the shortest that passed
     for _ in range(MAX_CONFIRMATIONS):
         if all(passes(bracket.u, bracket.checks + repeat) for repeat in range(times)):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
         growth *= math.sqrt(RATIO)
         scale = min(1.0, shortest_scale * growth)
-        grown_u = scale_domain(domain, scale).project(
-            domain.start + growth * (shortest_u - domain.start)
-        )
+        change = shortest_u - domain.start
+        grown_u = scale_domain(domain, scale).project(domain.start + growth * change)
         bracket = replace(bracket, high=scale, u=grown_u, checks=bracket.checks + times)
     return bracket
 
 
 def _shorten(
-    state: Bracket,
+    bracket: Bracket,
     u: Tensor,
     length: float,
     passes: Passes,
     domain: Domain,
     likely: Guess | None,
 ) -> Bracket:
-    """Bisect the length of a configuration that passes.
+    """Return the bracket with its upper end at the shortest length of a configuration,
+    moved towards the start, that still passes; found by bisection.
 
     Lengths are scales of the budgets, bisected in their logarithm until the bounds are
     within `LENGTH_RATIO` of each other. With `likely`, the first length that is tried
@@ -521,23 +543,25 @@ def _shorten(
     each time, but never beyond the middle of the bounds.
 
     Args:
-        state: the bracket, whose lower end is the lower bound.
+        bracket: so far; its lower end is the lower bound of the length.
         u: (d,) the configuration that passes.
         length: its scale.
         passes: runs the trials of a configuration.
         domain: with the full budgets.
         likely: guesses whether a configuration passes, or None.
     """
-    low = max(state.low, SMALLEST_SCALE * length)
+    low = max(bracket.low, SMALLEST_SCALE * length)
     high = length
     shortest_u = u
-    checks = state.checks
+    checks = bracket.checks
 
     def shrink_to(scale: float) -> Tensor:
         return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
+    # The next length is the geometric mean of the bounds, but at most this factor away
+    # from the bound that was set last.
+    max_step = math.inf
     trial_length = math.sqrt(high * low)
-    max_step = math.inf  # the largest factor from a bound to the next length
     if likely is not None:
         max_step = LENGTH_RATIO
         trial_length = _guess_shortest(likely, shrink_to, low, high)
@@ -552,15 +576,19 @@ def _shorten(
             trial_length = min(math.sqrt(high * low), low * max_step)
         max_step = max_step * max_step
         checks = checks + 1
-    return replace(state, high=high, u=shortest_u, checks=checks)
+    return replace(bracket, high=high, u=shortest_u, checks=checks)
 
 
 def _guess_shortest(
     likely: Guess, shrink_to: Callable[[float], Tensor], low: float, high: float
 ) -> float:
-    """Return about the shortest length between two bounds that is likely to pass.
+    """Return about the shortest length between two bounds that is likely to pass, by
+    bisection of its logarithm.
 
-    `shrink_to` returns the configuration of a length.
+    Args:
+        likely: guesses whether a configuration would pass.
+        shrink_to: returns the configuration (d,) of a length.
+        low, high: bounds, over 0.
     """
     while high > LENGTH_RATIO * low:
         middle = math.sqrt(high * low)

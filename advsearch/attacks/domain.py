@@ -120,7 +120,8 @@ class Block:
         if self.norm == "box":
             return 0.5 * diagonal if self.reach is None else self.reach
         diameter = width if self.norm == "linf" else diagonal
-        return min(float(self.epsilon or 0.0), diameter)
+        assert self.epsilon is not None  # every ball has one
+        return min(float(self.epsilon), diameter)
 
     @property
     def compute_rounding(self) -> float:
@@ -167,6 +168,24 @@ class Domain:
 
     def __post_init__(self) -> None:
         """Copy the start, compute the bounds of each element, and check all of them."""
+        self._copy_start()
+        if self.gradient_cost < 0:
+            raise InputError(
+                f"gradient_cost: expected at least 0, got {self.gradient_cost}"
+            )
+        self._compute_bounds()
+        if self.restart_point is not None and not self.contains(self.restart_point):
+            raise InputError(
+                "restart_point: expected a configuration of the domain; project it"
+            )
+
+    def _copy_start(self) -> None:
+        """Replace the start by a float32 copy, and the blocks by a tuple.
+
+        Raises:
+            InputError: the start has not as many elements as the blocks, or is not
+                finite.
+        """
         start = self.start.detach().to(torch.float32, copy=True)
         total = sum(block.size for block in self.blocks)
         if start.ndim != 1 or start.numel() != total:
@@ -178,14 +197,23 @@ class Domain:
             raise InputError(
                 "start: found NaN or infinite values; a start must be a configuration"
             )
-        if self.gradient_cost < 0:
-            raise InputError(
-                f"gradient_cost: expected at least 0, got {self.gradient_cost}"
-            )
-        lower = torch.empty_like(start)
-        upper = torch.empty_like(start)
+        # the dataclass is frozen
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "blocks", tuple(self.blocks))
+
+    def _compute_bounds(self) -> None:
+        """Compute `lower` and `upper`, the bounds (d,) of every element of u.
+
+        Those of an l-infinity ball around the start are cut into them: both together
+        are a box.
+
+        Raises:
+            InputError: the start lies outside the bounds of its block.
+        """
+        start = self.start
+        lower = torch.empty_like(start)
+        upper = torch.empty_like(start)
+        # the dataclass is frozen
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
         for block, part in self.list_block_slices():
@@ -204,10 +232,6 @@ class Domain:
             if block.norm == "linf" and block.epsilon is not None:
                 lower[part].clamp_(min=start[part] - block.epsilon)
                 upper[part].clamp_(max=start[part] + block.epsilon)
-        if self.restart_point is not None and not self.contains(self.restart_point):
-            raise InputError(
-                "restart_point: expected a configuration of the domain; project it"
-            )
 
     @property
     def initial_point(self) -> Tensor:
@@ -329,7 +353,7 @@ class Domain:
                 if block.options:
                     noise = option_center(noise, block.options)
                 elif extreme and block.norm != "box":
-                    noise.round_()
+                    noise.round_()  # 0 or 1: a corner, or the signs of a direction
                 if block.norm != "l2" or block.epsilon is None:
                     u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
                 elif extreme:
@@ -337,22 +361,19 @@ class Domain:
                     # below brings it to the surface
                     far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
                     u[part] = self.start[part] + (noise * 2.0 - 1.0) * far_distance
-                else:  # uniform in the ball (Muller 1959)
-                    direction = torch.randn(block.size, generator=generator)
-                    # A uniform number to the power 1/d is the radius of such a point.
-                    length = block.epsilon * math.pow(float(noise[0]), 1.0 / block.size)
-                    direction *= length / max(
-                        float(torch.linalg.vector_norm(direction)), 1e-30
+                else:
+                    u[part] = self.start[part] + _sample_ball(
+                        block.size, block.epsilon, float(noise[0]), generator
                     )
-                    u[part] = self.start[part] + direction
             samples.append(self.project(u))
         return torch.stack(samples)
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
         """Return one unit step (d,) from u uphill, by the gradient (d,), finite.
 
-        It is the displacement of the block's radius in the block's norm that increases
-        a linear objective most. Add a multiple of it to u and project. All are float32.
+        Of all displacements whose length, in the norm of each block, is the radius of
+        the block, it is the one that increases a linear objective most. Add a multiple
+        of it to u and project. All are float32.
 
         - "linf": radius * sign(gradient);
         - "l2": radius * gradient / ||gradient||;
@@ -381,6 +402,20 @@ class Domain:
             norm = max(float(torch.linalg.vector_norm(slope)), 1.0)
             step[part] = slope * (block.radius / norm)
         return step
+
+
+def _sample_ball(
+    size: int, radius: float, uniform: float, generator: torch.Generator
+) -> Tensor:
+    """Draw a point (size,), uniform in an l2 ball around 0 (Muller 1959).
+
+    Its distance from 0 is the radius times `uniform` to the power 1 / size, if
+    `uniform` is a uniform random number in [0, 1).
+    """
+    direction = torch.randn(size, generator=generator)
+    distance = radius * math.pow(uniform, 1.0 / size)
+    norm = float(torch.linalg.vector_norm(direction))
+    return direction.mul_(distance / max(norm, 1e-30))
 
 
 def option_center(u: Tensor, options: Tensor | int) -> Tensor:
@@ -448,7 +483,10 @@ def project_l2_box(
 def _solve_multiplier(
     squares: Sequence[Tensor], rooms: Sequence[Tensor], radius: float, s: float
 ) -> float:
-    """Return s with g(s) = radius^2 by Newton's method, see `project_l2_box`.
+    """Return s with g(s) = sum_i min(s v_i^2, room_i^2) = radius^2, by Newton's method.
+
+    `project_l2_box` has the derivation. g is piecewise linear, so that the method ends
+    at the exact root once it is on the right piece.
 
     Args:
         squares: v_i^2 in chunks.
@@ -466,7 +504,7 @@ def _solve_multiplier(
             value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
         # Newton's step; where nothing grows any more, it stays
         next_s = s + (radius**2 - value) / slope if slope > 0.0 else s
-        if next_s <= s * (1.0 + 1e-7):
+        if next_s <= s * (1.0 + 1e-7):  # steps only go up, so this one is rounding
             break
         s = next_s
     return s
@@ -532,6 +570,7 @@ def compute_half_widths(domain: Domain) -> Tensor:
             half[part] = min(
                 block.radius / math.sqrt(block.size), (block.high - block.low) / 2.0
             )
+    # an epsilon below the resolution of float32 leaves no width
     return half.clamp_(min=torch.finfo(torch.float32).tiny)
 
 
@@ -630,7 +669,7 @@ class SampleSequence:
             return np.empty((max(0, count), self.dimensions))
         blocks = []
         end = first + count
-        while first < end:
+        while first < end:  # a block at a time, of which the latest is cached
             block_index, first_row = divmod(first, self._rows)
             n_rows = min(self._rows - first_row, end - first)
             if block_index != self._block_index:

@@ -41,6 +41,7 @@ configurations together.
 
 def max_batch_size(dim: int) -> int:
     """Return the maximum number of queries in a batch, for configurations (dim,)."""
+    # at least 2, however large a configuration is
     return max(2, min(MAX_QUERIES, MAX_COORDINATES // dim))
 
 
@@ -281,6 +282,8 @@ class Policy(ABC, Generic[State]):
                 f"policy {cls.__name__}: `answer` is called "
                 "`distribution` now; rename it"
             )
+        # the arguments of which the methods get copies: `domain` of `start`, without the
+        # generator, which has to advance; `evaluated` of `update`
         hand_copies(cls, start=slice(1), update=slice(1, None))
 
     @property

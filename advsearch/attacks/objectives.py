@@ -94,7 +94,8 @@ class ObjectiveSignature:
 
 
 def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
-    """Return which arguments a function takes.
+    """Return which arguments an objective takes: (output, images, truth) or (output,
+    labels), and by name any of `REQUESTABLE_INPUTS`.
 
     The first two parameters request nothing, whatever their names are.
 
@@ -107,17 +108,20 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
             "objective: expected a name or a function (output, images, "
             f"truth), got {describe_value(function)}"
         )
+    # a module is called through its `forward`
+    callee = function.forward if isinstance(function, nn.Module) else function
     try:
-        signature = inspect.signature(
-            function.forward if isinstance(function, nn.Module) else function
-        )
+        signature = inspect.signature(callee)
     except ValueError:  # built in: nothing to look at
         return ObjectiveSignature()
     parameters = signature.parameters.values()
     by_position = [
-        parameter.name for parameter in parameters if parameter.kind in (0, 1)
+        parameter.name
+        for parameter in parameters
+        if parameter.kind
+        in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
     ]
-    if by_position[:1] and by_position[0] in IMAGE_PARAMETERS:  # as a metric takes them
+    if by_position and by_position[0] in IMAGE_PARAMETERS:  # as a metric takes them
         raise InputError(
             f"objective {get_name(function)!r}: its first argument is called "
             f"{by_position[0]!r}, but gets what the "
@@ -128,18 +132,15 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         for name in signature.parameters
         if name in REQUESTABLE_INPUTS and name not in by_position[:2]
     )
-    positional_names = [name for name in by_position if name not in requested_inputs]
-    takes_images = len(positional_names) < 2 or any(
+    has_star_args = any(
         parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters
     )
-    if not takes_images and positional_names[1] not in TRUTH_PARAMETERS:
-        has_third = len(positional_names) > 2
-        takes_images = has_third or positional_names[1] in (
-            *IMAGE_PARAMETERS,
-            *REQUESTABLE_INPUTS,
-        )
+    takes_images = has_star_args or _has_image_parameter(
+        [name for name in by_position if name not in requested_inputs]
+    )
     n_positional = 3 if takes_images else 2
     try:
+        # a trial call, with None for every argument
         signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
     except TypeError as error:
         raise InputError(
@@ -150,6 +151,22 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
             f"{error}"
         ) from None
     return ObjectiveSignature(takes_images, requested_inputs)
+
+
+def _has_image_parameter(names: Sequence[str]) -> bool:
+    """Return whether the positional parameters of a function are meant as (output,
+    images, truth), by their names; otherwise they are (output, truth).
+
+    A third parameter means the former, unless the second is called like the truth, as
+    in a loss whose third parameter is an option.
+    """
+    if len(names) < 2:  # neither; the caller refuses it
+        return True
+    second_name = names[1]
+    if second_name in TRUTH_PARAMETERS:
+        return False
+    has_third = len(names) > 2
+    return has_third or second_name in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS)
 
 
 def wrap_objective(function: Callable[..., Tensor]) -> Objective:
@@ -182,7 +199,11 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         try:
             result = function(*argument_copies, **input_copies)
         except TypeError as error:
-            if not (isinstance(labels, tuple) and "not tuple" in str(error)):
+            # what a loss of torch says that got a label set in place of a tensor
+            is_label_set_rejected = isinstance(labels, tuple) and "not tuple" in str(
+                error
+            )
+            if not is_label_set_rejected:
                 raise
             raise InputError(
                 f"objective {name!r}: expected one right label for a loss of torch, "
@@ -192,9 +213,11 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         if isinstance(result, Tensor) and result.ndim == 0 and count > 1:
             result = _evaluate_each_image(objective, output, images, truth, inputs)
         values = _check_values(name, result, count)
-        if values.requires_grad and any(
+        # torch counts in `_version` how often a tensor was written into
+        has_written_into_arguments = any(
             tensor._version for tensor in _list_tensors((argument_copies, input_copies))
-        ):
+        )
+        if values.requires_grad and has_written_into_arguments:
             sources = [
                 tensor
                 for tensor in _list_tensors((output, inputs))
@@ -214,7 +237,7 @@ def _evaluate_each_image(
     truth: Any,
     inputs: Mapping[str, Any],
 ) -> Tensor:
-    """Return the values (N,) of an objective that is called with an image at a time.
+    """Return the values (N,) of an objective that is called with one image at a time.
 
     Args:
         objective: returns a scalar.
@@ -234,8 +257,8 @@ def _evaluate_each_image(
 
 
 def _check_keeps_gradient(name: str, values: Tensor, sources: tuple[Any, ...]) -> None:
-    """Raise InputError if a function lost the gradient by its sources, such as
-    images.
+    """Raise InputError if a function's values do not depend differentiably on any of
+    its sources (its arguments), though a gradient is wanted.
     """
     if values.requires_grad or not torch.is_grad_enabled():
         return
@@ -261,8 +284,8 @@ def _list_tensors(value: Any) -> list[Tensor]:
 
 
 def _check_differentiable(name: str, values: Tensor, sources: Sequence[Tensor]) -> None:
-    """Raise InputError if writing in place keeps torch from differentiating values (N,)
-    by their sources.
+    """Raise InputError if a function wrote into its arguments in place, so that torch
+    cannot differentiate its values (N,) by their sources.
     """
     try:
         torch.autograd.grad(values.sum(), sources, retain_graph=True, allow_unused=True)
@@ -369,12 +392,13 @@ class ObjectiveKind:
         return self.of_features is not None
 
     def fits(self, task: str) -> bool:
-        """Whether it takes the outputs of the task of that name."""
-        return self.task in (None, task) or (
-            self.task in TASKS
-            and task in TASKS
-            and issubclass(TASKS[task], TASKS[self.task])
-        )
+        """Whether it takes the outputs of the task of that name: it is for any task,
+        for this one, or for one of which this is a kind.
+        """
+        if self.task is None or self.task == task:
+            return True
+        are_known = self.task in TASKS and task in TASKS
+        return are_known and issubclass(TASKS[task], TASKS[self.task])
 
     def form(self, *, targeted: bool) -> Callable[..., Tensor]:
         """Return the plain or the targeted function."""
@@ -388,8 +412,8 @@ class ObjectiveKind:
 
 
 def _ignore_inputs(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
-    """Return a function without further inputs as an objective, which may be passed
-    some.
+    """Return a function of (output, images, truth) as an objective, which is also
+    called with further inputs; they are ignored.
     """
 
     def plain(
@@ -572,33 +596,84 @@ def get_objective(
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
     kind = _find_kind(objective)
-    takes_logits_of_task = False
     is_built_in = kind is not None and _BUILT_IN_KINDS.get(kind.name) is kind
+    takes_logits_of_task = False
     if kind is None:
         function = wrap_objective(objective)  # type: ignore[arg-type]
     elif kind.of_task is not None:
         # It knows target and direction itself.
         return kind.of_task(task) if is_built_in else _pass_copies(kind.of_task(task))
     elif kind.of_features is not None:
-        if features is None or clean is None:
-            raise InputError(
-                f"objective {kind.name!r}: expected the model's features and a clean "
-                "picture, got none; use "
-                "get_objective(name, "
-                "features=advsearch.models.features.features_of(model), clean=picture)"
-            )
-        function = _ignore_inputs(kind.of_features(features, clean))
+        function = _make_feature_objective(kind, features, clean)
         if not is_built_in:
             function = _pass_copies(function)
     else:
         form = kind.form(targeted=targeted)
         function = _ignore_inputs(form) if is_built_in else wrap_objective(form)
-        compares_features = isinstance(task, Classification) and not task.reads_logits
-        takes_logits_of_task = compares_features or (
-            isinstance(task, ClassTask) and bool(task.nothing_classes)
+        takes_logits_of_task = _has_other_outputs(task)
+    return _orient_objective(
+        function,
+        task,
+        takes_logits_of_task=takes_logits_of_task,
+        user_function=objective if kind is None else None,
+    )
+
+
+def _make_feature_objective(
+    kind: ObjectiveKind, features: ReadFeatures | None, clean: Tensor | None
+) -> Objective:
+    """Return the objective of a kind that is made from the model's features.
+
+    Args:
+        kind: with `of_features`.
+        features: from images (N, H, W, 3) to features (N, F).
+        clean: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
+
+    Raises:
+        InputError: no features, or no clean picture.
+    """
+    assert kind.of_features is not None
+    if features is None or clean is None:
+        raise InputError(
+            f"objective {kind.name!r}: expected the model's features and a clean "
+            "picture, got none; use "
+            "get_objective(name, "
+            "features=advsearch.models.features.features_of(model), clean=picture)"
         )
-    # The direction of a user's function is checked once, at its first gradient.
-    must_check_direction = kind is None and targeted
+    return _ignore_inputs(kind.of_features(features, clean))
+
+
+def _has_other_outputs(task: Task) -> bool:
+    """Return whether the model's outputs are not logits of the labels as they are, so
+    that an objective of logits gets what `Task.as_logits` makes of them.
+
+    They are features that are compared, or have classes that stand for "nothing".
+    """
+    compares_features = isinstance(task, Classification) and not task.reads_logits
+    has_nothing_classes = isinstance(task, ClassTask) and bool(task.nothing_classes)
+    return compares_features or has_nothing_classes
+
+
+def _orient_objective(
+    function: Objective,
+    task: Task,
+    *,
+    takes_logits_of_task: bool,
+    user_function: str | Callable[..., Tensor] | None,
+) -> Objective:
+    """Return an objective that is called with the truth and is to be maximised,
+    whatever the search is after.
+
+    Args:
+        function: gets the target in place of the truth if the task has one; its values
+            are negated if the task minimises.
+        task: judges the model.
+        takes_logits_of_task: whether the function gets `Task.as_logits` of the output.
+        user_function: which the function wraps; None for a named objective. With a
+            target its direction is checked once, at its first gradient.
+    """
+    targeted = task.target is not None
+    must_check_direction = user_function is not None and targeted
 
     def oriented_objective(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
@@ -617,14 +692,16 @@ def get_objective(
             and output.requires_grad
         ):
             must_check_direction = False
-            _warn_of_direction(get_name(objective), value, output, labels)  # type: ignore[arg-type]
+            name = get_name(user_function)  # type: ignore[arg-type]
+            _warn_of_direction(name, value, output, labels)
         return -value if task.minimise else value
 
     return oriented_objective
 
 
 def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -> None:
-    """Warn of a user's function that falls as the target's logit rises.
+    """Warn of a user's function that falls for every image as the target's logit rises:
+    to maximise it leads away from the target.
 
     Args:
         name: of the function.
@@ -632,6 +709,7 @@ def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -
         output: (N, classes) logits.
         target: indices of classes; anything else is not checked.
     """
+    # the graph is differentiated again by the search
     (slope,) = torch.autograd.grad(
         values.sum(), output, retain_graph=True, allow_unused=True
     )
@@ -691,8 +769,23 @@ def check_objective(
         )
     kind = _find_kind(objective)
     if kind is None:
-        read_signature(objective)  # type: ignore[arg-type]
+        read_signature(objective)  # type: ignore[arg-type]  # checks its arguments
         return
+    _check_kind(kind, task, targeted=targeted, minimise=minimise)
+
+
+def _check_kind(
+    kind: ObjectiveKind, task: str, *, targeted: bool, minimise: bool
+) -> None:
+    """Raise InputError unless a named objective is one for the task, and for what is
+    sought.
+
+    Args:
+        kind: of the objective.
+        task: name of the task.
+        targeted: whether a target is sought.
+        minimise: whether a right prediction is sought.
+    """
     if not kind.fits(task):
         fitting = [name for name, other in OBJECTIVE_KINDS.items() if other.fits(task)]
         raise InputError(
@@ -701,17 +794,21 @@ def check_objective(
             f"outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
-        reason = "it leads away from the clean picture, to no class in particular"
+        # a distance from the clean picture has no other use than to be maximised
+        setting = "minimise"
+        reason = "it is least at the start already"
+        if targeted:
+            setting = "target"
+            reason = "it leads away from the clean picture, to no class in particular"
         raise InputError(
-            f"{'target' if targeted else 'minimise'}: expected `objective` "
-            f"{' or '.join(OBJECTIVES)}, got {kind.name}; "
-            f"{reason if targeted else 'it is least at the start already'}"
+            f"{setting}: expected `objective` {' or '.join(OBJECTIVES)}, "
+            f"got {kind.name}; {reason}"
         )
 
 
 def list_requested_inputs(objective: str | Callable[..., Tensor]) -> tuple[str, ...]:
-    """Return what an objective, checked already, asks for beside output, images and
-    truth.
+    """Return the names of what an objective, checked already, asks for besides output,
+    images and truth (of `REQUESTABLE_INPUTS`).
     """
     kind = _find_kind(objective)
     function = objective if kind is None else kind.plain
@@ -719,8 +816,8 @@ def list_requested_inputs(objective: str | Callable[..., Tensor]) -> tuple[str, 
 
 
 def _find_kind(objective: object) -> ObjectiveKind | None:
-    """Return the kind of a name, or of a function that has one; None for the user's
-    own.
+    """Return the kind of objective of a name, or of a function of ours (`OBJECTIVES`);
+    None for a user's function.
     """
     if isinstance(objective, str):
         return OBJECTIVE_KINDS[objective]

@@ -231,7 +231,7 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         seconds: that it took.
     """
     best = Candidate(log.domain.start, math.nan, False)
-    if log.pool:
+    if log.pool:  # else nothing could be evaluated
         best = select_best(log.pool)
     best_objective = math.nan
     if math.isfinite(best.mean_objective):
@@ -239,7 +239,7 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     is_claimed = best.success_rate >= 0.5 and stopped is not Ending.INTERRUPTED
     final_policy = None
     state = None
-    if log.state is not None:
+    if log.state is not None:  # else the search ended before the first proposal
         final_policy = log.policy
         state = log.state
         if final_policy is not None and log.evaluated_batch:
@@ -316,6 +316,8 @@ class _Log:
     ) -> Iterator[Evaluation]:
         """Yield the evaluations of proposals, each recorded before it is yielded.
 
+        Evaluations come one by one, and the time of each is that since the one before.
+
         Args:
             proposals: to evaluate.
             indices: number of the seed of each in the stream of the search.
@@ -364,8 +366,8 @@ class _Log:
         if not evaluation.is_finite:
             self.non_finite += 1
         elif phase == "search":
-            is_first = math.isnan(self.best)
-            if is_first or evaluation.objective >= self.best:
+            has_no_best = math.isnan(self.best)
+            if has_no_best or evaluation.objective >= self.best:
                 self.best = evaluation.objective
             candidate = Candidate(proposal.u, evaluation.objective, evaluation.success)
             self.pool = add_candidate(self.pool, candidate, self.size)
@@ -405,7 +407,9 @@ class _Log:
         )
 
     def _measure_agreement(self, gradient: Tensor | None) -> None:
-        """Compare a gradient (d,) that is not zero with the one before."""
+        """Add the cosine similarity of a gradient (d,) and the one before to
+        `agreement`; a gradient of zero, which has no direction, is left out.
+        """
         if gradient is None or not bool(gradient.any()):
             return
         if self.previous_gradient is not None:
@@ -438,29 +442,23 @@ def _explore(
         is_out_of_time: returns whether the time is over.
     """
     generator = torch.Generator().manual_seed(stream(seed, "search"))
-    name = policy.name
+    name = policy.name  # for messages: that of the policy that a user chose
     policy = wrap_choices(policy, log.domain)
     log.policy = policy
     state = policy.start(log.domain, generator, steps)
-    n_non_finite = 0
+    n_non_finite = 0  # in a row
     max_batch = max_batch_size(log.domain.dim)
     while log.renders < steps:
         max_proposals = min(max_batch, steps - log.renders)
         proposals, state = policy.propose(state, max_proposals)
         if not proposals:
             return Ending.STALLED
-        if len(proposals) > max_proposals:
-            raise RuntimeError(
-                f"policy {name!r} proposed {len(proposals)} "
-                f"configurations; expected at most {max_proposals}"
-            )
-        for proposal in proposals:
-            _check_inside(proposal, log.domain, name)
+        _check_proposals(proposals, max_proposals, log.domain, name)
         batch = _limit_batch(proposals, log.domain, steps - log.renders)
         log.state = state
         log.evaluated_batch = []
-        first = len(log.records)
-        indices = range(first, first + len(batch))
+        first_index = len(log.records)
+        indices = range(first_index, first_index + len(batch))
         evaluations = log.evaluate_and_record(batch, indices, "search")
         for proposal, evaluation in zip(batch, evaluations, strict=True):
             log.evaluated_batch.append((proposal.u, evaluation))
@@ -496,7 +494,7 @@ def _limit_batch(
     return batch
 
 
-def _rank(log: _Log, first: int, repeats: int, max_extra_repeats: int) -> None:
+def _rank(log: _Log, first_seed: int, repeats: int, max_extra_repeats: int) -> None:
     """Render every candidate again, all with the same new seeds.
 
     Then those that are not clearly worse than the best are rendered once more each,
@@ -505,32 +503,55 @@ def _rank(log: _Log, first: int, repeats: int, max_extra_repeats: int) -> None:
 
     Args:
         log: of the search, whose pool changes.
-        first: number of the first new seed.
+        first_seed: number of the first new seed.
         repeats: renders of every candidate.
         max_extra_repeats: renders of those that remain.
     """
-    end = first + repeats
-    _repeat_candidates(log, range(first, end))
-    for index in range(end, end + max_extra_repeats):
-        log.pool = select_contenders(log.pool, index - first)
+    first_extra_seed = first_seed + repeats
+    _repeat_candidates(log, range(first_seed, first_extra_seed))
+    for seed_index in range(first_extra_seed, first_extra_seed + max_extra_repeats):
+        n_renders = seed_index - first_seed  # of each remaining candidate so far
+        log.pool = select_contenders(log.pool, n_renders)
         if len(log.pool) < 2:
             break
-        _repeat_candidates(log, range(index, index + 1))
+        _repeat_candidates(log, range(seed_index, seed_index + 1))
 
 
 def _repeat_candidates(log: _Log, indices: range) -> None:
-    """Render all candidates with the seeds of these indices.
+    """Render all candidates of the pool with the seeds of these indices.
 
     The pool is updated after every render, so that an interrupted search has all.
     """
     pool = log.pool
     proposals = [Proposal(candidate.u) for candidate in pool for _ in indices]
+    # an iterator over the renders of the first candidate, then those of the second, ...
     evaluations = log.evaluate_and_record(proposals, [*indices] * len(pool), "ranking")
     for position, candidate in enumerate(pool):
         repeated = candidate
         for evaluation in islice(evaluations, len(indices)):
             repeated = repeated.with_repeat(evaluation.objective, evaluation.success)
             log.pool = (*log.pool[:position], repeated, *pool[position + 1 :])
+
+
+def _check_proposals(
+    proposals: Sequence[Proposal], max_count: int, domain: Domain, name: str
+) -> None:
+    """Raise RuntimeError if a policy proposed too many configurations, or something
+    else than configurations of the domain, which is a bug.
+
+    Args:
+        proposals: of the policy.
+        max_count: how many it may propose.
+        domain: of the search.
+        name: of the policy.
+    """
+    if len(proposals) > max_count:
+        raise RuntimeError(
+            f"policy {name!r} proposed {len(proposals)} "
+            f"configurations; expected at most {max_count}"
+        )
+    for proposal in proposals:
+        _check_inside(proposal, domain, name)
 
 
 def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
@@ -548,10 +569,10 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
             "torch.float32 of shape "
             f"{tuple(domain.start.shape)}"
         )
-    outside = domain.violation(u)
-    if not outside <= TOLERANCE:
+    excess = domain.violation(u)
+    if not excess <= TOLERANCE:  # so that NaN is rejected as well
         raise RuntimeError(
-            f"policy {name!r} left its budget by {outside:.3g}; it must "
+            f"policy {name!r} left its budget by {excess:.3g}; it must "
             "project what it proposes"
         )
 
@@ -568,11 +589,11 @@ def _check_evaluation(
     max_cost = proposal.max_cost(domain)
     if proposal.gradient and gradient is None:
         raise RuntimeError("evaluate returned no gradient although one was asked for")
-    if (
-        proposal.gradient
-        and gradient is not None
-        and (gradient.shape, gradient.dtype) != (u.shape, u.dtype)
-    ):
+    is_like_u = gradient is not None and (gradient.shape, gradient.dtype) == (
+        u.shape,
+        u.dtype,
+    )
+    if proposal.gradient and gradient is not None and not is_like_u:
         raise RuntimeError(
             f"evaluate returned a gradient of {gradient.dtype}, shape "
             f"{tuple(gradient.shape)}; expected "

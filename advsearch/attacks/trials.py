@@ -49,8 +49,8 @@ class Trials:
 
 
 def derive_trial_seed(seed: int, number: int) -> int:
-    """Return the seed of a trial, by its number: the same for all groups with that
-    root.
+    """Return the seed of a trial by its number. Groups of trials with the same root
+    seed have the same seeds.
     """
     return stream(seed, "verification", number)
 
@@ -211,11 +211,11 @@ def choose_spp(
         return SampleCount(ladder[0], False, (), 0)
     table = list[Rung]()
     n_renders = 0
-    highest_rung = 1
+    highest_rung = 1  # index; nothing settles at the first rung, which has none below
     look_sizes = list_look_sizes(trials)
     for name, render in margins.items():
         margins_of_rungs = _climb_ladder(render, seed, ladder, look_sizes, trials)
-        below: list[float] = []
+        below: list[float] = []  # margins of the rung before
         # only the rungs that were rendered, from the first on
         for spp, at_rung in zip(ladder, margins_of_rungs, strict=False):
             table.append(
@@ -280,22 +280,21 @@ def _climb_ladder(
     """
     margins_of_rungs: list[list[float]] = [[] for _ in ladder]
     n_looks = len(look_sizes)
+    # (index of the rung, renders there), in the order in which one looks
     all_looks = list(product(range(1, len(ladder)), look_sizes))
     for look_index, (level, count) in enumerate(all_looks):
+        # whether this look or a later one may show that the margin has settled
         if not any(
-            _may_settle(margins_of_rungs, ladder, *later_look, n_looks)
-            for later_look in all_looks[look_index:]
+            _may_settle(margins_of_rungs, ladder, *level_and_count, n_looks)
+            for level_and_count in all_looks[look_index:]
         ):
             break
         if not _may_settle(margins_of_rungs, ladder, level, count, n_looks):
             continue
         for rung in (level - 1, level):
-            n_rendered = len(margins_of_rungs[rung])
-            if n_rendered < count:
-                new_seeds = [
-                    stream(seed, "sample count", number)
-                    for number in range(n_rendered, count)
-                ]
+            seeds = [stream(seed, "sample count", number) for number in range(count)]
+            new_seeds = seeds[len(margins_of_rungs[rung]) :]
+            if new_seeds:
                 margins_of_rungs[rung] += margins(ladder[rung], new_seeds)
         if _is_settled(
             margins_of_rungs[level], margins_of_rungs[level - 1], n_looks, trials
@@ -309,7 +308,8 @@ def _is_settled(
 ) -> bool:
     """Return whether more samples would not change the sign of the margin.
 
-    See `choose_spp` for the three conditions.
+    The mean, the mean extrapolated to more samples, and every single render have to be
+    on the same side of zero (`choose_spp`).
 
     Args:
         at_rung: margins of a rung.
@@ -320,8 +320,8 @@ def _is_settled(
     mean = fmean(at_rung)
     count = min(len(at_rung), len(below))
     deviation = _compute_deviation(at_rung)
-    # m + (m - m'): the mean if the rest of the noise changed it as much as the step
-    # from below did
+    # m + (m - m'), with the mean m at the rung and m' below: the mean if the rest of the
+    # noise changed it as much as the step from below did
     extrapolated = 2.0 * mean - fmean(below)
     extrapolated_error = math.hypot(
         2.0 * deviation, _compute_deviation(below)
@@ -360,30 +360,37 @@ def _may_settle(
     """
     rendered_rungs = [rung for rung in range(level + 1) if values[rung]]
     if not rendered_rungs:
-        return True
+        return True  # nothing is known yet
     if values[level] and min(values[level]) <= 0.0 <= max(values[level]):
         return False
     last_rung = rendered_rungs[-1]
     last_values = values[last_rung]
     mean = fmean(last_values)
+    # the first look renders two rungs, so that there is one before the last
     drift = abs(mean - fmean(values[rendered_rungs[-2]]))
     standard_error = _compute_deviation(last_values) / math.sqrt(len(last_values))
     max_mean = abs(mean) + drift + standard_error
 
     def estimate_deviation(rung: int) -> float:
+        """Return the standard deviation of the margins of a rung, rendered or not."""
         if values[rung]:
             return _compute_deviation(values[rung])
         return _compute_deviation(last_values) * math.sqrt(
             ladder[last_rung] / ladder[rung]
         )
 
-    # that of 2 m - m', as in `_is_settled`
-    error = math.hypot(2.0 * estimate_deviation(level), estimate_deviation(level - 1))
-    return error * _compute_quantile(count, looks) / math.sqrt(count) <= max_mean
+    # The mean m of the rung and m' of the one below have to show that 2 m - m' is not
+    # zero (`_is_settled`): this is the deviation of a difference of single renders.
+    deviation = math.hypot(
+        2.0 * estimate_deviation(level), estimate_deviation(level - 1)
+    )
+    min_mean = deviation * _compute_quantile(count, looks) / math.sqrt(count)
+    return min_mean <= max_mean
 
 
 def list_look_sizes(trials: int = 0) -> tuple[int, ...]:
-    """Return after how many renders of a rung one looks, see `choose_spp`.
+    """Return after how many renders at a sample count one looks whether the margin has
+    settled (`choose_spp`).
 
     The number of trials is one more look if it is above the others, but not too large.
     """
@@ -500,7 +507,7 @@ def _summarize_conditions(
         at_rung: (n,) margins of the rung, by condition.
         below: (n,) margins of the rung below; None at the first.
     """
-    quantile = stdtrit(len(at_rung) - 1, CONFIDENCE)
+    quantile = stdtrit(len(at_rung) - 1, CONFIDENCE)  # Student's t, one-sided
     half_width = quantile * at_rung.std(ddof=1) / math.sqrt(len(at_rung))
     drift = math.nan
     is_settled = False
@@ -512,19 +519,26 @@ def _summarize_conditions(
 
 
 def estimate_moved_fraction(at_rung: FloatArray, below: FloatArray) -> float:
-    """Return the fraction of conditions that more samples may carry over zero.
+    """Return the fraction of conditions whose margin more samples may carry over zero.
 
-    The mean change of the margins (n,) from the rung below is taken once more, at the
-    end of its 95 % interval that carries more over zero. The distribution of margins is
-    smoothed by normal kernels of Silverman's width. NaN if a margin is no number.
+    It is supposed that all margins change once more by the mean change from the rung
+    below, at either end of its 95 % interval; the end counts that carries more over
+    zero. The distribution of margins is smoothed by normal kernels. NaN if a margin is
+    no number.
+
+    Args:
+        at_rung: (n,) margins at one sample count, by condition.
+        below: (n,) margins at the sample count before.
     """
     change = at_rung - below
+    # of the kernels, by Silverman's rule of thumb
     width = 0.9 * at_rung.std(ddof=1) * len(at_rung) ** -0.2
     if not np.isfinite(change).all():
         return math.nan
     quantile = stdtrit(len(at_rung) - 1, 0.5 + CONFIDENCE / 2.0)
     half_width = quantile * change.std(ddof=1) / math.sqrt(len(at_rung))
     mean_change = change.mean()
+    # none, for comparison; and both ends of the interval of the mean change
     shifts = np.array([0.0, mean_change - half_width, mean_change + half_width])
     # smoothed fraction of conditions with a margin over zero, by shift (3,); the width
     # is 0 if all margins are equal

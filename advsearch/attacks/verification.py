@@ -145,7 +145,7 @@ class Rule:
 
     def count_percent(self, trials: int) -> int:
         """Return the percentage of a number of trials, rounded up."""
-        return -(-self.percent * trials // 100)
+        return -(-self.percent * trials // 100)  # `//` rounds down
 
     def is_success(self, trial: Judgement, clean: Judgement) -> bool:
         """Return whether a trial is a success, given the clean trial of the same seed.
@@ -175,10 +175,12 @@ class Rule:
     def decide(self, successes: int, trials: int) -> bool | None:
         """Return whether a configuration is a success by its trials.
 
-        None if that depends on the noise: there are both more successes and more
-            failures than the rule allows failures.
+        None if that depends on the noise: it succeeds too often to be called a failure
+        and fails too often to be called a success. Neither may happen more often than
+        the rule allows failures.
         """
-        if min(successes, trials - successes) > self.count_allowed_failures(trials):
+        n_exceptions = min(successes, trials - successes)
+        if n_exceptions > self.count_allowed_failures(trials):
             return None
         return successes >= self.count_needed(trials)
 
@@ -404,8 +406,10 @@ def verify(
         is_success = _is_found(
             rule, done, clean_trials, count, spp=spp, is_early=is_early
         )
+        # there are fewer than `count` if too many of them failed before
         if len(done) < count or has_failed(()) or is_success or not is_early:
             break
+    # as many as were asked for, and no look before
     is_complete = not has_several_looks and len(done) == looks[0]
     return _summarize_trials(
         rule,
@@ -431,7 +435,8 @@ def _extend_clean_trials(
     look: int,
     max_trials: int,
 ) -> int:
-    """Run clean trials until `look` of them count; return how many there are then.
+    """Run clean trials until `look` of them count, or there are `max_trials`; return
+    how many there are then.
 
     Over conditions, clean trials that are wrong do not count, so that more are run.
 
@@ -508,7 +513,8 @@ def _summarize_trials(
     is_early: bool,
     begin: int,
 ) -> Verification:
-    """Return the verification that the trials of both groups make.
+    """Return the verification of a configuration by the trials of both groups: counts,
+    ending and the reason in a sentence.
 
     Args:
         rule: says what a success is, and how many are needed.
@@ -523,7 +529,7 @@ def _summarize_trials(
         begin: index of the first trial.
     """
     outcomes = _list_outcomes(rule, trials, clean_trials)
-    n_counted = max(1, len(outcomes) - outcomes.count(None))
+    n_counted = max(1, len(outcomes) - outcomes.count(None))  # a rate needs one
     clean_counts = count_right(clean_trials, spp)
     counts = Trials(outcomes.count(True), n_counted, spp, confidence)
     ending = rule.decide_ending(claim, clean_counts, counts)

@@ -142,8 +142,8 @@ def draw_searches(
     axes: Any,
     zero_means: str = "",
 ) -> None:
-    """Draw the best objective so far of searches against their evaluations: a line for
-    the best so far, and a faint dot for each single evaluation.
+    """Draw the objectives of searches against their evaluations: a line for the best so
+    far, and a faint dot for each single evaluation.
 
     Args:
         objectives: of each evaluation of each search, by the search's name; None where
@@ -153,52 +153,67 @@ def draw_searches(
         zero_means: the text at the zero line, which is left out if this is empty.
     """
     styles = cycle(((BLUE, "-"), (RED, (0.0, (4.0, 1.5))), (GREY, "-")))
+    # the styles repeat if there are more searches
     for (name, values), (colour, dashes) in zip(
         objectives.items(), styles, strict=False
     ):
-        objective = np.array(values, dtype=float)  # None is NaN
-        # fmax skips NaN
-        best = np.fmax.accumulate(objective) if len(objective) else objective
-        # of a long search only some points are drawn
-        indices = _select_points(len(objective))
-        # a dot is a line without a length: all of them are one path, and a page stays
-        # small
-        dots_x = _as_dots(indices + 1.0)
-        dots_y = _as_dots(objective[indices])
-        axes.plot(
-            dots_x,
-            dots_y,
-            solid_capstyle="round",
-            linewidth=4,
-            alpha=0.35,
-            color=colour,
-        )
-        axes.plot(
-            indices + 1,
-            best[indices],
-            linestyle=dashes,
-            linewidth=2,
-            color=colour,
-            label=name,
-        )
+        _draw_search(axes, name, values, colour, dashes)
     if zero_means:
         axes.axhline(0.0, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
+        # at the right end of the zero line, 4 points above it
         axes.annotate(
             zero_means,
-            (1.0, 0.0),
-            (-4, 4),
-            axes.get_yaxis_transform(),
-            "offset points",
+            xy=(1.0, 0.0),
+            xytext=(-4, 4),
+            xycoords=axes.get_yaxis_transform(),
+            textcoords="offset points",
             ha="right",
         )
     axes.set(
         xlabel="evaluations",
         ylabel=meaning,
+        # an axis of a single evaluation would have no width
         xlim=(1, max(2, *map(len, objectives.values()))),
     )
     axes.locator_params("x", integer=True)
     axes.grid(True, axis="y")
     axes.legend()
+
+
+def _draw_search(
+    axes: Any, name: str, values: Sequence[float | None], colour: str, dashes: Any
+) -> None:
+    """Draw the evaluations of one search, and a line for the best so far.
+
+    Args:
+        axes: of matplotlib, on which it is drawn.
+        name: of the search, for the legend.
+        values: objective of each evaluation; None where it was not a number.
+        colour: of dots and line.
+        dashes: matplotlib's style of the line.
+    """
+    objective = np.array(values, dtype=float)  # None is NaN
+    # fmax skips NaN
+    best = np.fmax.accumulate(objective) if len(objective) else objective
+    # of a long search only some points are drawn
+    indices = _select_points(len(objective))
+    # a dot is a line without a length: all of them are one path, and a page stays small
+    axes.plot(
+        _as_dots(indices + 1.0),
+        _as_dots(objective[indices]),
+        solid_capstyle="round",
+        linewidth=4,
+        alpha=0.35,
+        color=colour,
+    )
+    axes.plot(
+        indices + 1,
+        best[indices],
+        linestyle=dashes,
+        linewidth=2,
+        color=colour,
+        label=name,
+    )
 
 
 def _select_points(count: int) -> npt.NDArray[np.int_]:
@@ -299,7 +314,7 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
     factor = max(1, -(-MIN_IMAGE_SIDE // max(levels.shape[:2])))
     size = levels.shape[1] * factor, levels.shape[0] * factor
     image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
-    # false comes before true, so that true masks are drawn last and stay visible
+    # False comes before True, so that true masks are drawn last and stay visible
     for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
             _draw_mask(image, shape)
@@ -414,6 +429,7 @@ def _to_pixel_corners(
     # x1 and y1 are the ends, one past the last pixel
     right = min(x1, width) - 1
     bottom = min(y1, height) - 1
+    # at least one pixel, also of a box outside of the image
     return left, top, max(left, right), max(top, bottom)
 
 
@@ -450,6 +466,7 @@ def _write_label(
     preferred_y = max(0, min(preferred_y, size[1] - height))
 
     def is_free(y: int) -> bool:
+        """Return whether the text would cover no other one at this height."""
         return all(
             x > x1 or x0 > x + width or y > y1 or y0 > y + height
             for x0, y0, x1, y1 in text_boxes

@@ -53,6 +53,7 @@ CHECKLIST = (
 )
 """What is to be done, to tick off."""
 MAX_PROFILE_BYTES = 16 << 20
+MAX_LISTED_PIECES = 30  # Pieces that the first page lists
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,18 +147,7 @@ def write_sheets(
         raise InputError(
             f"sheets: expected a whole number from 1 to {MAX_SHEETS}, got {max_sheets}"
         )
-    convert: Any = None
-    if profile is not None:
-        data = read_bytes(profile, "an ICC profile", MAX_PROFILE_BYTES)
-        try:
-            printer = ImageCms.ImageCmsProfile(io.BytesIO(data))
-            convert = ImageCms.buildTransform(
-                ImageCms.createProfile("sRGB"), printer, "RGB", "RGB"
-            )
-        except (ImageCms.PyCMSError, OSError, ValueError) as error:
-            raise FileFormatError(
-                f"{profile}: expected the ICC profile of an RGB printer ({error})"
-            ) from None
+    convert = None if profile is None else _load_color_conversion(profile)
     pages = list(arrange_pages(pieces, PAPERS[paper]))
     if len(pages) > max_sheets:
         raise InputError(
@@ -169,23 +159,50 @@ def write_sheets(
     with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
         file.savefig(_make_cover(pieces, title, PAPERS[paper], len(pages), profile))
         for number, page in enumerate(pages, 1):
-            figure, axes = make_blank_page(PAPERS[paper])
-            for part in page:
-                _draw_part(axes, part, convert)
-            right, bottom = (side - MARGIN for side in PAPERS[paper])
-            axes.text(
-                right,
-                bottom,
-                f"{title}: sheet {number} of {len(pages)}",
-                fontsize=7,
-                ha="right",
-                va="bottom",
-            )
-            _draw_ruler(axes, PAPERS[paper])
-            file.savefig(figure)
+            heading = f"{title}: sheet {number} of {len(pages)}"
+            file.savefig(_make_sheet(page, heading, PAPERS[paper], convert))
         if make_last_page is not None:
             file.savefig(make_last_page(title, PAPERS[paper], convert))
-    return len(pages) + 1 + (make_last_page is not None)
+    has_last_page = make_last_page is not None
+    return 1 + len(pages) + has_last_page
+
+
+def _load_color_conversion(profile: Path) -> Any:
+    """Return the conversion of Pillow from sRGB to the colours of a printer.
+
+    Raises:
+        FileFormatError: the file is not the ICC profile of an RGB printer.
+    """
+    data = read_bytes(profile, "an ICC profile", MAX_PROFILE_BYTES)
+    try:
+        printer = ImageCms.ImageCmsProfile(io.BytesIO(data))
+        return ImageCms.buildTransform(
+            ImageCms.createProfile("sRGB"), printer, "RGB", "RGB"
+        )
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        raise FileFormatError(
+            f"{profile}: expected the ICC profile of an RGB printer ({error})"
+        ) from None
+
+
+def _make_sheet(
+    parts: Sequence[PlacedPart], heading: str, paper: tuple[float, float], convert: Any
+) -> Figure:
+    """Return a page with parts of pieces, a ruler, and a text at its lower right corner.
+
+    Args:
+        parts: with their places on the page.
+        heading: the text.
+        paper: (width, height) in millimetres.
+        convert: converts colours from sRGB to those of the printer; None leaves them.
+    """
+    figure, axes = make_blank_page(paper)
+    for part in parts:
+        _draw_part(axes, part, convert)
+    right, bottom = (side - MARGIN for side in paper)
+    axes.text(right, bottom, heading, fontsize=7, ha="right", va="bottom")
+    _draw_ruler(axes, paper)
+    return figure
 
 
 def arrange_pages(
@@ -209,6 +226,7 @@ def arrange_pages(
     parts = [part for piece in pieces for part in _cut_piece(piece, width, height)]
     parts.sort(key=lambda part: -part.extent[1])
     page: list[PlacedPart] = []
+    # where the next part begins, inside the margins, and the height of its row so far
     x = 0.0
     y = 0.0
     row_height = 0.0
@@ -322,10 +340,12 @@ def _make_cover(
         "",
         *[
             f"{piece.name}: {piece.size[0]:.1f} x {piece.size[1]:.1f} mm"
-            for piece in pieces[:30]
+            for piece in pieces[:MAX_LISTED_PIECES]
         ],
-        *([f"and {len(pieces) - 30} more"] if len(pieces) > 30 else []),
     ]
+    n_unlisted = len(pieces) - MAX_LISTED_PIECES
+    if n_unlisted > 0:
+        lines.append(f"and {n_unlisted} more")
     top = y + 15.0
     right = x + SQUARE
     bottom = y + 15.0 + SQUARE

@@ -20,6 +20,7 @@ counted.
 from __future__ import annotations
 
 import base64
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -240,8 +241,7 @@ def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
     seconds = getattr(result, "seconds", None)
     n_renders = sum(renders.values()) if isinstance(renders, Mapping) else renders
     environment = getattr(result, "environment", "")
-    # they are told already, all of them
-    if "environments" in view.facts:
+    if "environments" in view.facts:  # which has this one among them
         environment = ""
     common_facts = {
         "environment": environment,
@@ -265,7 +265,7 @@ def make_default_view(result: Result) -> ShownResult:
     values = {name: getattr(result, name) for name in type(result).described()}
     tables = {name: value for name, value in values.items() if _is_table(value)}
     facts = _find_plain_facts(result, values, tables)
-    # objects with fields, and those of their names that the reader sees
+    # objects with fields, each with the names of those that are on the page
     described: list[tuple[Fields, set[str]]] = [
         (result, {name for name, text in facts.items() if text})
     ]
@@ -276,7 +276,8 @@ def make_default_view(result: Result) -> ShownResult:
         described.append((rows[0], set(table.heads)))
     sections.append(_explain_words(described))
     brief = result.brief or str(values.get("ending", "done"))
-    return ShownResult(brief[:1].upper() + brief[1:] + ".", sections, facts)
+    statement = f"{brief[:1].upper()}{brief[1:]}."
+    return ShownResult(statement, sections, facts)
 
 
 def _is_table(value: object) -> bool:
@@ -353,7 +354,7 @@ def _format_value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return "" if value != value else wording.format_number(value)
+        return "" if math.isnan(value) else wording.format_number(value)
     if isinstance(value, Formation):
         return wording.format_formation(value)
     if isinstance(value, Fields):
@@ -435,6 +436,8 @@ def make_case_claim(
             only tried again.
     """
     extent = make_rate_extent("fresh renders that count as a success", rate)
+    is_only_tried_again = spent is None
+    has_failed = ending in FAILED_SEARCH_ENDINGS
     if ending == "found" and rate is not None and rate.successes:
         return claim(
             "found",
@@ -443,8 +446,8 @@ def make_case_claim(
         )
     if (
         rate is not None
-        and spent is None
-        and ending in (*FAILED_SEARCH_ENDINGS, "not verified")
+        and is_only_tried_again
+        and (has_failed or ending == "not verified")
     ):
         return claim(
             "measured",
@@ -452,7 +455,7 @@ def make_case_claim(
             f"{wording.format_rate(rate)}.",
             extent,
         )
-    if rate is not None and ending in FAILED_SEARCH_ENDINGS:
+    if rate is not None and has_failed:
         text = (
             f"{name}: no failure was found; the best configuration counts in "
             f"{wording.format_rate(rate)}."
@@ -576,10 +579,13 @@ class InNotebook:
         Args:
             axes: to draw on; None makes new ones.
         """
-        axes = new_axes() if axes is None else axes
-        draw = next((part.draw for part in get_view(self).sections if part.draw), None)  # type: ignore[arg-type]
-        if draw is not None:
-            draw(axes)
+        if axes is None:
+            axes = new_axes()
+        view = get_view(self)  # type: ignore[arg-type]
+        for part in view.sections:
+            if part.draw is not None:
+                part.draw(axes)
+                break  # the first is the figure of the result
         return axes
 
     def to_pandas(self) -> Any:
@@ -743,21 +749,24 @@ def make_chart_svg(
         axes = figure.subplots()
         draw(axes)
         axes.set_title("")
-        for legend in (*figure.legends, *filter(None, [axes.get_legend()])):
+        # the figure gets a legend above the axes in place of all others
+        axes_legend = axes.get_legend()
+        if axes_legend is not None:
+            axes_legend.remove()
+        for legend in [*figure.legends]:
             legend.remove()
         columns = 1 if width == NARROW_WIDTH else 2
         figure.legend(
             loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"]
         )
 
-    # inches: 72 pixels each
-    (file,) = render_figure(
-        on_figure, (width / 72, height / 72), ("svg",), STYLE
-    ).values()
+    size_in_inches = (width / 72, height / 72)  # 72 pixels each
+    files = render_figure(on_figure, size_in_inches, kinds=("svg",), style=STYLE)
     return make_element(
         "svg",
         make_element("title", description),
-        _make_inline_svg(file.decode("utf-8"), f"{width}-"),
+        # the width tells the ids of two charts on a page apart
+        _make_inline_svg(files["svg"].decode("utf-8"), prefix=f"{width}-"),
         viewBox=f"0 0 {width} {height}",
         class_="chart wide" if width == WIDE_WIDTH else "chart narrow",
         role="img",

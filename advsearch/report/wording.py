@@ -128,16 +128,15 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
     distance = min(value, 100.0 - value)
     if distance >= 5.0 or distance <= 0.0:
         return f"{value:.0f}"
+    # up to the first digit of the distance that is not 0
     decimals = min(max(1, -math.floor(math.log10(distance))), max_decimals)
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     if text not in ("0", "100"):
         return text
     smallest = 10.0**-decimals
-    return (
-        f"under {smallest:.{decimals}f}"
-        if text == "0"
-        else f"over {100.0 - smallest:.{decimals}f}"
-    )
+    if text == "0":
+        return f"under {smallest:.{decimals}f}"
+    return f"over {100.0 - smallest:.{decimals}f}"
 
 
 def format_fraction_of(
@@ -152,11 +151,8 @@ def format_fraction_of(
     if not total:
         return "none of 0"
     low, high = map(format_percent_number, interval)
-    return (
-        f"{percent(count / total if share is None else share)} ({low} to {high}) "
-        "of "
-        f"{total:,}"
-    )
+    fraction = count / total if share is None else share
+    return f"{percent(fraction)} ({low} to {high}) of {total:,}"
 
 
 def explain_repeats(name: str, repeats: int, units: int) -> str:
@@ -379,11 +375,9 @@ def format_image_prediction(task: str, prediction: AnyPrediction) -> str:
     0.77)``, ``mug 91 %``.
     """
     label, number = format_image_prediction_cells(task, prediction)
-    return (
-        f"{label} ({number})"
-        if task == DETECTION and number
-        else f"{label} {number}".rstrip()
-    )
+    if task == DETECTION and number:
+        return f"{label} ({number})"
+    return f"{label} {number}".rstrip()
 
 
 def format_mistake(
@@ -402,8 +396,10 @@ def format_mistake(
         return f"predicts nothing for {thing}, for its output is not a number"
     if outcome is Outcome.MISSED:
         return f"finds {label}"
+    if outcome is Outcome.LOOSE and task == SEGMENTATION:
+        return f"sees {thing}, but only in part"
     if outcome is Outcome.LOOSE:
-        return f"sees {thing}, but {'only in part' if task == SEGMENTATION else 'in a loose box'}"
+        return f"sees {thing}, but in a loose box"
     if outcome is Outcome.PHANTOM:
         return f"sees {add_article(label)}, and none where {thing} is"
     if task == CLASSIFICATION:
@@ -433,12 +429,15 @@ def format_outcomes(outcomes: Mapping[str, int] | None, task: str = "") -> str:
     """Return how often each outcome but the right one came about: ``12 missed, 6 in a
     loose box``; empty where nothing is known of outcomes.
     """
-    names = _OUTCOMES | ({Outcome.LOOSE: _LOOSELY[task]} if task in _LOOSELY else {})
-    counts = (
-        (name, (outcomes or {}).get(outcome.value, 0))
-        for outcome, name in names.items()
-    )
-    return ", ".join(f"{number} {name}" for name, number in counts if number)
+    names = dict(_OUTCOMES)
+    if task in _LOOSELY:
+        names[Outcome.LOOSE] = _LOOSELY[task]
+    texts = []
+    for outcome, name in names.items():
+        count = (outcomes or {}).get(outcome.value, 0)
+        if count:
+            texts.append(f"{count} {name}")
+    return ", ".join(texts)
 
 
 def get_only_outcome(outcomes: Mapping[str, int] | None) -> Outcome | None:
@@ -450,11 +449,10 @@ def get_only_outcome(outcomes: Mapping[str, int] | None) -> Outcome | None:
     Returns:
         The outcome; None where there were several, or nothing is known of them.
     """
-    return (
-        get_outcome({"outcome": next(iter(outcomes))})
-        if outcomes and len(outcomes) == 1
-        else None
-    )
+    if outcomes is None or len(outcomes) != 1:
+        return None
+    (outcome,) = outcomes
+    return get_outcome({"outcome": outcome})
 
 
 NO_INTERVAL = "no interval"
@@ -519,9 +517,10 @@ def format_rate_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
     """Return a rate and its interval, for a table: ``["20/20", "83-100 %"]``; of
     outputs that are not numbers, how many.
     """
-    number = rated.successes if hasattr(rated, "successes") else rated.correct
+    # of adversarial trials the successes count, of clean ones the right predictions
+    count = rated.successes if hasattr(rated, "successes") else rated.correct
     nan_text = f", {rated.not_a_number} not a number" if rated.not_a_number else ""
-    return [f"{number}/{rated.trials}{nan_text}", format_interval(rated.interval)]
+    return [f"{count}/{rated.trials}{nan_text}", format_interval(rated.interval)]
 
 
 def format_tally(event: str, number: int, trials: int, not_a_number: int = 0) -> str:
@@ -537,11 +536,12 @@ def format_seconds(seconds: Any) -> str:
     if seconds is None:
         return "unknown"
     total = round(float(seconds))
+    minutes, rest = divmod(total, 60)
     if total < 100:
         return f"{float(seconds):.1f} s"
-    if total < 6000:
-        return f"{total // 60} min {total % 60} s"
-    return f"{total // 3600} h {total % 3600 // 60} min"
+    if minutes < 100:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
 
 
 def format_count(number: Any, thing: str) -> str:
@@ -613,13 +613,14 @@ def format_conditions(conditions: Sequence[ConditionRow]) -> str:
 
 def format_extent(extent: Extent) -> str:
     """Return ``12 of 20 (60 %, 95 % interval 36-81 %)``."""
-    share = "none"
-    if extent.total:
-        share = percent(
-            extent.count / extent.total if extent.share is None else extent.share
-        )
+    if not extent.total:
+        percentage = "none"
+    elif extent.share is None:
+        percentage = percent(extent.count / extent.total)
+    else:  # a weighted share, for example
+        percentage = percent(extent.share)
     return (
-        f"{extent.count} of {extent.total} ({share}, 95 % interval "
+        f"{extent.count} of {extent.total} ({percentage}, 95 % interval "
         f"{format_interval(extent.interval)})"
     )
 
@@ -636,8 +637,10 @@ def format_estimate(estimate: Estimate | None, otherwise: str = "") -> str:
 
 
 def _two_decimals(value: float) -> str:
+    """Return ``.96`` for 0.96 and ``1.00`` for 1, without a 0 before the point."""
     text = f"{value:.2f}"
-    return text.replace("0.", ".", 1) if abs(value) < 0.995 else text
+    rounds_to_1 = abs(value) >= 0.995
+    return text if rounds_to_1 else text.replace("0.", ".", 1)
 
 
 NO_TWINS = (

@@ -89,20 +89,21 @@ def correlation_interval(
     n_units = len(names)
     if n_units < MIN_UNITS:
         return None
-    left_out = np.array(
+    # the coefficient without the rows of one unit, for each unit
+    values_without_unit = np.array(
         [
             statistic(first[unit_index != unit], second[unit_index != unit])
             for unit in range(n_units)
         ]
     )
     value = statistic(first, second)
-    if not math.isfinite(value) or not np.isfinite(left_out).all():
+    if not math.isfinite(value) or not np.isfinite(values_without_unit).all():
         return None
-    z = _to_fisher_z(left_out)
-    # the jackknife's, by the values without one unit each
+    # The jackknife on the scale of Fisher's z, from which the bounds are turned back.
+    z = _to_fisher_z(values_without_unit)
     variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
-    tail = (1.0 + CONFIDENCE) / 2.0
-    half_width = float(stdtrit(n_units - 1, tail)) * math.sqrt(variance)
+    probability = (1.0 + CONFIDENCE) / 2.0  # below the upper end of the interval
+    half_width = float(stdtrit(n_units - 1, probability)) * math.sqrt(variance)
     center = float(_to_fisher_z(np.array(value)))
     return math.tanh(center - half_width), math.tanh(center + half_width)
 
@@ -143,14 +144,20 @@ def estimate_rate(
     n_units = len(np.unique(units))
     if n_units == n_rows:
         return rate, clopper_pearson(int(event.sum()), n_rows)
+    # of the rate, by the residuals of independent units
     unit_residual = sum_per_unit(event - rate, units)
     variance = float((unit_residual**2).sum()) / n_rows**2
     variance *= n_units / max(n_units - 1, 1)
     n_effective = float(n_units)
     if variance > 0.0 and n_units > 1:
-        tail = (1.0 + CONFIDENCE) / 2.0
-        ratio = float(stdtrit(n_rows - 1, tail) / stdtrit(n_units - 1, tail))
-        n_effective = min(rate * (1.0 - rate) / variance * ratio**2, float(n_rows))
+        # n independent rows would have the variance rate (1 - rate) / n. The ratio of
+        # the quantiles makes up for the variance being estimated from few units.
+        probability = (1.0 + CONFIDENCE) / 2.0
+        quantile_ratio = float(
+            stdtrit(n_rows - 1, probability) / stdtrit(n_units - 1, probability)
+        )
+        n_effective = rate * (1.0 - rate) / variance * quantile_ratio**2
+        n_effective = min(n_effective, float(n_rows))
     return rate, _make_beta_interval(rate * n_effective, n_effective)
 
 

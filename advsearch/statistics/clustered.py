@@ -85,7 +85,7 @@ def rate_interval(
             "share: expected counts from 0 to the predictions of each "
             "unit, and one prediction at least"
         )
-    if n_rows.max() == 1.0:
+    if n_rows.max() == 1.0:  # independent rows
         return clopper_pearson(round(n_counted.sum()), round(n_rows.sum()), confidence)
     is_used = n_rows > 0.0
     return _betting_interval(n_counted[is_used] / n_rows[is_used], confidence)
@@ -162,12 +162,14 @@ def compare_paired(
     unit_advantage = sum_per_unit((1.0 + second - 1.0 * first) / 2.0, units) / unit_rows
     lower, upper = _betting_interval(unit_advantage, CONFIDENCE)
     copies = np.ones(len(unit_rows))  # each value counts once
+    # bets that the second outcome happens more often, and that the first does
     max_log_capital = max(
         log_capital(0.5, unit_advantage, copies),
         log_capital(0.5, 1.0 - unit_advantage, copies),
     )
     second_rate = mean_rate(sum_per_unit(second, units), unit_rows)
     first_rate = mean_rate(sum_per_unit(first, units), unit_rows)
+    # one over the capital (Markov), twice as there are two sides
     p_value = float(min(1.0, 2.0 * np.exp(-max_log_capital)))
     # the mean advantage a in [0, 1] is a difference 2 a - 1 of rates
     return second_rate - first_rate, (2 * lower - 1, 2 * upper - 1), p_value
@@ -233,7 +235,8 @@ def one_sided_p_value(
             round(copies * float(rows_outside.sum())),
         )
     is_inside = rows_inside > 0.0
-    is_cut = bool((is_inside & (rows_outside > 0.0)).any())
+    is_outside = rows_outside > 0.0
+    is_cut = bool((is_inside & is_outside).any())  # the rule cuts through a unit
     if not is_cut and len(np.unique(unit_rows)) == 1:
         return _permutation_p_value(
             right_inside + right_outside,
@@ -241,22 +244,23 @@ def one_sided_p_value(
             n_right_inside=copies * float(right_inside.sum()),
             times=copies,
         )
-    wrong_inside = np.divide(
-        rows_inside - right_inside,
-        rows_inside,
-        out=np.zeros_like(rows_inside),
-        where=is_inside,
-    )
-    rate_outside = np.divide(
-        right_outside,
-        rows_outside,
-        out=np.zeros_like(rows_outside),
-        where=rows_outside > 0.0,
-    )
+    wrong_rate_inside = _divide_or_zero(rows_inside - right_inside, rows_inside)
+    right_rate_outside = _divide_or_zero(right_outside, rows_outside)
     rates = np.stack(
-        [wrong_inside, is_inside, rate_outside, rows_outside > 0.0], axis=1
+        [wrong_rate_inside, is_inside, right_rate_outside, is_outside], axis=1
     )
     return _betting_p_value(rates, is_cut=is_cut, times=copies)
+
+
+def _divide_or_zero(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
+    """Return quotients (n,), 0 where the denominator is 0."""
+    quotient: FloatArray = np.divide(
+        numerator,
+        denominator,
+        out=np.zeros_like(denominator),
+        where=denominator > 0.0,
+    )
+    return quotient
 
 
 def _fisher_p_value(
@@ -281,7 +285,11 @@ def _fisher_p_value(
 def _permutation_p_value(
     unit_right: FloatArray, *, n_inside: int, n_right_inside: float, times: float
 ) -> float:
-    """Return the one-sided p-value of a permutation test over units of equal size.
+    """Return the one-sided p-value of a permutation test over units of equal size: how
+    often chance puts at most as many right predictions inside.
+
+    Units with equally many right predictions are the same, so that only their numbers
+    are sampled.
 
     Args:
         unit_right: (n,) right predictions of each unit.
@@ -295,7 +303,8 @@ def _permutation_p_value(
     sampled_units = rng.multivariate_hypergeometric(
         n_units, min(n_inside, int(n_units.sum())), N_PERMUTATIONS, method="marginals"
     )
-    # how often chance has at most as many inside; what was observed is one more
+    # how often chance has at most as many inside, but for rounding; what was observed is
+    # one more
     n_as_few = (sampled_units @ values <= n_right_inside + 1e-9).sum()
     return float((1 + n_as_few) / (1 + N_PERMUTATIONS))
 

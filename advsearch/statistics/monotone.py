@@ -74,15 +74,17 @@ def find_dips(
 
     n_distances = len(distances)
     n_comparisons = n_distances * (n_distances - 1) / 2.0
+    # sums over the distances before each index
     right_before = np.concatenate([[0], np.cumsum(right)])
     counts_before = np.concatenate([[0], np.cumsum(counts)])
     dips = []
     for near in range(n_distances - 1):
-        # the runs right behind it, by the index after their last distance
+        # the runs of distances right behind it, by the index after their last one
         end = np.arange(near + 2, n_distances + 1)
         right_beyond = right_before[end] - right_before[near + 1]
         counts_beyond = counts_before[end] - counts_before[near + 1]
-        # of as few right ones at the nearer distance, if chance divides them
+        # probability of as few right images at the nearer distance, if chance decides
+        # which of all images of both are right: Fisher's exact test
         p_values = hypergeom.cdf(
             right[near],
             counts_beyond + counts[near],
@@ -92,6 +94,7 @@ def find_dips(
         is_dip = right[near] / counts[near] < right_beyond / counts_beyond
         if not is_dip.any():
             continue
+        # the run with the clearest difference
         best = int(np.argmin(np.where(is_dip, p_values, np.inf)))
         dip = Dip(
             distance=float(distances[near]),

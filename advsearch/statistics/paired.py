@@ -38,12 +38,14 @@ def paired_difference(
     phi = _phi_coefficient(both, first, second, neither)
 
     def combine(a: float, b: float) -> float:
-        """Return the distance of the difference's bound, by those of both rates; the
-        root of a number below 0 by rounding is 0.
+        """Return how far a bound is from the difference, by how far the bounds of both
+        rates are from these, with the correlation phi.
         """
+        # not below 0 by rounding
         return math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b))
 
     difference = second_rate - first_rate
+    # the difference is smallest where the second rate is low and the first high
     below = combine(second_rate - second_low, first_high - first_rate)
     above = combine(second_high - second_rate, first_rate - first_low)
     return difference, (max(-1.0, difference - below), min(1.0, difference + above))

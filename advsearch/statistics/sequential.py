@@ -27,7 +27,7 @@ def find_threshold(is_beyond: Callable[[float], bool]) -> float:
         return 0.0
     if not is_beyond(high):
         return 1.0
-    for _ in range(40):
+    for _ in range(40):  # to 1e-12, which is 2^-40
         center = 0.5 * (low + high)
         if is_beyond(center):
             high = center
@@ -116,8 +116,12 @@ class ConfidenceSequence:
     def _has_won(self, mean: float, counts: Mapping[float, int]) -> bool:
         """Return whether bets on "more than `mean`" have won against samples.
 
-        Only as long as the capital stays above the threshold, so that adding samples
-        may undo it.
+        They have as long as the capital is above the threshold; further samples may
+        bring it down again.
+
+        Args:
+            mean: that the bets are on, in (0, 1).
+            counts: of the samples, by their value.
         """
         threshold = np.log(self.sides / (1.0 - self.confidence))
         return bool(log_capital_of_counts(mean, counts) >= threshold)
@@ -143,6 +147,7 @@ def count_needed_samples(mean: float, *, confidence: float, value: float = 1.0) 
     upper = 1
     while not is_enough(upper):
         upper *= 2
+    # the first count from 1 on that is enough, by bisection; an index from 0
     return bisect_left(range(1, upper + 1), True, key=is_enough) + 1
 
 
@@ -166,7 +171,8 @@ def log_capital(
         counts: (n,) how often each occurs.
     """
     with np.errstate(divide="ignore"):
-        factors = 1.0 - STAKES + STAKES * (values / mean)[:, None]
-        log_factors = np.log(np.maximum(factors, 0.0))
+        factors = 1.0 - STAKES + STAKES * (values / mean)[:, None]  # (n, stakes)
+        log_factors = np.log(np.maximum(factors, 0.0))  # not below 0 by rounding
         log_capital_of_stake = (counts[:, None] * log_factors).sum(axis=0)
+    # the capital is the mean over stakes
     return float(np.logaddexp.reduce(log_capital_of_stake) - np.log(len(STAKES)))

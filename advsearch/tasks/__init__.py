@@ -88,6 +88,7 @@ class FunctionTask(Task):
         losses = self.function(copy_value(output), truth)
         count = len(output)
         is_tensor = isinstance(losses, Tensor)
+        # of any shape: () of one image, or (N, 1)
         if is_tensor and losses.is_floating_point() and losses.numel() == count:
             return losses.reshape(count)
         got = type(losses).__name__
@@ -198,7 +199,7 @@ def make_task(task: AnyTask) -> Task:
     check_options("task", name, TASKS[name], options)
     build: Callable[..., Any] = TASKS[name]
     result: Any = build(**options)
-    if result.judges_rig:
+    if result.judges_rig:  # the task of each image is one of its options
         result = replace(result, part=make_task(result.task))
     created: Task = result
     return created

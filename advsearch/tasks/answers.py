@@ -87,7 +87,7 @@ class FreeAnswer(Task):
         """See `Task.on`: the target is a word, or several separated by commas, of which
         the answer has to contain one.
         """
-        if model.read is None:
+        if model.read is None:  # its outputs are logits, as of a classifier
             raise InputError(
                 f"model {model.name}: it was loaded for its logits; load "
                 f'it with task="{self.name}"'
@@ -111,11 +111,7 @@ class FreeAnswer(Task):
         Raises:
             ValueError: they are something else.
         """
-        keys = AnswerWithLogits.__required_keys__
-        if isinstance(returned, (list, tuple)) and all(
-            isinstance(answer, Mapping) and (keys <= answer.keys() or "texts" in answer)
-            for answer in returned
-        ):
+        if isinstance(returned, (list, tuple)) and all(map(_is_answer, returned)):
             return list(returned)
         raise ValueError(
             "expected a mapping with text, logits and begins for each "
@@ -185,8 +181,8 @@ class FreeAnswer(Task):
         truth: Words,
         margins: Sequence[float],
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.describe`: of several texts, the most frequent among those that
-        decided.
+        """See `Task.describe`: of several texts about an image, the most frequent among
+        those that decided: the right ones if the prediction is right, else the wrong.
 
         The payload has all of them.
         """
@@ -201,11 +197,19 @@ class FreeAnswer(Task):
         return results
 
 
+def _is_answer(value: Any) -> bool:
+    """Return whether a value has the keys of one of the two forms of an answer."""
+    required_keys = AnswerWithLogits.__required_keys__
+    return isinstance(value, Mapping) and (
+        required_keys <= value.keys() or "texts" in value
+    )
+
+
 def _compute_token_margin(
     logits: Tensor, begins: Callable[[str], Sequence[int]], words: Words
 ) -> Tensor:
-    """Compute by how much the tokens that begin one of the words lead at their best
-    step.
+    """Compute by how much the tokens that begin one of the words lead over all others,
+    at the step of an answer at which they do best.
 
     Args:
         logits: (T, tokens) of each step of the answer.
@@ -233,7 +237,7 @@ def _compute_token_margin(
 
 
 def _texts(answer: AnswerWithLogits | AnswersWithoutLogits) -> list[str]:
-    """Return all texts of an answer."""
+    """Return all texts about an image: several requests' or the only one."""
     if "texts" in answer:
         return answer["texts"]  # type: ignore[typeddict-item]
     return [answer["text"]]

@@ -557,13 +557,20 @@ def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
     Of equally frequent ones it is that with the lowest class index. Score, margin and
     probability are the means of the judgements with this prediction.
     """
-    key_of_judgement = [(x.prediction.label, x.prediction.index) for x in judgements]
-    counts = Counter(key_of_judgement)
-    label, index = min(counts, key=lambda key: (-counts[key], key[1] or 0))
+    label_and_index = [(x.prediction.label, x.prediction.index) for x in judgements]
+    counts = Counter(label_and_index)
+
+    def sort_key(candidate: tuple[str, int | None]) -> tuple[int, int]:
+        """Return a key by which the most frequent comes first, then a low index."""
+        _, class_index = candidate
+        return -counts[candidate], class_index or 0  # None if there are no classes
+
+    most_frequent = min(counts, key=sort_key)
+    label, index = most_frequent
     matching = [
         judgement
-        for judgement, key in zip(judgements, key_of_judgement, strict=True)
-        if key == (label, index)
+        for judgement, candidate in zip(judgements, label_and_index, strict=True)
+        if candidate == most_frequent
     ]
     probabilities = [
         judgement.prediction.probability

@@ -97,15 +97,17 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     """
     order = scores.argsort(descending=True)[:MAX_SUPPRESSED]
     sorted_boxes = boxes[order]
+    # 256 rows at a time, which bounds the memory of what `compute_iou` computes
     overlap_chunks = [
         compute_iou(sorted_boxes, chunk[:, None]) >= iou
         for chunk in sorted_boxes.split(256)
     ]
-    # Row i, column j: whether box j, which is better, overlaps box i.
+    # Row i, column j: whether box j, which is better (j < i), overlaps box i.
     is_overlapped = torch.cat(overlap_chunks).tril(-1)
     undecided = torch.ones(len(sorted_boxes), dtype=torch.bool, device=boxes.device)
     survives = ~undecided
     while bool(undecided.any()):
+        # no undecided box that is better overlaps it
         survives = survives | (undecided & ~(is_overlapped & undecided).any(dim=1))
         is_suppressed = (is_overlapped & survives).any(dim=1)
         undecided = undecided & ~survives & ~is_suppressed
@@ -161,7 +163,8 @@ def suppress(detections: Detections, min_score: float, iou: float) -> Detections
         iou: intersection over union from which boxes are duplicates; 1 disables
             suppression.
     """
-    if "labels" in detections or iou == 1.0 or not len(detections["boxes"]):
+    is_disabled = iou == 1.0
+    if "labels" in detections or is_disabled or not len(detections["boxes"]):
         return detections
     scores = detections["scores"].detach()
     boxes = detections["boxes"].detach()
@@ -362,10 +365,12 @@ class BoxFormat:
 
         Of several, those that differ least from this one.
         """
+        # without yxyx: with swapped axes a box is as plausible as before
         alternatives = [
             BoxFormat(form, unit, self.input_size)
             for unit in UNITS
-            for form in FORMS[:3]
+            for form in FORMS
+            if form != "yxyx"
         ]
         changes = [
             self.format_change_to(alternative)
@@ -393,8 +398,8 @@ class BoxFormat:
     def suggest_better_format(
         self, boxes: Tensor, true_box: Tensor, min_iou: float
     ) -> str:
-        """Suggest the format in which a box fits the true box much better; empty if
-        none.
+        """Suggest the format in which one of the boxes fits the true box much better
+        than in this format; empty if there is none.
 
         Args:
             boxes: (D, 4), with a right class.

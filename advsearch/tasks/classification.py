@@ -60,7 +60,8 @@ class ClassTask(Task):
             InputError: there is no such class, or the model's outputs are not what the
                 task reads.
         """
-        if self.reads_logits != (model.read is None):
+        model_returns_logits = model.read is None
+        if self.reads_logits != model_returns_logits:
             if self.reads_logits:
                 advice = (
                     "it was loaded for another task than classification; give the "
@@ -188,7 +189,9 @@ class Classification(ClassTask):
         """
         nothing = set(self.nothing_classes) - set(truth)
         n_classes = output.shape[1]
-        if not nothing or len(nothing) + max(1, len(truth)) >= n_classes:
+        n_right = max(1, len(truth))  # one at least, if it is not known yet
+        has_other_wrong_class = len(nothing) + n_right < n_classes
+        if not nothing or not has_other_wrong_class:
             return output
         indices = torch.tensor(sorted(nothing), device=output.device)
         return output.index_fill(1, indices, -math.inf)
@@ -212,7 +215,7 @@ class Classification(ClassTask):
     def _rank_classes(self, logits: Tensor, count: int) -> list[tuple[Prediction, ...]]:
         """Return the `count` likeliest classes of each row of logits (N, classes)."""
         probabilities = logits.detach().softmax(dim=1)
-        if count == 1:
+        if count == 1:  # of equal ones `argmax` returns the first, `topk` any
             top_classes = probabilities.argmax(dim=1, keepdim=True)
             top_probabilities = probabilities.gather(1, top_classes)
         else:
@@ -230,28 +233,33 @@ class Classification(ClassTask):
                 for class_id, probability in zip(
                     classes, class_probabilities, strict=True
                 )
+                # classes that stand for no thing have a probability of 0
                 if probability > 0.0 or count == 1
             )
             predictions_of_images.append(predictions)
         return predictions_of_images
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
-        """See `Task.judge`; the logits are computed once for all that needs them."""
+        """See `Task.judge`; the logits are computed once for all that needs them.
+
+        Loss and score are computed from these logits, unless a subclass defines them.
+        """
         logits = self.as_logits(output, truth)
-        task_class = type(self)
-        if task_class.loss is Classification.loss:
-            losses = compute_misclassification_margin(logits, truth)
-        else:
+        defines_loss = type(self).loss is not Classification.loss
+        if defines_loss:
             losses = self.loss(output, truth)
-        if task_class.score is not Classification.score or self.target is not None:
+        else:
+            losses = compute_misclassification_margin(logits, truth)
+        defines_score = type(self).score is not Classification.score
+        if defines_score or self.target is not None:
             scores = self.score(output, truth)
         else:
             scores = -losses if self.minimise else losses
         judgements = []
         for score, margin, predictions in zip(
             scores.tolist(),
-            (0.0 - losses).tolist(),
-            self._rank_classes(logits, 1),
+            (0.0 - losses).tolist(),  # not `-losses`, which would be -0.0 for 0
+            self._rank_classes(logits, count=1),
             strict=True,
         ):
             judgements.append(Judgement.of(score, margin, predictions[0]))

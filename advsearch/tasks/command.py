@@ -76,7 +76,6 @@ class Command(Task):
 
         They are stored in one form, so that tasks with equal options compare as equal.
         """
-        # Normalise the options, so that equal tasks compare as equal.
         set_field = object.__setattr__  # the dataclass is frozen
         set_field(self, "state", _load_state(self.state))
         set_field(self, "names", _parse_names("names", self.names))
@@ -95,7 +94,12 @@ class Command(Task):
                 )
 
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
-        """See `Task.wrap_network`: a policy gets the state next to images."""
+        """See `Task.wrap_network`: a policy gets the state next to images.
+
+        A network that takes the images of all cameras at once, or that is wrapped
+        already, is wrapped inside. One that only takes images stays as it is, unless
+        there is a state or it has the method of LeRobot's policies, `select_action`.
+        """
         if isinstance(network, models.AllAtOnce):
             inner: Any = self.wrap_network(network.network)
             return models.AllAtOnce(inner, network.cameras, network.layout)
@@ -113,7 +117,7 @@ class Command(Task):
             ValueError: there are none, or their size differs from that of the options.
         """
         actions = returned.get("action") if isinstance(returned, Mapping) else returned
-        if type(actions) in (tuple, list) and actions:
+        if type(actions) in (tuple, list) and actions:  # no named tuple
             actions = actions[0]
         if (
             not isinstance(actions, Tensor)
@@ -134,8 +138,8 @@ class Command(Task):
         for option in ("envelope", "names", "units"):
             size = len(getattr(self, option) or ())
             # One envelope or unit is for all elements.
-            min_size = 1 if option == "names" else 2
-            if size >= min_size and size != actions.shape[1]:
+            is_for_all = size == 1 and option != "names"
+            if size and not is_for_all and size != actions.shape[1]:
                 raise ValueError(
                     f"expected actions of {size} elements, as task command has {option}"
                 )
@@ -176,7 +180,9 @@ class Command(Task):
         return replace(self, target=None if target is None else self._target(target))
 
     def _target(self, text: str) -> Tensor:
-        """Parse a target action (A,), with NaN for elements that are not named."""
+        """Parse a target action (A,): numbers of all elements ("0.1,-0.3"), or named
+        ones ("yaw rate=-0.3"); elements that are not named are NaN.
+        """
         assignments = [part.rpartition("=") for part in str(text).split(",")]
         numbers = [number.strip() for _, _, number in assignments]
         values = torch.tensor(_parse_numbers("target", numbers))
@@ -218,17 +224,18 @@ class Command(Task):
         return replace(self, clean=clean_action)
 
     def _check_target(self, clean_action: Tensor) -> None:
-        """Check the target's size, and that its envelope is apart from the clean
-        one.
+        """Raise InputError if the target has another size than the clean action (A,),
+        or their envelopes overlap.
         """
         if len(self.target) != len(clean_action):
             raise InputError(
                 f"target: expected an action of {len(clean_action)} "
                 f"elements, got {len(self.target)}"
             )
-        # Otherwise an action could be right and a success at once.
-        # A loss of 1 is a distance of 2 envelopes.
-        if float(self.loss(clean_action[None], self.target)) <= 1.0:
+        # A loss of 1 is a distance of 2 envelopes. Nearer to each other, an action could
+        # be in both envelopes, right and a success at once.
+        do_envelopes_overlap = float(self.loss(clean_action[None], self.target)) <= 1.0
+        if do_envelopes_overlap:
             raise InputError(
                 "target: expected an action more than two envelopes from the clean "
                 f"one, which is {self._format_action(clean_action.tolist())}"
@@ -273,7 +280,7 @@ class Command(Task):
         """Compute the deviation (N, A) of each element from an action `center` (A,).
 
         It is in envelopes: 1 is at the edge of what is allowed. An element that is NaN
-            in `center` is not judged, so that its deviation is 0.
+        in `center` is not judged, so that its deviation is 0.
         """
         if center is None:
             raise InputError(

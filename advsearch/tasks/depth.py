@@ -124,6 +124,7 @@ class DepthTruth:
         right_disparity = disparity.gather(1, right.clamp_max(width - 1))
         weight = (column - left) / (right - left).clamp_min(1)
         result = left_disparity + weight * (right_disparity - left_disparity)
+        # where the object reaches an edge of the image, the value of the other side
         has_left = left >= 0
         has_right = right != width
         result = torch.where(has_right, result, left_disparity)
@@ -171,6 +172,7 @@ class Depth(Task):
             "a number over 0, under 100",
             "tolerance",
         )
+        # 0, the default, means that there is none
         self.check_numbers(
             lambda value: -1e-9 < value < 1e6, "a number over 0, under 1e+06", "size"
         )
@@ -215,7 +217,7 @@ class Depth(Task):
             InputError: the model was loaded for another task or with names of classes,
                 or there is a target.
         """
-        if model.read is None:
+        if model.read is None:  # its outputs are logits, as of a classifier
             raise InputError(
                 f"model {model.name}: it was loaded for its logits; load "
                 'it with task="depth"'
@@ -237,7 +239,9 @@ class Depth(Task):
     def after_calibration(
         self, output: Sequence[DepthMap], truth: DepthTruth | None
     ) -> Depth:
-        """See `Task.after_calibration`: find out what the values are."""
+        """See `Task.after_calibration`: find out what the values are, by the options or
+        by what the network states in the map of a clean image.
+        """
         kind = self.kind or next(iter(output[0]))
         return replace(self, resolved_kind=kind, missing=self._missing(kind, truth))
 
@@ -354,11 +358,13 @@ class Depth(Task):
             return super().score(output, truth)
 
         def score_gone(log_factors: Tensor) -> Tensor:
+            """Return by how much the object is as far as what is behind it, ()."""
             excess = log_factors.abs().mean() - self._log_limit
             lost_relief = 0.5 - self._relief(log_factors, truth)
             return torch.minimum(excess, lost_relief)
 
         def score_signed(log_factors: Tensor) -> Tensor:
+            """Return by how much the object is too near, or too far, ()."""
             sign = 1.0 if self.seek == "farther" else -1.0
             return sign * log_factors.mean() - self._log_limit
 
@@ -398,10 +404,12 @@ class Depth(Task):
         predicted, is_inverse = self._align(depth_map, truth)
         mask = truth.mask.to(predicted.device)
         z = truth.z.to(predicted.device)
+        # of predicted to true, both z-depth or both its inverse
         if is_inverse:
             ratio = predicted[mask] * z[mask]
         else:
             ratio = predicted[mask] / z[mask]
+        # clamped first, since a predicted disparity may be 0 or negative
         log_ratio = ratio.clamp(1.0 / MAX_FACTOR, MAX_FACTOR).log()
         log_factors = -log_ratio if is_inverse else log_ratio
         # 0, or NaN if the map has a NaN anywhere, also outside the object
@@ -484,6 +492,7 @@ class Depth(Task):
         if not truth.is_visible:
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
         results: list[tasks.PredictionWithPayload] = []
+        # geometric mean over the object's pixels, as of the factors
         distance = float(truth.z[truth.mask].double().log().mean().exp())
         for depth_map, margin in zip(output, margins, strict=True):
             log_factors = self._log_factors(depth_map, truth)
@@ -495,26 +504,31 @@ class Depth(Task):
                 "factor": round(math.exp(float(log_factors.abs().mean())), 4),
                 "relief": round(relief, 4),
             }
-            if (self.kind or next(iter(depth_map))) != METRIC:
-                payload["fitted"] = (
-                    "beside the object"
-                    if truth.determines_scale
-                    else "in the whole picture"
-                )
-            label = (
-                AS_FAR if margin >= 0.0 else self._error_label(mean_log_factor, relief)
-            )
+            is_fitted = (self.kind or next(iter(depth_map))) != METRIC
+            if is_fitted and truth.determines_scale:
+                payload["fitted"] = "beside the object"
+            elif is_fitted:
+                payload["fitted"] = "in the whole picture"
+            label = AS_FAR
+            if margin < 0.0:
+                label = self._error_label(mean_log_factor, relief)
             results.append((tasks.Prediction(label), payload))
         return results
 
     def _error_label(self, mean_log_factor: float, relief: float) -> str:
-        """Return the label of a wrong distance; what is sought comes first."""
+        """Return the label of a wrong distance; of several that hold, the one that the
+        search seeks.
+
+        Args:
+            mean_log_factor: mean of log(predicted / true) over the object's pixels.
+            relief: remaining fraction of the object's relief, see `_relief`.
+        """
         holds = {
             "gone": relief < 0.5,
             "nearer": -mean_log_factor > self._log_limit,
             "farther": mean_log_factor > self._log_limit,
         }
-        sought_first = sorted(holds, key=lambda goal: goal != self.seek)
+        sought_first = sorted(holds, key=lambda goal: goal != self.seek)  # False first
         for goal in sought_first:
             if holds[goal]:
                 return LABELS[goal]
@@ -533,7 +547,8 @@ class Depth(Task):
         for depth_map in output:
             marks = [true_mark]
             kind = self.kind or next(iter(depth_map))
-            # Whether the fit is reliable does not matter for what is drawn.
+            # Without the truth `_missing` does not ask whether the fit of a relative map
+            # is reliable, which does not matter for what is drawn.
             missing = self._missing(kind, truth if kind == METRIC else None)
             if truth.is_visible and not missing:
                 marks.append(self._predicted_mark(depth_map, truth))
@@ -568,8 +583,11 @@ def _find_maps(returned: Any) -> tuple[str, Any]:
         return "", returned.predicted_depth
     if isinstance(returned, (list, tuple)) and returned:
         first = returned[0]
+        # a detector's output begins with boxes, which are no maps
         is_boxes = isinstance(first, Tensor) and first.shape[-1:] == (4,)
-        return "", None if is_boxes and len(returned) > 1 else first
+        if is_boxes and len(returned) > 1:
+            return "", None
+        return "", first
     return "", returned
 
 
@@ -584,11 +602,11 @@ def _fit_scale_and_shift(values: Tensor, expected: Tensor, mask: Tensor) -> Tens
         expected: (H, W), finite in the mask.
         mask: (H, W) bool, the pixels of the fit, at least one.
     """
-    x = values[mask]
-    y = expected[mask]
-    x_mean = x.mean()
-    y_mean = y.mean()
-    x = x - x_mean
-    y = y - y_mean
-    scale = ((x * y).sum() / x.square().sum().clamp_min(1e-20)).clamp_min(0.0)
-    return y_mean + scale * (values - x_mean)
+    fit_values = values[mask]
+    fit_expected = expected[mask]
+    x_mean = fit_values.mean()
+    y_mean = fit_expected.mean()
+    x = fit_values - x_mean
+    y = fit_expected - y_mean
+    slope = (x * y).sum() / x.square().sum().clamp_min(1e-20)
+    return y_mean + slope.clamp_min(0.0) * (values - x_mean)

@@ -202,7 +202,9 @@ class Detection(ClassTask):
         with torch.no_grad():
             noise = torch.rand((1, *model.input_size, 3), generator=generator)
             output = model(noise)
+        # rows of NaN are counted as "blank"
         fills_with_nan = any("blank" in detections for detections in output)
+        # the options count more than what the network declares
         has_format_options = bool(self.boxes or self.unit)
         is_declared = not has_format_options and getattr(
             model.module, DECLARED_FORMAT_ATTRIBUTE, False
@@ -232,23 +234,29 @@ class Detection(ClassTask):
         """
         task = self._infer_format(output)
         output = task._resolve_grids(output)
-        box_format = task._box_format
         if truth is not None and truth.box_fractions is not None:
             right_boxes = task._find_boxes_of_classes(output, truth.labels)
             if len(right_boxes):
-                better_format = box_format.suggest_better_format(
-                    right_boxes, truth.box_fractions, self.iou
-                )
-                if better_format:
-                    doubts = f"one of them is nearer to the object with {better_format}"
-                else:
-                    doubts = box_format.describe_fault(right_boxes)
+                doubts = task._compare_with_truth(right_boxes, truth.box_fractions)
                 return replace(task, doubts=doubts)
         # no box of a right class, or no true box to compare with
         boxes = select_best_boxes(output)
-        fault = box_format.describe_fault(boxes)
-        doubts = fault and f"{fault}{box_format.suggest_plausible_formats(boxes)}"
+        box_format = task._box_format
+        doubts = box_format.describe_fault(boxes)
+        if doubts:
+            doubts += box_format.suggest_plausible_formats(boxes)
         return replace(task, doubts=doubts)
+
+    def _compare_with_truth(self, boxes: Tensor, true_box: Tensor) -> str:
+        """Return what is odd about boxes (D, 4) of the right classes; "" if nothing.
+
+        `true_box` is (4,), in fractions of width and height.
+        """
+        box_format = self._box_format
+        better_format = box_format.suggest_better_format(boxes, true_box, self.iou)
+        if better_format:
+            return f"one of them is nearer to the object with {better_format}"
+        return box_format.describe_fault(boxes)
 
     def _find_boxes_of_classes(
         self, output: Sequence[Detections], classes: Labels
@@ -263,7 +271,12 @@ class Detection(ClassTask):
         return torch.cat(selected)
 
     def _infer_format(self, output: Sequence[Detections]) -> Detection:
-        """Return the task with the order and unit that an output of its model shows."""
+        """Return the task with the order and unit that an output of its model shows.
+
+        What the output leaves open stays as it was inferred before. "raw" are grids of
+        a YOLO network, and "either" pairs of numbers of which it is open which one is
+        the score (see `detector_outputs`).
+        """
         grids = [detections["raw"] for detections in output if "raw" in detections]
         is_ambiguous = any("either" in detections for detections in output)
         order = self._infer_order(output)
@@ -277,7 +290,7 @@ class Detection(ClassTask):
         )
         resolved = task._resolve_grids(output)
         if self.has_declared_format:
-            unit = UNITS[1]
+            unit = "pixels"  # what the declaration says
         else:
             unit = infer_unit(select_best_boxes(resolved)) or self.inferred_unit
         has_nan_rows = any(
@@ -303,7 +316,7 @@ class Detection(ClassTask):
         has_logits = any("logits" in detections for detections in output)
         head = self._stated_class_count_order
         if not head and has_logits and self.named and is_nothing_name(self.labels[-1]):
-            head = QUERIES[1]
+            head = QUERIES[1]  # with a last class for no object
         n_classes = len(self.labels) if self.named else None
         try:
             return outputs.infer_order(output, n_classes, head)
@@ -314,7 +327,15 @@ class Detection(ClassTask):
             raise InputError(f"task detection: {shape}{error}{hint}") from None
 
     def _has_mask_coefficients(self, output: Sequence[Detections], order: str) -> bool:
-        """Whether mask coefficients accompany the scores of boxes in an output."""
+        """Return whether mask coefficients accompany the scores of boxes in an output.
+
+        They do if feature maps came with rows of boxes; or in a YOLO grid, if it has
+        more channels than the box and the scores take.
+
+        Args:
+            output: of N images.
+            order: one of `HEADS` with a layout, if there are grids.
+        """
         for detections in output:
             if "map_channels" in detections and "raw" not in detections:
                 return True
@@ -329,7 +350,9 @@ class Detection(ClassTask):
         return n_channels > len(self.labels) + first_score
 
     def _resolve_grids(self, output: Sequence[Detections]) -> Sequence[Detections]:
-        """Return an output with YOLO grids split and DETR logits turned into scores."""
+        """Return an output with YOLO grids ("raw") split into boxes and scores, and DETR
+        logits turned into scores; any other as it is.
+        """
         if any("raw" in detections or "logits" in detections for detections in output):
             return self._resolve_labels(output)
         return output
@@ -382,8 +405,9 @@ class Detection(ClassTask):
     def _box_format(self) -> BoxFormat:
         """How the model's boxes are read: by the options, else as inferred."""
         order = self._stated_class_count_order or self.inferred_order
-        default_form = "cxcywh" if order in CLASS_COUNT_ORDERS else FORMS[0]
-        unit = self.unit or self.inferred_unit or UNITS[1]
+        # YOLO heads and DETR networks have centers and sizes
+        default_form = "cxcywh" if order in CLASS_COUNT_ORDERS else "xyxy"
+        unit = self.unit or self.inferred_unit or "pixels"
         return BoxFormat(self.boxes or default_form, unit, self.input_size)
 
     @property
@@ -437,12 +461,13 @@ class Detection(ClassTask):
         """Compute by how much the best right box is below `confidence`, in log-odds.
 
         Returns:
-            (N,), over 0 if the object is not found. For `create`: by how much the best
-            box where nothing is exceeds `confidence`.
+            (N,), over 0 if the object is not found. If `seek` is `create`: by how much
+            the best box where nothing is exceeds `confidence`.
         """
-        loss_of_image = (
-            self._score_create if self.seek == "create" else self._score_vanish
-        )
+        if self.seek == "create":
+            loss_of_image = self._score_create
+        else:
+            loss_of_image = self._score_vanish
         return self._map_images(
             output,
             truth,
@@ -486,10 +511,10 @@ class Detection(ClassTask):
         is_out_of_view = truth.box is None and self.seek != "create"
         values = []
         for detections in self._read_boxes(output):
+            # Products keep values without a derivative attached to the graph.
             if self._is_broken(detections):
                 value = detections["scores"].sum() * math.nan
             elif is_out_of_view:
-                # The product keeps the value attached to the graph.
                 value = detections["scores"].sum() * 0.0 - 1.0
             else:
                 value = function(detections)
@@ -515,7 +540,7 @@ class Detection(ClassTask):
 
     def _score_displace(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Compute the lesser of two: that boxes miss the object, and that some box
-            counts.
+        counts.
 
         The first is how far the best overlap of a box that counts is below `iou`,
         scaled so that a small step from `iou` is as long as one in log-odds. The second
@@ -582,6 +607,7 @@ class Detection(ClassTask):
             is_weak = (get_box_numbers(resolved) < self._min_score).all(dim=1)
             counts = is_finite | ~is_weak
             if not bool(counts.all()):
+                # "blank" is a single number; everything else has a row for each box
                 resolved = {
                     name: values if name == "blank" else values[counts]
                     for name, values in resolved.items()
@@ -597,8 +623,8 @@ class Detection(ClassTask):
     def _is_broken(self, detections: Detections) -> bool:
         """Return whether the detections of an image cannot be judged.
 
-        A score or a box that counts is not finite; or all rows are NaN, although the
-        model does not fill its outputs with such rows.
+        A score or a box that counts is not finite; or all rows are NaN ("blank" counts
+        such rows), although the model does not fill its outputs with them.
         """
         has_only_nan_rows = "blank" in detections and not len(detections["boxes"])
         if has_only_nan_rows and not self.fills_with_nan:
@@ -678,15 +704,12 @@ class Detection(ClassTask):
         elsewhere than the object. Only scores of target classes count, if there is a
         target.
         """
-        right_classes = set(truth.labels)
         if self.target is not None:
-            targets = set(self.target)
-            right_score = self._scores_of_classes(
-                detections, tuple(sorted(targets & right_classes))
-            )
-            wrong_score = self._scores_of_classes(
-                detections, tuple(sorted(targets - right_classes))
-            )
+            right_classes = set(truth.labels)
+            right_targets = tuple(sorted(set(self.target) & right_classes))
+            wrong_targets = tuple(sorted(set(self.target) - right_classes))
+            right_score = self._scores_of_classes(detections, right_targets)
+            wrong_score = self._scores_of_classes(detections, wrong_targets)
         else:
             right_score = self._scores_of_classes(detections, truth.labels)
             wrong_score = self._scores_of_rivals(detections, truth.labels)
@@ -717,6 +740,7 @@ class Detection(ClassTask):
         if self.target is not None:
             return self._scores_of_classes(detections, self.target)
         if "labels" in detections:
+            # a single score for each box: it remains if the class is another, else 0
             return detections["scores"] - self._scores_of_classes(detections, classes)
         n_classes = detections["scores"].shape[1]
         rivals = tuple(sorted(set(range(n_classes)) - set(classes)))
@@ -752,16 +776,16 @@ class Detection(ClassTask):
         """
         results: list[PredictionWithPayload] = []
         for detections in self._read_boxes(output):
-            finding = self._match_object(self._suppress(detections), truth)
+            match = self._match_object(self._suppress(detections), truth)
             payload: dict[str, JsonValue] = {
                 "box": None if truth.box is None else list(truth.box),
                 "found": self._boxes_in_pixels(detections, truth),
             }
-            if finding.outcome is not None:
-                payload[OUTCOME] = finding.outcome.value
-                payload["class"] = self.get_class_name(finding.index)
-                payload["iou"] = None if finding.iou is None else round(finding.iou, 3)
-            results.append((self._describe_match(finding, truth), payload))
+            if match.outcome is not None:
+                payload[OUTCOME] = match.outcome.value
+                payload["class"] = self.get_class_name(match.index)
+                payload["iou"] = None if match.iou is None else round(match.iou, 3)
+            results.append((self._describe_match(match, truth), payload))
         return results
 
     def _boxes_in_pixels(
@@ -792,12 +816,8 @@ class Detection(ClassTask):
     ) -> ObjectMatch:
         """Decide what becomes of the object in the boxes that survived suppression.
 
-        The outcomes are tried in order, the best for the model first; the first one
-        whose best box reaches `confidence` is returned with that box. Where phantoms
-        are sought, they come before all others.
+        Where phantoms (boxes where nothing is) are sought, they come before all others.
         """
-        right_score = self._scores_of_classes(detections, truth.labels)
-        is_on_nothing = self._is_on_nothing(detections, truth)
         if self.seek == "create" and float(self._score_create(detections, truth)) > 0.0:
             phantom_score = self._phantom_scores(detections, truth)
             is_phantom = phantom_score > 0.0
@@ -805,12 +825,36 @@ class Detection(ClassTask):
                 Outcome.PHANTOM, detections, phantom_score, is_phantom, truth
             )
         if truth.box is None:
-            best_phantom = float(max_or_zero(right_score, is_on_nothing))
-            if self.seek != "create" and best_phantom >= self.confidence:
-                return self._match_best_box(
-                    Outcome.PHANTOM, detections, right_score, is_on_nothing, truth
-                )
-            return ObjectMatch(None, truth.labels[0])
+            return self._match_phantom(detections, truth)
+        return self._match_visible_object(detections, truth)
+
+    def _match_phantom(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> ObjectMatch:
+        """Decide what is detected in an image in which the object is out of view.
+
+        It is a phantom if a box of a right class on nothing reaches `confidence`; no
+        outcome otherwise, or if phantoms are sought (and were looked for already).
+        """
+        right_score = self._scores_of_classes(detections, truth.labels)
+        is_on_nothing = self._is_on_nothing(detections, truth)
+        best_phantom = float(max_or_zero(right_score, is_on_nothing))
+        if self.seek != "create" and best_phantom >= self.confidence:
+            return self._match_best_box(
+                Outcome.PHANTOM, detections, right_score, is_on_nothing, truth
+            )
+        return ObjectMatch(None, truth.labels[0])
+
+    def _match_visible_object(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> ObjectMatch:
+        """Decide what becomes of an object that is in view.
+
+        The outcomes are tried in order, the best for the model first; the first one
+        whose best box reaches `confidence` is returned with that box.
+        """
+        right_score = self._scores_of_classes(detections, truth.labels)
+        is_on_nothing = self._is_on_nothing(detections, truth)
         is_at_object = self._is_at_object(detections, truth)
         is_loose = self._is_loosely_on_object(detections, truth) & ~is_at_object
         wrong_score = self._scores_of_rivals(detections, truth.labels)
@@ -849,30 +893,30 @@ class Detection(ClassTask):
             is_candidate: (D,) bool.
             truth: of the scene.
         """
+        # scores are at least 0, so that other boxes come last
         row = int(torch.where(is_candidate, scores, -1.0).argmax())
         score = float(scores[row])
         if "labels" in detections:
             class_id = int(detections["labels"][row])
-        else:
+        else:  # the class that has this score
             class_id = int((detections["scores"][row] == score).nonzero()[0])
         iou = None
         if truth.box is not None:
             iou = float(compute_iou_with_truth(detections, truth)[row])
         return ObjectMatch(outcome, class_id, score, iou)
 
-    def _describe_match(
-        self, finding: ObjectMatch, truth: DetectionTruth
-    ) -> Prediction:
+    def _describe_match(self, match: ObjectMatch, truth: DetectionTruth) -> Prediction:
         """Return the prediction about the object, with the score of the deciding
         box.
         """
-        class_name = self.get_class_name(finding.index)
-        if finding.outcome is None or (truth.box is None and self.seek != "create"):
+        class_name = self.get_class_name(match.index)
+        is_out_of_view = truth.box is None and self.seek != "create"
+        if match.outcome is None or is_out_of_view:
             return Prediction(OUT_OF_VIEW)
-        if finding.outcome in LABELS:
-            label = LABELS[finding.outcome].format(class_name)
-            return Prediction(label, None, finding.score)
-        return Prediction(class_name, finding.index, finding.score)
+        if match.outcome in LABELS:
+            label = LABELS[match.outcome].format(class_name)
+            return Prediction(label, None, match.score)
+        return Prediction(class_name, match.index, match.score)
 
     def marks(
         self, output: Sequence[Detections], truth: DetectionTruth

@@ -153,45 +153,58 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
     """
     order_names = parse_order(order) if order else ()
     order = " ".join(order_names)
+    _check_no_head_maps(returned)
+    queries = _find_queries(returned, order)
+    if queries is not None:
+        return _split_queries(*queries)
+
+    predictions, channels = _split_off_maps(returned)
+    map_channels = torch.tensor(sorted(channels), dtype=torch.long)
+    is_batch = (
+        isinstance(predictions, Tensor)
+        and predictions.ndim == 3
+        and predictions.shape[0] == count
+        and predictions.shape[2] != 4  # boxes alone
+    )
+    has_mask_rows = is_batch and _has_mask_rows(predictions, channels)
+    # One tensor (N, A, B) is a YOLO grid, unless its rows are six numbers (a box, a
+    # score and a class), with or without mask coefficients.
+    has_six_columns = is_batch and predictions.shape[2] == 6
+    is_rows = bool(order_names) or has_mask_rows or has_six_columns
+    if is_batch and (order in HEAD_ORDERS or not is_rows):
+        return [
+            {"raw": grid.float(), "map_channels": map_channels} for grid in predictions
+        ]
+    if has_mask_rows:
+        rows = read_detections(predictions[..., :6], count, order)
+        return [{**detections, "map_channels": map_channels} for detections in rows]
+    if "objectness" in order_names or "channels" in order_names:
+        # the user stated a YOLO head, and this is no grid
+        raise ValueError(EXPECTED)
+    images = _split_images(predictions, count, order_names)
+    return list(map(_checked_detections, images))
+
+
+def _check_no_head_maps(returned: Any) -> None:
+    """Raise ValueError if all that a detector returned are maps (N, K, h, w): those of
+    a head in training, from which boxes are still to be made.
+    """
     is_sequence = isinstance(returned, (list, tuple)) and len(returned) > 0
     if is_sequence and all(isinstance(x, Tensor) and x.ndim > 3 for x in returned):
         raise ValueError(
             "expected boxes, and not the maps of a head from which they "
             "are made: export it in .eval()"
         )
-    queries = _find_queries(returned, order)
-    if queries is not None:
-        return _split_queries(*queries)
-
-    # One tensor (N, A, B) is a YOLO grid, unless its rows are six numbers (a box, a
-    # score and a class), with or without mask coefficients.
-    returned, channels = _split_off_maps(returned)
-    map_channels = torch.tensor(sorted(channels), dtype=torch.long)
-    is_grid = (
-        isinstance(returned, Tensor)
-        and returned.ndim == 3
-        and returned.shape[0] == count
-        and returned.shape[2] != 4
-    )
-    is_rows_with_masks = is_grid and _has_mask_rows(returned, channels)
-    is_rows = bool(order_names) or is_rows_with_masks
-    if is_grid and (order in HEAD_ORDERS or not (is_rows or returned.shape[2] == 6)):
-        return [
-            {"raw": grid.float(), "map_channels": map_channels} for grid in returned
-        ]
-    if is_rows_with_masks:
-        rows = read_detections(returned[..., :6], count, order)
-        return [{**detections, "map_channels": map_channels} for detections in rows]
-    if "objectness" in order_names or "channels" in order_names:
-        raise ValueError(EXPECTED)
-    return list(map(_checked_detections, _split_images(returned, count, order_names)))
 
 
 def _has_mask_rows(grid: Tensor, channels: Collection[int]) -> bool:
-    """Return whether rows (N, D, k) are a box, a score, a class and mask
-    coefficients.
+    """Return whether rows (N, D, k) are a box, a score, a class and mask coefficients.
+
+    `channels` are the numbers of channels of the feature maps that came with them, one
+    of which is the number of coefficients.
     """
-    if grid.shape[2] - 6 not in channels:
+    n_coefficients = grid.shape[2] - 6
+    if n_coefficients not in channels:
         return False
     class_column = grid[..., 5]
     return bool((class_column == class_column.round()).all())
@@ -272,14 +285,14 @@ def _split_batch_rows(
     names_before: Sequence[str] = ()
     if "batch" in order_names:
         names_before = order_names[: order_names.index("batch")]
-    # each name before takes one column, boxes take four
+    # each name before takes one column, but boxes take four
     batch_column = len(names_before)
     if "boxes" in names_before:
-        batch_column += 3
+        batch_column += 4 - 1
     image_index = rows.detach()[:, batch_column]
     is_index = (
         (image_index == image_index.round())
-        & (image_index >= -1)
+        & (image_index >= -1)  # of padding, which no image gets below
         & (image_index < count)
     )
     if not bool(is_index.all()):
@@ -307,8 +320,9 @@ def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
             return None
         logits = next((tensor for tensor in tensors if tensor is not boxes), None)
         return None if logits is None else (boxes, logits)
-    if order not in ("", *QUERIES):
+    if order not in ("", *QUERIES):  # the user stated another form
         return None
+    # items of a mapping, or attributes of an object
     get = returned.get if isinstance(returned, Mapping) else partial(getattr, returned)
     boxes = get("pred_boxes", None)
     if not isinstance(boxes, Tensor):
@@ -340,8 +354,9 @@ def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
         return returned, set()
     predictions = returned[0]
     rest = returned[1:]
+    is_boxes = predictions.ndim == 3 and predictions.shape[2] == 4
     has_other_tensors = any(isinstance(x, Tensor) and x.ndim < 4 for x in rest)
-    if predictions.ndim != 3 or predictions.shape[2] == 4 or has_other_tensors:
+    if predictions.ndim != 3 or is_boxes or has_other_tensors:
         return returned, set()
     channels = {
         tensor.shape[1]
@@ -471,23 +486,24 @@ def _components_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
         for tensor in tensors
         if tensor is not boxes and tensor.shape[: len(shape)] == shape
     ]
-    if len(rest) == 1 and rest[0].ndim == boxes.ndim:
+    if len(rest) == 1 and rest[0].ndim == boxes.ndim:  # a score of every class
         return {"boxes": boxes, "scores": rest[0]}
-    flat = [_squeeze_last(tensor, shape) for tensor in rest]
-    integer = [tensor for tensor in flat if not tensor.is_floating_point()]
+    # otherwise two numbers for each box, a score and a label
+    numbers = [_squeeze_last(tensor, shape) for tensor in rest]
+    integers = [tensor for tensor in numbers if not tensor.is_floating_point()]
     if (
-        len(flat) != 2
-        or len(integer) == 2
-        or any(tensor.shape != shape for tensor in flat)
+        len(numbers) != 2
+        or len(integers) == 2
+        or any(tensor.shape != shape for tensor in numbers)
     ):
         raise ValueError(EXPECTED)
-    if integer:
-        labels = integer[0]
-        scores = flat[0] if flat[1] is labels else flat[1]
+    if integers:
+        labels = integers[0]
+        scores = numbers[0] if numbers[1] is labels else numbers[1]
         return {"boxes": boxes, "scores": scores, "labels": labels}
     return {
         "boxes": boxes,
-        "either": torch.stack([tensor.to(boxes.dtype) for tensor in flat], dim=-1),
+        "either": torch.stack([tensor.to(boxes.dtype) for tensor in numbers], dim=-1),
     }
 
 
@@ -515,27 +531,23 @@ def _checked_detections(components: Mapping[str, Tensor]) -> Detections:
     boxes = components["boxes"]
     if boxes.numel() == 0:
         boxes = boxes.reshape(-1, 4)
-    rows = [tensor for name, tensor in components.items() if name != "blank"]
+    # "blank" is a count; everything else has a row for each box
+    row_tensors = [tensor for name, tensor in components.items() if name != "blank"]
     if (
         boxes.ndim != 2
         or boxes.shape[1] != 4
-        or any(len(tensor) != len(boxes) for tensor in rows)
+        or any(len(tensor) != len(boxes) for tensor in row_tensors)
     ):
         raise ValueError(EXPECTED)
     boxes = boxes.float()
     if "either" in components:
-        either = components["either"].float()
-        has_scores = (either.detach() > 0.0).all(dim=1)
-        is_padding = are_invalid(boxes.detach()) & ~has_scores
-        return _without_padding(
-            {"boxes": boxes, "either": either}, is_padding, either.detach()
-        )
+        return _remove_padded_pairs(boxes, components["either"].float())
 
     scores, labels = _checked_scores(components)
     values = scores.detach() if labels is None else scores.detach()[:, None]
     has_score = (values > 0.0).any(dim=1)
-    is_marked = (values == -1.0).all(dim=1)
-    is_padding = (are_invalid(boxes.detach()) & ~has_score) | is_marked
+    is_marked_as_padding = (values == -1.0).all(dim=1)
+    is_padding = (are_invalid(boxes.detach()) & ~has_score) | is_marked_as_padding
     if labels is not None:
         is_padding = is_padding | (labels < 0)
     _check_probabilities(values[~is_padding], has_labels=labels is not None)
@@ -546,6 +558,18 @@ def _checked_detections(components: Mapping[str, Tensor]) -> Detections:
     if "blank" in components:
         detections["blank"] = components["blank"]
     return detections
+
+
+def _remove_padded_pairs(boxes: Tensor, either: Tensor) -> Detections:
+    """Return boxes (D, 4) with two numbers each (D, 2), of which it is open which one
+    is the score, without rows of padding.
+
+    Such a row has an invalid box, and one of its numbers is not over 0.
+    """
+    numbers = either.detach()
+    are_positive = (numbers > 0.0).all(dim=1)
+    is_padding = are_invalid(boxes.detach()) & ~are_positive
+    return _without_padding({"boxes": boxes, "either": either}, is_padding, numbers)
 
 
 def _checked_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | None]:
@@ -628,23 +652,47 @@ def resolve_detections(
         if classes is None:
             raise ValueError(EXPECTED)
         order = order or infer_order([detections], classes)
-        if "raw" in detections:
-            boxes, scores = split_grid(detections["raw"], classes, order)
-        else:
-            boxes = detections["boxes"]
-            logits = detections["logits"]
-            if order == QUERIES[1]:
-                scores = logits.softmax(dim=1)[:, :classes]
-            else:
-                scores = logits.sigmoid()
-        return _checked_detections({"boxes": boxes, "scores": scores})
-    if "either" not in detections:
-        return {
-            name: value for name, value in detections.items() if name != "map_channels"
-        }
+        return _checked_detections(_split_by_class_count(detections, classes, order))
+    if "either" in detections:
+        order = order or infer_order([detections], classes)
+        return _resolve_pairs(detections, order)
+    return {name: value for name, value in detections.items() if name != "map_channels"}
 
+
+def _split_by_class_count(
+    detections: Detections, classes: int, order: str
+) -> dict[str, Tensor]:
+    """Return boxes (D, 4) and scores (D, C) of a YOLO grid ("raw") or of DETR logits.
+
+    Args:
+        detections: of one image.
+        classes: number of classes, C.
+        order: of the grid one of `HEADS` with a layout, of logits one of `QUERIES`.
+    """
+    if "raw" in detections:
+        boxes, scores = split_grid(detections["raw"], classes, order)
+        return {"boxes": boxes, "scores": scores}
+    logits = detections["logits"]
+    if order == QUERIES[1]:  # exclusive classes, of which a last one means no object
+        scores = logits.softmax(dim=1)[:, :classes]
+    else:
+        scores = logits.sigmoid()
+    return {"boxes": detections["boxes"], "scores": scores}
+
+
+def _resolve_pairs(detections: Detections, order: str) -> Detections:
+    """Return the detections of an image whose boxes have two numbers each ("either"),
+    with these as scores and labels.
+
+    Args:
+        detections: of one image.
+        order: what the numbers are: one of `ORDERS`, or of `HEADS` with a layout if
+            both are scores; "" if that is unknown.
+
+    Raises:
+        ValueError: the order is unknown, and there are boxes that count.
+    """
     either = detections["either"]
-    order = order or infer_order([detections], classes)
     has_values = are_counted(detections) | either.isnan().any(dim=1)
     if not order and not bool(has_values.any()):
         order = ORDERS[0]  # any order will do
@@ -763,9 +811,9 @@ def _order_of_pairs(
     max_classes = math.inf if classes is None else classes
     are_classes = [_may_be_classes(column, max_classes) for column in columns]
     are_scores = [_may_be_scores(column) for column in columns]
-    scores_first = are_scores[0] and are_classes[1]
-    labels_first = are_scores[1] and are_classes[0]
-    if not scores_first and not labels_first:
+    may_have_scores_first = are_scores[0] and are_classes[1]
+    may_have_labels_first = are_scores[1] and are_classes[0]
+    if not may_have_scores_first and not may_have_labels_first:
         has_integers = any(bool((x == x.round()).all()) for x in columns)
         if all(are_scores) and not has_integers and classes in (1, 2):
             scores_head, objectness_head = HEADS
@@ -778,12 +826,12 @@ def _order_of_pairs(
             "expected for each box a score in [0, 1] and the number of a "
             "class, got other numbers"
         )
-    if scores_first and labels_first:
-        scores_first = _is_falling(pairs_of_images, 0)
-        labels_first = _is_falling(pairs_of_images, 1)
-    if scores_first == labels_first:
-        return ""
-    return ORDERS[0] if scores_first else ORDERS[1]
+    if may_have_scores_first and may_have_labels_first:
+        may_have_scores_first = _is_falling(pairs_of_images, column=0)
+        may_have_labels_first = _is_falling(pairs_of_images, column=1)
+    if may_have_scores_first == may_have_labels_first:
+        return ""  # it is open
+    return ORDERS[0] if may_have_scores_first else ORDERS[1]
 
 
 def _collect_pairs(detections_of_images: Sequence[Detections]) -> list[Tensor]:
@@ -849,10 +897,8 @@ def find_head_orders(
         for head, first_score in HEADS.items():
             name = f"{head} {layout}"
             # channels that are left over have to be mask coefficients
-            n_masks = n_channels - first_score - classes
-            if order not in ("", head, name) or (
-                n_masks and n_masks not in map_channels
-            ):
+            n_left_over = n_channels - first_score - classes
+            if order not in ("", head, name) or n_left_over not in (0, *map_channels):
                 continue
             scores = split_grid(returned, classes, name, multiply_objectness=False)[
                 1
@@ -861,6 +907,7 @@ def find_head_orders(
             if not bool((is_outside & scores.isfinite()).any()):
                 orders.append(name)
             elif name == _WITH_ANGLE and not bool(is_outside[:, :-1].any()):
+                # only the last channel is outside: an angle
                 problem = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
             elif not problem:
                 problem = (
@@ -878,25 +925,35 @@ def find_head_orders(
         return tuple(orders)
     if problem:
         raise ValueError(f"it has {problem}")
-    n_channels = min(returned.shape)
-    is_channels_last = returned.shape[0] >= returned.shape[1]
+    raise _make_channel_error((returned.shape[0], returned.shape[1]), classes)
+
+
+def _make_channel_error(shape: tuple[int, int], classes: int) -> ValueError:
+    """Return the error about an output (A, B) of one image whose number of channels
+    fits no head; the smaller of the two sizes is taken for it.
+    """
+    n_channels = min(shape)
+    is_channels_last = shape[0] >= shape[1]
     advice = _advise_on_channels(n_channels, classes, may_be_rows=is_channels_last)
     noun = "classes" if classes > 1 else "class"
-    raise ValueError(
+    return ValueError(
         f"expected 4 + {classes} or 5 + {classes} numbers of a box for "
         f"{classes} {noun}, got {n_channels}{advice}"
     )
 
 
 def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> str:
-    """Return what to do about an output whose number of channels does not fit.
+    """Return what to do about an output whose number of channels does not fit, by what
+    the channels beyond boxes and scores seem to be; it follows on a message.
 
     Args:
         n_channels: of a box.
         classes: number of classes.
         may_be_rows: whether boxes are rows, which may begin with six numbers.
     """
-    excess_channels = {n_channels - 4 - classes, n_channels - 6 if may_be_rows else 0}
+    excess_channels = {n_channels - 4 - classes}
+    if may_be_rows:
+        excess_channels.add(n_channels - 6)
     fitting = [
         f"`labels={name}`"
         for first_score in HEADS.values()
@@ -904,6 +961,7 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
     ]
     if fitting:
         return f"; {' or '.join(fitting)} would fit"
+    # OBB heads have 1 channel more, YOLO's masks 32, and keypoints 3 each
     if 1 in excess_channels:
         return f", as OBB heads (oriented boxes, with an angle) have it, {_UNREAD}"
     if 32 in excess_channels:

@@ -113,6 +113,7 @@ class Rig(tasks.JointTask):
 
     def truth(self, facts: tasks.Facts) -> tasks.Truths:
         """Return the truth of each image."""
+        # without views, all cameras have the same facts
         views = facts.views or (facts,) * self.cameras
         return tuple(self.part.truth(view) for view in views)
 
@@ -156,13 +157,15 @@ class Rig(tasks.JointTask):
         if self.rule == "mean":
             return values.mean(dim=1)
         n_images = values.shape[1]
+        # index of the loss that decides; with `vote`, of an even number of images, the
+        # upper of the two in the middle: more than half have to be right
         rank = {"any": 0, "all": n_images - 1, "vote": n_images // 2}[self.rule]
         return values.sort(dim=1).values[:, rank]
 
     def predictions(
         self, output: Sequence[tasks.Outputs], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
-        """Return the joint prediction of the images of each rig."""
+        """Return a single prediction for each rig: those about its images, joined."""
         predictions_of_rigs: list[tuple[tasks.Prediction, ...]] = []
         for image_outputs in output:
             predictions = [
@@ -199,14 +202,16 @@ class Rig(tasks.JointTask):
             prediction = tasks.join_predictions(
                 judgement.prediction for judgement in judgements
             )
-            outcome = tasks.make_outcome_payload(self._deciding(judgements, margin))
+            outcome = tasks.make_outcome_payload(
+                self._find_deciding_judgement(judgements, margin)
+            )
             payload = {"pictures": image_payloads, **outcome}
             rig_judgements.append(
                 tasks.Judgement.of(score, margin, prediction, payload)
             )
         return rig_judgements
 
-    def _deciding(
+    def _find_deciding_judgement(
         self, judgements: Sequence[tasks.Judgement], margin: float
     ) -> tasks.Judgement:
         """Return the judgement that decides by the rule; for the mean, the worst

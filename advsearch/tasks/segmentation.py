@@ -90,7 +90,7 @@ class Segmentation(tasks.ClassTask):
             not isinstance(returned, Tensor)
             or returned.ndim != 4
             or len(returned) != count
-            or returned.shape[1] < 2
+            or returned.shape[1] < 2  # no prediction could be wrong
         ):
             raise ValueError(EXPECTED)
         return returned.float()
@@ -179,7 +179,8 @@ class Segmentation(tasks.ClassTask):
         """
         mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
         selected = output.permute(0, 2, 3, 1)[:, mask]
-        return selected.reshape(-1, output.shape[1]) if selected.shape[1] else None
+        is_out_of_view = selected.shape[1] == 0
+        return None if is_out_of_view else selected.reshape(-1, output.shape[1])
 
     def predictions(
         self, output: Tensor, count: int = 1
@@ -189,6 +190,7 @@ class Segmentation(tasks.ClassTask):
         """
         predictions_of_images = []
         for logits in output.detach():
+            # minus infinity is a class that is excluded
             is_number = (logits.isfinite() | (logits == -math.inf)).all(dim=0)
             class_of_pixel = logits[:, is_number].argmax(dim=0)
             n_classes = len(logits)
@@ -205,7 +207,7 @@ class Segmentation(tasks.ClassTask):
                 )
                 if class_count
             )
-            if not predictions:
+            if not predictions:  # only classes that stand for nothing, or only NaN
                 label = "nothing" if len(class_of_pixel) else tasks.NOT_A_NUMBER
                 predictions = (tasks.Prediction(label),)
             predictions_of_images.append(predictions)
@@ -279,8 +281,10 @@ class Segmentation(tasks.ClassTask):
         """
         is_right_class = torch.zeros_like(counts, dtype=torch.bool)
         is_right_class[list(truth.labels)] = True
-        # the most frequent right class, or else the most frequent wrong one
-        top_class = int(counts.masked_fill(is_right_class != is_right, -1).argmax())
+        # the most frequent right class if the object is right, else the most frequent
+        # wrong one; the other classes are left out by a count of -1
+        is_other_kind = is_right_class != is_right
+        top_class = int(counts.masked_fill(is_other_kind, -1).argmax())
         if is_right or top_class not in self.nothing_classes:
             prediction = tasks.Prediction(
                 self.get_class_name(top_class), top_class, accuracy

@@ -392,7 +392,7 @@ class Similarity(tasks.Classification):
         Raises:
             ValueError: there are none.
         """
-        is_tuple = type(returned) in (tuple, list) and returned
+        is_tuple = type(returned) in (tuple, list) and returned  # no named tuple
         features = models.pooled(returned[0] if is_tuple else returned, token=True)
         if features is None or features.dim() != 2 or features.shape[0] != count:
             raise ValueError(
@@ -411,6 +411,7 @@ class Similarity(tasks.Classification):
                     "picture that it was shown first"
                 )
             cosine = features @ self.clean.to(features)
+            # class 0, the clean thing, wins where the cosine exceeds the threshold
             threshold = torch.full_like(cosine, self.threshold)
             return torch.stack([cosine, threshold], dim=1) / TEMPERATURE
         if self.method == "linear":
@@ -419,11 +420,11 @@ class Similarity(tasks.Classification):
             return functional.linear(
                 features, weights.to(features), biases.to(features)
             )
-        cosines = self.gallery.compute_cosines(features)
-        owners = self.gallery.name_index.to(features.device)
+        cosines = self.gallery.compute_cosines(features)  # (N, R)
+        name_of_image = self.gallery.name_index.to(features.device)
         name_scores = []
         for name_index in range(len(self.gallery.names)):
-            name_cosines = cosines[:, owners == name_index]
+            name_cosines = cosines[:, name_of_image == name_index]
             k = min(self.k, name_cosines.shape[1])
             name_scores.append(name_cosines.topk(k, dim=1).values.mean(dim=1))
         return torch.stack(name_scores, dim=1) / TEMPERATURE

@@ -127,7 +127,7 @@ class JointTask(Task):
 
     def truth_names(self, truth: Any) -> tuple[str, ...]:
         truths = truth.values() if isinstance(truth, Mapping) else truth
-        # A single judge is repeated for all truths.
+        # A single judge is repeated for all truths; several have one each.
         judged_truths = zip(cycle(self.judges), truths, strict=False)
         return _distinct(judge.truth_names(value) for judge, value in judged_truths)
 
@@ -229,7 +229,7 @@ class EnsembleTask(JointTask):
         self, output: Sequence[Outputs], truth: Truths | None
     ) -> EnsembleTask:
         """See `Task.after_calibration`: each task gets the output of its model."""
-        truths = truth or [None] * len(self.tasks)
+        truths = truth or [None] * len(self.tasks)  # unknown for each task
         tasks = tuple(
             task.after_calibration(model_output, task_truth)
             for task, model_output, task_truth in zip(
@@ -268,7 +268,7 @@ class EnsembleTask(JointTask):
     def predictions(
         self, output: Sequence[Outputs], count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """Return the joint prediction of the models about each image."""
+        """Return a single prediction for each image: those of the models, joined."""
         predictions_of_models = [
             task.predictions(model_output)
             for task, model_output in zip(
@@ -425,6 +425,7 @@ class EachThingTask(JointTask):
                 for name, judgement in by_name.items()
                 if judgement.prediction.label != OUT_OF_VIEW
             ]
+            # of all things if none is visible
             worst = min(visible or by_name, key=lambda name: by_name[name].margin)
             worst_payload = by_name[worst].payload
             payload: dict[str, JsonValue] = {
@@ -448,6 +449,7 @@ class EachThingTask(JointTask):
         ]
         marks_of_images = []
         for image_marks in zip(*marks_of_things, strict=True):
+            # the predictions are the same whichever thing is judged
             marks = [mark for thing in image_marks for mark in thing if mark.true]
             marks += [mark for mark in image_marks[0] if not mark.true]
             marks_of_images.append(marks)

@@ -58,7 +58,8 @@ def find_reachable_address(host: str) -> str:
         remote = "2001:db8::1"
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            probe.connect((remote, 9))  # chooses an address; nothing is sent
+            # chooses an address of this machine; nothing is sent, whatever the port
+            probe.connect((remote, 9))
             return str(probe.getsockname()[0])
     except OSError:
         return "::1" if host == "::" else "127.0.0.1"
@@ -159,7 +160,7 @@ class ConnectionPool:
         """
         # address, and since when it is silent, by connection
         silent: dict[Any, tuple[Any, float]] = {}
-        listens = False
+        listens = False  # whether new connections are accepted at present
         while not self._closed.is_set():
             # with too many connections, new ones wait in the system's queue
             has_room = len(silent) + self._ready.qsize() < MAX_WAITING
@@ -180,13 +181,11 @@ class ConnectionPool:
                     self._ready.put((connection, silent.pop(connection)[0]))
             now = time.monotonic()
             # silent clients have less time where others wait
-            patience = (
-                REQUEST_SECONDS
-                if has_room
-                else min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
-            )
-            for connection, (_, since) in list(silent.items()):
-                if now - since > patience:
+            patience = REQUEST_SECONDS
+            if not has_room:
+                patience = min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
+            for connection, (_, silent_since) in list(silent.items()):
+                if now - silent_since > patience:
                     del silent[connection]
                     selector.unregister(connection)
                     connection.close()
@@ -203,15 +202,17 @@ class ConnectionPool:
         clients = sorted(
             self._connections.copy().values(), key=lambda client: client.since
         )
-        # as long as a worker is free, nobody has to go
-        n_waiting = self._ready.qsize() if len(clients) == N_WORKERS else 0
+        n_waiting = 0  # as long as a worker is free, nobody has to go
+        if len(clients) == N_WORKERS:
+            n_waiting = self._ready.qsize()
         for client in clients:
             makes_room = n_waiting > 0 and now - client.since > SLOW_CLIENT_SECONDS
             if client.due < now or makes_room:
                 n_waiting -= 1
                 client.since = math.inf
                 client.due = math.inf
-                # not the method of an SSL socket, which would forget that it is one
+                # The worker's next read or write ends then. (The plain method: that of
+                # an SSL socket would forget that it is one.)
                 with suppress(OSError):
                     socket.socket.shutdown(client.connection, socket.SHUT_RDWR)
 

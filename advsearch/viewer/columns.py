@@ -143,10 +143,10 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
         boxes.add(payload)
         values = list[float]()
         for box in (payload["box"], best_box):
-            for corner in box or [None] * 4:
+            for corner in box or [None] * 4:  # no box: four NaN
                 values.append(math.nan if corner is None else float(corner))
         corners = dict(zip(CORNERS, values, strict=True))
-    # for every row, also one without boxes
+    # an end for every row, also one without boxes
     boxes.ends.append(len(boxes.values) // VALUES_PER_BOX)
     return corners
 
@@ -173,6 +173,7 @@ def pack_columns(
     parameter_columns, parameters = _parameter_columns(rows)
     columns |= parameter_columns
     columns |= _box_columns(rows)
+    # the largest values first, so that all are aligned
     arrays = sorted(columns.items(), key=lambda item: -item[1].itemsize)
 
     layout = _make_layout(arrays)
@@ -189,7 +190,7 @@ def pack_columns(
         "columns": layout,
     }
     head_data = json.dumps(head).encode()
-    head_data += b" " * (-len(head_data) % 4)
+    head_data += b" " * (-len(head_data) % 4)  # up to a multiple of 4 bytes
     data = [
         values.astype(values.dtype.newbyteorder("<")).tobytes() for _, values in arrays
     ]
@@ -289,9 +290,15 @@ def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _encode_levels(column: pd.Series) -> tuple[Any, list[str]]:
-    """Encode a column of names: return the index (n,) uint16 of each, and the names."""
+    """Encode a column of names: return the index (n,) uint16 of each, and the names.
+
+    Names beyond `MAX_LEVELS` share the last one, "others". A column without any name
+    has the index 0 throughout.
+    """
     names = column.cat.categories.tolist() if column.dtype == "category" else []
+    if not names:
+        return np.zeros(len(column), np.uint16), names
     if len(names) >= MAX_LEVELS:
         names = [*names[: MAX_LEVELS - 1], "others"]
-    indices = column.cat.codes.to_numpy() if names else np.zeros(len(column))
-    return np.minimum(indices, max(len(names) - 1, 0)).astype(np.uint16), names
+    indices = np.minimum(column.cat.codes.to_numpy(), len(names) - 1)
+    return indices.astype(np.uint16), names

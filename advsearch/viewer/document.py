@@ -66,6 +66,7 @@ def make_document(
         footer: a sentence at the end, by default the title.
     """
     code = _join_scripts(scripts)
+    # the policy lets no other script run
     digests = [pages.compute_script_digest(code.encode())] if code else []
     policy = pages.make_page_policy(digests, connects=connects)
     head = make_element(
@@ -81,6 +82,7 @@ def make_document(
         ),
         make_element("meta", name="color-scheme", content="light dark"),
         make_element("title", f"{title} - advsearch"),
+        # an empty icon, or browsers would ask the server for one
         make_element("link", rel="icon", href="data:,"),
         make_element(
             "style", Html(f"\n{read_asset('document.css')}{read_asset('viewer.css')}")
@@ -147,7 +149,7 @@ def make_data_script(value: object, name: str) -> Html:
 
 
 def make_data_url(data: bytes, media_type: str) -> str:
-    """Return bytes as a data URL; `media_type` is a media type."""
+    """Return bytes as a data URL, of a media type such as ``image/png``."""
     return f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
 
 
@@ -270,6 +272,7 @@ def make_table(
 def _cell_class(text: str, share: float | None) -> str:
     """Return the CSS classes of a cell, which may have the color of a fraction."""
     if share is not None:
+        # the style sheet has eleven colors, share-0 to share-10
         return f"number share share-{round(10 * share)}"
     return "number" if len(text) <= MAX_CELL_LENGTH else "long"
 

@@ -95,7 +95,7 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
     content = list[Html | None]()
     if part.draw is not None:
         alt = " ".join([f"{part.title}.", *(part.text or [description])])
-        # the style of the page shows the one that fits the window
+        # a wide one and a narrow one: the style of the page shows what fits the window
         charts = [
             views.make_chart_svg(part.draw, alt, width, part.height)
             for width in (views.WIDE_WIDTH, views.NARROW_WIDTH)
@@ -124,9 +124,9 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
     figures = []
     for picture in group:
         is_png = picture.file.lower().endswith(".png")
-        file = find_image(
-            run, picture.file, MAX_PNG_BYTES if is_png else MAX_FIGURE_BYTES
-        )
+        # a PNG is scaled down, so that it may be larger
+        max_bytes = MAX_PNG_BYTES if is_png else MAX_FIGURE_BYTES
+        file = find_image(run, picture.file, max_bytes)
         if file is None:
             continue
         data = file.read_bytes()
@@ -144,7 +144,7 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
         figures.append(make_element("figure", image, caption))
     if not figures:
         return None
-    if not layout and len(figures) < 3:
+    if not layout and len(figures) <= 2:
         layout = "pair"
     return make_element("div", *figures, class_=f"pictures {layout}".strip())
 
@@ -181,6 +181,7 @@ def make_end(run: Path, result: Result, view: ShownResult) -> Html:
             make_element("pre", resume, class_="wrap"),
         ]
     config_file = run / CONFIG
+    # names of settings that were given from Python and no file can hold
     python_only = getattr(result, "python_only", [])
     repeat = ""
     if python_only:
@@ -249,7 +250,7 @@ def _read_header(data: bytes) -> dict[str, dict[str, object]]:
         magic, _, _, length, kind = struct.unpack_from("<4sII I4s", data)
         if (magic, kind) != (b"glTF", b"JSON"):
             return {}
-        header = json.loads(data[20 : 20 + length])
+        header = json.loads(data[20 : 20 + length])  # behind these 20 bytes
     except (struct.error, ValueError, RecursionError):
         return {}
     if not isinstance(header, dict) or not isinstance(header.get("asset"), dict):

@@ -94,35 +94,34 @@ def make_list_page(runs: Mapping[str, Path]) -> str:
     listed.sort(key=lambda item: item[1].when or 0.0, reverse=True)
     # a single sweep has nothing to be compared with
     can_compare = sum(run.command == "sweep" for _, run in listed) > 1
-    heads = ["picture", "run", "what came out", "begun"]
+    button = None
     if can_compare:
-        heads.insert(0, "side by side")
-    rows = [_run_row(name, run, can_compare) for name, run in listed]
-    head = make_element(
-        "tr", *(make_element("th", text, scope="col") for text in heads)
-    )
-    table = make_element(
-        "table",
-        make_element("thead", head),
-        make_element("tbody", *rows),
-        class_="runs",
-    )
-    button = make_element(
-        "p",
-        make_element("button", "Show the chosen sweeps side by side", type="submit"),
-    )
+        text = "Show the chosen sweeps side by side"
+        button = make_element("p", make_element("button", text, type="submit"))
     content = make_element(
         "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
     )
     if listed:
-        content = make_element(
-            "form",
-            make_scrollable(table),
-            button if can_compare else None,
-            action="compare/",
-        )
+        table = make_scrollable(_runs_table(listed, can_compare))
+        content = make_element("form", table, button, action="compare/")
     title = make_element("header", make_element("h1", "Runs"))
     return make_document("Runs", title, make_element("main", content), connects=True)
+
+
+def _runs_table(
+    listed: Sequence[tuple[str, listing.ListedRun]], can_compare: bool
+) -> Html:
+    """Return the table of runs with their names, in their order.
+
+    With `can_compare` a first column has boxes to choose sweeps.
+    """
+    heads = ["picture", "run", "what came out", "begun"]
+    if can_compare:
+        heads.insert(0, "side by side")
+    column_heads = (make_element("th", text, scope="col") for text in heads)
+    head = make_element("thead", make_element("tr", *column_heads))
+    rows = [_run_row(name, run, can_compare) for name, run in listed]
+    return make_element("table", head, make_element("tbody", *rows), class_="runs")
 
 
 def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
@@ -130,27 +129,9 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
     address = f"runs/{quote_name(name)}/"
     cells = []
     if can_compare:
-        checkbox = None
-        if run.command == "sweep":
-            checkbox = make_element(
-                "input",
-                type="checkbox",
-                name="run",
-                value=name,
-                aria_label=f"compare {name}",
-            )
+        checkbox = _comparison_checkbox(name) if run.command == "sweep" else None
         cells.append(make_element("td", checkbox))
-    cover_image = make_element(
-        "img", src=f"{address}cover", alt="", loading="lazy", width="72", height="72"
-    )
-    cover_link = make_element(
-        "a",
-        None if run.fault else cover_image,
-        href=address,
-        tabindex="-1",
-        aria_hidden="true",
-    )
-    cells.append(make_element("td", cover_link))
+    cells.append(make_element("td", _cover_link(run, address)))
     cells.append(
         make_element(
             "th",
@@ -167,6 +148,35 @@ def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
         start = time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))
     cells.append(make_element("td", start, class_="number"))
     return make_element("tr", *cells)
+
+
+def _comparison_checkbox(name: str) -> Html:
+    """Return the box by which a sweep is chosen to be shown beside others."""
+    return make_element(
+        "input",
+        type="checkbox",
+        name="run",
+        value=name,
+        aria_label=f"compare {name}",
+    )
+
+
+def _cover_link(run: listing.ListedRun, address: str) -> Html:
+    """Return the small image of a run as a link to its page.
+
+    The name beside it is a link too, so that keys and screen readers skip this one. A
+    run that cannot be read has no image.
+    """
+    image = make_element(
+        "img", src=f"{address}cover", alt="", loading="lazy", width="72", height="72"
+    )
+    return make_element(
+        "a",
+        None if run.fault else image,
+        href=address,
+        tabindex="-1",
+        aria_hidden="true",
+    )
 
 
 def _run_subject(name: str, run: listing.ListedRun, address: str) -> Html:
@@ -278,6 +288,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
             for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
                 rows.append(_row_json(row))
                 last = row.id or after
+            # those of the search alone, which the page draws
             for number, picture in results.iterate_images("search", after, last):
                 jpeg = make_thumbnail(picture.astype("float32") / 255.0)
                 url = make_data_url(jpeg, "image/jpeg")
@@ -363,6 +374,19 @@ class PhotographServer(Protocol):
         """
 
 
+def _name_runs(paths: Sequence[Path]) -> dict[str, Path]:
+    """Return directories of runs by name; further runs of one name get numbers."""
+    path_of_name: dict[str, Path] = {}
+    for path in paths:
+        name = path.resolve().name
+        number = 2
+        while name in path_of_name:
+            name = f"{path.resolve().name} ({number})"
+            number = number + 1
+        path_of_name[name] = path
+    return path_of_name
+
+
 class Dashboard(HTTPServer):
     """The server of runs, by default of those in ``runs/``, looked up at each request.
 
@@ -397,14 +421,7 @@ class Dashboard(HTTPServer):
         Beyond this machine pages are encrypted and need a token. Runs of one name in
         different folders get numbers.
         """
-        self._explicit_runs: dict[str, Path] = {}
-        for path in runs:
-            name = path.resolve().name
-            number = 2
-            while name in self._explicit_runs:
-                name = f"{path.resolve().name} ({number})"
-                number = number + 1
-            self._explicit_runs[name] = path
+        self._explicit_runs = _name_runs(runs)
         self.token = None if is_local(host) else secrets.token_urlsafe(24)
         self._secret = secrets.token_bytes(32)
         self.photographs = photographs
@@ -586,6 +603,7 @@ class _Handler(BaseHTTPRequestHandler):
         query = parse_qs(address.query, errors="surrogateescape")
         headers = {}
         if self.server.token and "token" in query:
+            # later requests of this browser have the token as a cookie
             headers["Set-Cookie"] = make_token_cookie(
                 self.server.server_port, self.server.token
             )
@@ -652,33 +670,35 @@ class _Handler(BaseHTTPRequestHandler):
         stored page of a run that has ended.
         """
         run = self.server.find_run(name)
+        home = "../../"  # from runs/NAME/
         if listing.read_listed_run(run, counts=False).command == "sweep":
             page = make_sweep_page(
-                [(run, load_sweep_result(run))], [_make_source(name, run, "")]
+                [(run, load_sweep_result(run))], [_make_source(name, run, base="")]
             )
-            return _serve_page(page, "../../")
+            return _serve_page(page, home)
         if is_unfinished(run):
-            return _serve_page(make_progress_page(name, run), "../../")
-        return _serve_stored_page(run, "../../")
+            return _serve_page(make_progress_page(name, run), home)
+        return _serve_stored_page(run, home)
 
     def _serve_part(self, name: str, part: str) -> Response:
         """Return the stored page of a part of a run, such as an attack of a study."""
         # compared to names that exist, since the name comes from a request
         for path in (self.server.find_run(name) / PARTS).iterdir():
-            if path.name == part:
-                if (path / REPORT).is_file():
-                    return _serve_stored_page(path, "../../../../", ("../../", name))
-                break
+            if path.name == part and (path / REPORT).is_file():
+                # from runs/NAME/parts/PART/
+                return _serve_stored_page(
+                    path, home="../../../../", above=("../../", name)
+                )
         raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such attack")
 
     def _serve_photograph_page(self, name: str) -> Response:
         """Return the page on which photographs are aligned with a run's renderings."""
         run = self.server.find_run(name)
-        elsewhere = None
-        if self.server.token:
-            elsewhere = self.server.make_url(f"/runs/{quote_name(name)}/align/")
+        other_device_url = None
+        if self.server.token:  # other machines can reach this server
+            other_device_url = self.server.make_url(f"/runs/{quote_name(name)}/align/")
         page = self.server.photograph_pages.make_page(
-            run, name, self.server.make_key(name), elsewhere
+            run, name, self.server.make_key(name), other_device_url
         )
         return _serve_page(page, "../../../", ("../", name))
 
@@ -836,7 +856,8 @@ def _add_navigation(
     """
     links = [("All runs", home)]
     if above:
-        links.append((above[1], above[0]))
+        parent_address, parent_name = above
+        links.append((parent_name, parent_address))
     anchors = (make_element("a", text, href=address) for text, address in links)
     navigation = join_html(
         make_element("nav", *anchors, aria_label="back"),

@@ -177,7 +177,7 @@ class Thumbnails:
             number = int(step) // self.configurations_per_image
             if number not in remaining:
                 continue
-            remaining.discard(number)
+            remaining.discard(number)  # once, whichever of its rows comes first
             data = read_thumbnail(self.run, number)
             # base64 makes 4 letters of 3 bytes
             n_bytes += len(data) * 4 // 3
@@ -192,8 +192,11 @@ def find_thumbnails(run: Path) -> Thumbnails | None:
     if next(_list_numbers(run), None) is None:
         return None
     settings = read_yaml(run / CONFIG) if (run / CONFIG).is_file() else {}
-    models = len(split_names(str(settings.get("model", "one"))))
-    return Thumbnails(run, models, settings.get("keep_pictures") != "all")
+    # every model predicts each image, so that so many configurations share one; without
+    # the setting there is a single model
+    model_names = split_names(str(settings.get("model", "default")))
+    is_subset = settings.get("keep_pictures") != "all"
+    return Thumbnails(run, len(model_names), is_subset)
 
 
 def _list_numbers(run: Path) -> Iterator[int]:

@@ -83,7 +83,8 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
         options["policy"] = _make_nested_policy(options["policy"], f"policy of {name}")
     if "policies" in options:
         specs = options["policies"]
-        specs = specs if isinstance(specs, (list, tuple)) else [specs]
+        if not isinstance(specs, (list, tuple)):  # a single policy
+            specs = [specs]
         options["policies"] = tuple(
             _make_nested_policy(spec, f"policies of {name}") for spec in specs
         )

@@ -97,8 +97,12 @@ class ArchiveState:
         """Return offspring (n, d) of the archive, which may be out of bounds.
 
         Each has two parents: numbers are those of the first plus noise and a random
-        step along the line to the second; options are those of the first, or with
-        probability `RESAMPLED_FRACTION` of the samples (n, d).
+        step along the line to the second; options are those of the first, or, with
+        probability `RESAMPLED_FRACTION`, those of a sample.
+
+        Args:
+            samples: (n, d) configurations that are sampled anew.
+            rng: of the noise, the steps and what is sampled anew.
         """
         count, dim = samples.shape
         first, second = self._sample_parents(count)
@@ -119,7 +123,8 @@ class ArchiveState:
     def _sample_parents(self, count: int) -> tuple[Tensor, Tensor]:
         """Return two parents (count, d) of each offspring.
 
-        The first is the best of `TOURNAMENT` elites, the second any elite.
+        Both are elites, the stored configurations of cells: the first is the best of
+        `TOURNAMENT` sampled ones, the second any.
         """
         # Sampling changes the generator of an archive.
         archive = copy.deepcopy(self.archive)
@@ -136,27 +141,31 @@ class ArchiveState:
     ) -> Tensor:
         """Return the `count` most promising of the candidates `points` (n, d).
 
-        The promise of a candidate is the probability that it exceeds the objective to
-        beat in its cell; in a cell that fails already it counts `IMPROVEMENT_WEIGHT`
-        times. The best of each cell come first, then the rest.
+        The promise of a candidate is the probability, by the surrogate, that it exceeds
+        the objective to beat in its cell; in a cell that fails already it counts
+        `IMPROVEMENT_WEIGHT` times. The best of each cell come first, then the rest.
         """
         mean, deviation = surrogate.predict(surrogate.box.from_configuration(points))
-        objective_of_cell, threshold = self._find_objectives_to_beat()
+        failed_objective_of_cell, threshold = self._find_objectives_to_beat()
         measures = points[:, self.measure_indices].double().numpy()
         cells = self.archive.index_of(measures).tolist()
         to_beat = torch.tensor(
-            [objective_of_cell.get(cell, threshold) for cell in cells]
+            [failed_objective_of_cell.get(cell, threshold) for cell in cells]
         )
         weight = torch.tensor(
-            [IMPROVEMENT_WEIGHT if cell in objective_of_cell else 1.0 for cell in cells]
+            [
+                IMPROVEMENT_WEIGHT if cell in failed_objective_of_cell else 1.0
+                for cell in cells
+            ]
         )
+        # (mean - to_beat) / deviation is normal under the surrogate
         promise = weight * torch.special.ndtr((mean - to_beat) / deviation)
         order = promise.argsort(descending=True, stable=True).tolist()
         return points[_order_by_cell(order, cells)[:count]]
 
     def _find_objectives_to_beat(self) -> tuple[dict[int, float], float]:
-        """Return the objectives of the cells that fail, by index, and the one to beat
-        in the other cells.
+        """Return the objectives to beat: those of the cells that fail, by index of the
+        cell, and a single one for all other cells.
 
         The latter is the smallest objective of a failure; without any failure, the
         largest objective.
@@ -175,7 +184,12 @@ class ArchiveState:
 
 
 def _order_by_cell(order: list[int], cells: list[int]) -> list[int]:
-    """Return the order with the first candidate of each cell before all others."""
+    """Return the order with the first candidate of each cell before all others.
+
+    Args:
+        order: indices of the candidates, the best first.
+        cells: index of the cell of each candidate.
+    """
     first_of_cell = dict[int, int]()
     for index in order:
         first_of_cell.setdefault(cells[index], index)
@@ -229,6 +243,44 @@ def _make_candidates(
     ]
     x = box.normalize((offspring - box.low) / box.width)
     return box.to_configuration(offspring, x)
+
+
+def _make_archive(
+    domain: policies.Domain, measure_indices: Tensor, dims: Sequence[int], seed: int
+) -> Any:
+    """Return an empty archive of ribs: a grid over the ranges of some parameters.
+
+    Args:
+        domain: of the search.
+        measure_indices: (k,) indices in u of the parameters.
+        dims: number of cells along the axis of each.
+        seed: of the search.
+    """
+    from ribs import archives  # an extra, and it takes seconds
+
+    lower = domain.lower[measure_indices].tolist()
+    upper = domain.upper[measure_indices].tolist()
+    return archives.GridArchive(
+        solution_dim=domain.dim,
+        dims=dims,
+        seed=seeds.stream(seed, "archive"),
+        ranges=list(zip(lower, upper, strict=True)),
+        solution_dtype=np.float32,
+        objective_dtype=np.float64,
+        measures_dtype=np.float64,
+        extra_fields={"wrong": ((), np.bool_)},
+    )
+
+
+def _make_observations(domain: policies.Domain) -> policies.Observations | None:
+    """Return what a surrogate is fitted to, without a point yet; None if the domain has
+    norm balls, or too many numbers for a surrogate.
+    """
+    box = policies.find_box_coordinates(domain)
+    has_norm_balls = box.count < domain.dim
+    if has_norm_balls or domain.dim > policies.MAX_SCALED_DIM:
+        return None
+    return policies.Observations(box, torch.empty(0, box.count), memory=MEMORY)
 
 
 @dataclass(frozen=True)
@@ -305,52 +357,28 @@ class MapElites(Policy[ArchiveState]):
         measure_indices = self._find_measure_indices(domain)
         # number of cells along each axis
         dims = [
-            options or self.cells
-            for options in domain.options[measure_indices].tolist()
+            n_options or self.cells  # 0 options: a number, whose range is divided
+            for n_options in domain.options[measure_indices].tolist()
         ]
         if math.prod(dims) > MAX_CELLS:
             raise InputError(
                 f"cells: expected at most {MAX_CELLS} in all, got "
                 f"{math.prod(dims)}; set `cells` lower"
             )
-        from ribs import archives  # an extra, and it takes seconds
-
-        archive = archives.GridArchive(
-            solution_dim=domain.dim,
-            dims=dims,
-            seed=seeds.stream(seed, "archive"),
-            ranges=list(
-                zip(
-                    domain.lower[measure_indices].tolist(),
-                    domain.upper[measure_indices].tolist(),
-                    strict=True,
-                )
-            ),
-            solution_dtype=np.float32,
-            objective_dtype=np.float64,
-            measures_dtype=np.float64,
-            extra_fields={"wrong": ((), np.bool_)},
-        )
+        archive = _make_archive(domain, measure_indices, dims, seed)
         first_points = [
             domain.initial_point[None],
             domain.sample(policies.seeded(seed, 0), self.population - 1),
         ]
-        box = policies.find_box_coordinates(domain)
-        is_low_dimensional = box.count == domain.dim <= policies.MAX_SCALED_DIM
-        observations = (
-            policies.Observations(box, torch.empty(0, box.count), memory=MEMORY)
-            if is_low_dimensional
-            else None
-        )
         return ArchiveState(
             domain,
             seed,
             measure_indices,
             policies.compute_half_widths(domain),
             archive,
-            0,
-            torch.cat(first_points),
-            observations=observations,
+            generation=0,
+            points=torch.cat(first_points),
+            observations=_make_observations(domain),
         )
 
     def propose(
@@ -394,6 +422,7 @@ class MapElites(Policy[ArchiveState]):
         is_periodic = policies.find_periodic(state.domain)[state.measure_indices]
         is_discrete = state.domain.options[state.measure_indices] > 0
         diverse_indices = policies.select_diverse(
+            # position of each cell in the grid, in fractions of each axis
             torch.from_numpy(grid_indices / archive.dims),
             objectives,
             is_periodic,
@@ -408,10 +437,10 @@ class MapElites(Policy[ArchiveState]):
             examples.append(policies.FoundFailure(u, objectives[index], ranges))
         return policies.Failures(
             tuple(examples),
-            measure_indices,
-            len(wrong),
-            len(elites["objective"]),
-            int(archive.cells),
+            over=measure_indices,
+            n_failures=len(wrong),
+            n_visited=len(elites["objective"]),
+            n_cells=int(archive.cells),
         )
 
     def _start_generation(self, state: ArchiveState) -> ArchiveState:
@@ -423,7 +452,7 @@ class MapElites(Policy[ArchiveState]):
         state = replace(state, generation=state.generation + 1, values=(), successes=())
         domain = state.domain
         rng = policies.seeded(state.seed, state.generation)
-        if state.archive.empty:
+        if state.archive.empty:  # nothing could be evaluated so far
             return replace(state, points=domain.sample(rng, self.population))
         is_resampled = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
         n_new = int(is_resampled.sum())

@@ -117,10 +117,10 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
             ascent_start=math.ceil(ASCENT_START_MIXED * steps),
             gradient="free" if has_free_part else True,
         )
-    n_continuous = int((box.options == 0).sum())
-    screen = math.ceil(
-        SCREEN_FRACTION * steps * min(1.0, LOW_DIM / max(n_continuous, 1))
-    )
+    n_continuous = int((box.options == 0).sum())  # choices have no derivative
+    # of many numbers a screen sees little: it is shorter, and the ascent follows at once
+    shortening = min(1.0, LOW_DIM / max(n_continuous, 1))
+    screen = math.ceil(SCREEN_FRACTION * steps * shortening)
     ascent_start = screen
     if n_continuous <= LOW_DIM:
         ascent_start = math.ceil(ASCENT_START * steps)
@@ -129,6 +129,7 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
     fits = MIN_DERIVATIVES_PER_RENDER * (1 + cost) <= steps - ascent_start
     if n_continuous and is_worth_renders and fits:
         return BudgetPlan(steps, screen, ascent_start, gradient=True)
+    # no ascent, so that the screen needn't be short
     return BudgetPlan(
         steps,
         screen=math.ceil(SCREEN_FRACTION * steps),
@@ -217,7 +218,8 @@ class Auto(Policy[AutoState]):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
-        """Divide the renders, and start with the screen.
+        """Divide the renders, and start with the screen: evenly spread points of the
+        box coordinates (the numbers and choices that belong to no norm ball).
 
         Without box coordinates there is nothing but the ascent, which starts at once.
         """
@@ -230,12 +232,13 @@ class Auto(Policy[AutoState]):
                 domain,
                 observations,
                 plan,
-                0,
-                no_points,
+                seed=0,  # the ascent draws its own
+                screen=no_points,
                 ascent=_make_pgd(domain).start(domain, generator, steps),
             )
         seed = draw_seed(generator)
         with limit_to_single_thread():
+            # the initial point comes first
             screen = box.sample_screen(seed, max(0, plan.screen - 1))
         return AutoState(domain, observations, plan, seed, screen)
 
@@ -259,18 +262,27 @@ class Auto(Policy[AutoState]):
             has_norm_balls = state.box.count < state.domain.dim
             if has_norm_balls:
                 return (), state
-        n_observed = len(state.observations.values)
-        points = []
-        if n_observed == 0:
-            points.append(state.domain.initial_point)
-        # the screen follows the initial point
-        screen = state.screen[max(0, n_observed - 1) :][: n - len(points)]
-        points += map(state.to_configuration, screen)
+        points = self._list_screen(state, n)
         if not points:
             with limit_to_single_thread():
                 x, state = self._choose_next_point(state)
             points = [state.to_configuration(x)]
         return tuple(map(Proposal, points)), state
+
+    @staticmethod
+    def _list_screen(state: AutoState, n: int) -> list[Tensor]:
+        """Return the next configurations (d,) of the screen, up to n; none after it.
+
+        They are the initial point, then the points of the screen.
+        """
+        n_observed = len(state.observations.values)
+        points = []
+        if n_observed == 0:
+            points.append(state.domain.initial_point)
+        n_screened = max(0, n_observed - 1)
+        next_points = state.screen[n_screened:][: n - len(points)]
+        points += map(state.to_configuration, next_points)
+        return points
 
     def _propose_ascent_step(
         self, state: AutoState, proposal: Proposal, count: int
@@ -287,10 +299,12 @@ class Auto(Policy[AutoState]):
         """
         proposal = replace(proposal, gradient=state.plan.gradient)
         state = replace(state, is_climbing=True)
-        if proposal.gradient is True or count % 2 == 0:
+        has_full_gradient = proposal.gradient is True
+        if has_full_gradient or count % 2 == 0:
             return (proposal,), state
         box = state.box
         x = box.from_configuration(proposal.u)
+        # numbers from `plan.steps` on: those before are the surrogate's
         rng = seeded(state.seed, state.plan.steps + count)
         moved_x = box.sample_moves(x[None], rng)[0]
         u = state.domain.project(box.to_configuration(proposal.u, moved_x))
@@ -304,7 +318,7 @@ class Auto(Policy[AutoState]):
         cost = sum(evaluation.cost for _, evaluation in evaluated)
         state = replace(state, renders_spent=state.renders_spent + cost)
         if state.is_climbing and state.ascent is not None:
-            ((_, evaluation),) = evaluated
+            ((_, evaluation),) = evaluated  # an ascent proposes one at a time
             ascent = _make_pgd(state.domain).update(state.ascent, evaluated)
             has_fallen = evaluation.objective < state.latest_objective
             if state.box_before_trial is not None and has_fallen:
@@ -349,31 +363,33 @@ class Auto(Policy[AutoState]):
         finite. Norm balls begin at their start.
         """
         x = state.box.from_configuration(state.domain.initial_point)
-        blocks = state.domain.blocks
         if state.observations.has_finite:
             surrogate, observations = state.observations.fit_surrogate()
             state = replace(state, observations=observations)
-            x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
+            mean, _ = surrogate.predict(surrogate.x)
+            x = surrogate.x[int(mean.argmax())]
         ascent_blocks = []
-        for block in blocks:
+        for block in state.domain.blocks:
             reach = ASCENT_REACH * block.radius if block.norm == "box" else None
             ascent_blocks.append(replace(block, reach=reach))
         domain = replace(state.domain, blocks=tuple(ascent_blocks))
         renders_left = max(1, state.plan.steps - state.renders_spent)
         ascent = _make_pgd(domain).start(domain, seeded(state.seed, 0), renders_left)
+        # PGD starts at the initial point of the domain; it is put to the best one
         return replace(state, ascent=replace(ascent, u=state.to_configuration(x)))
 
 
 def _sample_candidates(surrogate: Surrogate, generator: torch.Generator) -> Tensor:
     """Return points (n, k) of the box to choose the next one from.
 
-    They are the best known point, by the surrogate's mean; moves of it, and as many of
-    the `N_CENTERS` best known points; and uniform points.
+    They are the best known point, by the surrogate's mean; random moves of it, and as
+    many of the `N_CENTERS` best known points; and uniform points.
     """
     box = surrogate.box
     known_mean, _ = surrogate.predict(surrogate.x)
     ranked_points = surrogate.x[known_mean.argsort(descending=True, stable=True)]
     n_centers = min(N_CENTERS, len(ranked_points))
+    # half of the moves start at the best point, half at any of the centers
     center_rank = torch.randint(0, n_centers, (N_NEAR_CANDIDATES,), generator=generator)
     center_rank[: N_NEAR_CANDIDATES // 2] = 0
     near_candidates = box.sample_moves(ranked_points[center_rank], generator)
@@ -394,6 +410,7 @@ class WithoutAscent(Auto):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
+        # no plan has an ascent then
         return super().start(
             replace(domain, gradient_cost=UNAFFORDABLE_COST), generator, steps
         )
@@ -441,13 +458,14 @@ class Restarts(RacingPolicy[Race]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Race:
         """Start the policy from several points; the first is the domain's own.
 
-        There are as many as `steps` renders allow one evaluation each, at most `times`.
+        There are at most `times`, and no more than the renders (`steps`) suffice for if
+        each has a single evaluation, with its gradient.
         """
         seed = draw_seed(generator)
-        renders_per_step = 1
+        renders_per_evaluation = 1
         if self.policy.uses_gradient:
-            renders_per_step += domain.gradient_cost
-        n_starts = max(1, min(self.times, steps // renders_per_step))
+            renders_per_evaluation += domain.gradient_cost
+        n_starts = max(1, min(self.times, steps // renders_per_evaluation))
         initial_points = [domain.initial_point]
         for number in range(1, n_starts):
             initial_points.append(domain.sample(seeded(seed, number))[0])

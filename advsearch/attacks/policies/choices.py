@@ -90,17 +90,20 @@ class Race:
         """Return the race at the beginning of a round.
 
         Args:
-            field: the runners that are in it, which get equal renders.
+            field: indices of the searches that take part, which get equal renders.
             number: index of the round.
         """
-        field = tuple(field)
+        active_runners = tuple(field)
         rounds_left = self.n_rounds - number
-        renders_each = max(1, (self.steps - self.spent) // rounds_left // len(field))
+        renders_of_round = (self.steps - self.spent) // rounds_left
+        renders_each = max(1, renders_of_round // len(active_runners))
         runners = [
-            replace(runner, renders_left=renders_each if index in field else 0)
+            replace(runner, renders_left=renders_each if index in active_runners else 0)
             for index, runner in enumerate(self.runners)
         ]
-        return replace(self, runners=tuple(runners), active_runners=field, round=number)
+        return replace(
+            self, runners=tuple(runners), active_runners=active_runners, round=number
+        )
 
     def propose(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
         """Return up to n proposals of this round that do not wait for each other.
@@ -129,7 +132,7 @@ class Race:
                 proposer = replace(proposer, state=state)
             if not proposals[k]:
                 self._retire(runners, k)
-            elif n_used[k] == len(proposals[k]):
+            elif n_used[k] == len(proposals[k]):  # all used up: the batch ends
                 break
             else:
                 proposal = self._limit_proposal(proposals[k][n_used[k]], proposer)
@@ -143,11 +146,19 @@ class Race:
             waiting = self._find_waiting(runners)
         for k, count in n_used.items():
             if count < len(proposals[k]):
-                _, state = runners[k].policy.propose(self.runners[k].state, count)
+                state = self._propose_again(k, count)
                 runners[k] = replace(runners[k], state=state)
         return tuple(batch), replace(
             self, runners=tuple(runners), runner_of_proposal=tuple(runner_of_proposal)
         )
+
+    def _propose_again(self, k: int, count: int) -> Any:
+        """Return the state of search k after it proposed no more than `count`
+        configurations, from its state before the batch.
+        """
+        runner = self.runners[k]
+        _, state = runner.policy.propose(runner.state, count)
+        return state
 
     def _find_waiting(self, runners: Sequence[Runner]) -> list[int]:
         """Return the indices of active runners that have renders left."""
@@ -171,19 +182,23 @@ class Race:
         renders_left = runner.renders_left
         has_later_round = self.round + 1 < self.n_rounds
         if has_later_round:
-            # the first render of that round, which can use a gradient of this one
+            # Without a render that follows, `limit_cost` drops the gradient. There is
+            # one: the first of the later round.
             renders_left += 1
         return proposal.limit_cost(runner.domain, renders_left)
 
 
 def count_rounds(runners: int) -> int:
-    """Return how many rounds a race has: 1 + ceil(log2 runners)."""
+    """Return how many rounds a race has: 1 + ceil(log2 runners).
+
+    Each round halves the searches; in the last one a single search is left.
+    """
     return 1 + (runners - 1).bit_length()
 
 
 def max_runners(steps: int, each: int, limit: int) -> int:
-    """Return how many searches a race can have if each needs `each` renders in every
-    round.
+    """Return how many searches a race can have at most if each needs `each` renders in
+    every round.
 
     Args:
         steps: renders of the race.
@@ -213,7 +228,8 @@ def start_race(
     """
     steps = max(1, steps)
     rounds = rounds or count_rounds(len(searches))
-    # A search plans with the renders that it gets if it stays in to the end.
+    # A search plans with the renders that it gets if it stays in to the end. Rounds have
+    # equally many, divided among the searches that are left, half of them each time.
     planned_renders = 0.0
     n_active = len(searches)
     for _ in range(rounds):
@@ -227,7 +243,7 @@ def start_race(
         )
         for number, (policy, domain) in enumerate(searches)
     )
-    return Race(runners, steps, rounds).begin_round(range(len(runners)), 0)
+    return Race(runners, steps, rounds).begin_round(range(len(runners)), number=0)
 
 
 class RacingPolicy(Policy[Racing]):
@@ -242,6 +258,7 @@ class RacingPolicy(Policy[Racing]):
             batch, state = state.propose(n)
             if batch or all(runner.is_over for runner in state.runners):
                 return batch, state
+            # after the last round there may be renders left over: it goes on
             next_round = min(state.round + 1, state.n_rounds - 1)
             state = state.begin_round(self._select_continuing(state), next_round)
 
@@ -332,9 +349,10 @@ class ChoicesState(Race):
     combinations: Tensor
 
     def join_choices(self, numbers: Tensor, combination: int) -> Tensor:
-        """Return the configuration (d,) with numbers (k,) and a combination of options.
+        """Return the configuration (d,) with numbers (k,) and a combination of options,
+        by its index.
 
-        Without numbers in the domain, the only number of the search is dropped.
+        If the domain has no numbers, the search has a single one, which is dropped.
         """
         u = self.domain.initial_point.clone()
         u[self.numbers] = numbers[: len(self.numbers)]
@@ -378,11 +396,13 @@ class Choices(RacingPolicy[ChoicesState]):
         options = domain.options
         numbers = (options == 0).nonzero().flatten()
         choices = options.nonzero().flatten()
-        policy: Policy[Any] = Random()
-        inner_domain = Domain(torch.zeros(1), (Block(1),))
+        policy: Policy[Any]
         if len(numbers):
             policy = self.policy
             inner_domain = _drop_choices(domain, numbers)
+        else:
+            policy = Random()
+            inner_domain = Domain(torch.zeros(1), (Block(1),))
         combinations = _select_combinations(
             options[choices].tolist(),
             domain.initial_point[choices],
@@ -463,8 +483,10 @@ def _count_runners(domain: Domain, policy: Policy[Any], steps: int) -> int:
     """Return how many combinations of options can be searched in `steps` renders."""
     n_combinations = math.prod(domain.options[domain.options > 0].tolist())
     limit = min(MAX_COMBINATIONS, n_combinations, max(2, MAX_NUMBERS // domain.dim))
-    cost = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
-    return max_runners(steps, cost, limit)
+    renders_per_evaluation = 1
+    if policy.uses_gradient:
+        renders_per_evaluation += domain.gradient_cost
+    return max_runners(steps, renders_per_evaluation, limit)
 
 
 def _select_combinations(
@@ -485,25 +507,52 @@ def _select_combinations(
         generator: of random numbers.
     """
     sizes = torch.tensor(n_options)
-    n_choices = len(n_options)
-    total = math.prod(n_options)
+    # index of the option of each choice; u = 1 belongs to the last
     initial = torch.floor(initial_point * sizes).long().clamp(max=sizes - 1)
-    if total <= max(1024, 4 * max_combinations):
-        axes = [torch.arange(count) for count in n_options]
-        combinations = torch.cartesian_prod(*axes).reshape(total, n_choices)
-        combinations = combinations[torch.randperm(total, generator=generator)]
+    if math.prod(n_options) <= max(1024, 4 * max_combinations):
+        combinations = _shuffle_combinations(n_options, generator)
         is_initial = (combinations == initial).all(dim=1)
         selected = combinations[~is_initial][: max_combinations - 1]
     else:
-        initial_options = tuple(initial.tolist())
-        sampled = {initial_options}
-        while len(sampled) < max_combinations:
-            options = [
-                int(torch.randint(count, (1,), generator=generator))
-                for count in n_options
-            ]
-            sampled.add(tuple(options))
-        others = sorted(sampled - {initial_options})
-        selected = torch.tensor(others).reshape(-1, n_choices)
+        selected = _sample_combinations(
+            n_options, tuple(initial.tolist()), max_combinations - 1, generator
+        )
     centers = option_center((selected + 0.5) / sizes, sizes)
     return torch.cat([initial_point[None], centers.to(initial_point.dtype)])
+
+
+def _shuffle_combinations(n_options: list[int], generator: torch.Generator) -> Tensor:
+    """Return all combinations of options (n, c), as their indices, in a random order.
+
+    `n_options` has the number of options of each of the c choices.
+    """
+    total = math.prod(n_options)
+    axes = [torch.arange(count) for count in n_options]
+    combinations = torch.cartesian_prod(*axes).reshape(total, len(n_options))
+    return combinations[torch.randperm(total, generator=generator)]
+
+
+def _sample_combinations(
+    n_options: list[int],
+    initial: tuple[int, ...],
+    count: int,
+    generator: torch.Generator,
+) -> Tensor:
+    """Sample different combinations of options (count, c), as their indices, in
+    ascending order.
+
+    Args:
+        n_options: of each of the c choices; there are far more combinations than are
+            sampled.
+        initial: the combination that is not sampled.
+        count: number of combinations.
+        generator: of random numbers.
+    """
+    sampled = set[tuple[int, ...]]()
+    while len(sampled) < count:
+        options = tuple(
+            int(torch.randint(size, (1,), generator=generator)) for size in n_options
+        )
+        if options != initial:
+            sampled.add(options)
+    return torch.tensor(sorted(sampled)).reshape(-1, len(n_options))

@@ -55,7 +55,8 @@ Float64Array = npt.NDArray[np.float64]
 
 
 def utilities(values: Sequence[float]) -> list[float]:
-    """Return the weights of n objectives by their ranks; `NES` has the formula.
+    """Return the weight of each of n objectives by its rank, of which the largest has
+    rank 1: max(0, ln(n/2 + 1) - ln(rank)), over the sum of these, less 1/n.
 
     They sum to zero and are larger for larger objectives. Equal objectives take up as
     many ranks as they are, and each gets the mean of the weights of these.
@@ -110,6 +111,22 @@ class NESState:
         noise = torch.randn(self.domain.dim, generator=generator)
         return noise.neg_() if is_mirrored else noise
 
+    def sum_weighted_noise(self) -> tuple[Tensor, Tensor]:
+        """Return sum_k w_k s_k and sum_k w_k s_k^2, both (d,), over the samples of a
+        complete generation, with weights w_k by rank (`utilities`) and noise s_k.
+        """
+        weights = utilities(self.values)
+        noise_sum = torch.zeros(self.domain.dim)
+        square_sum = torch.zeros(self.domain.dim)
+        # Samples come in pairs, s and -s.
+        for number in range(0, self.population, 2):
+            noise = self.noise(number)
+            weight = weights[number]
+            mirrored_weight = weights[number + 1]
+            noise_sum.add_(noise, alpha=weight - mirrored_weight)
+            square_sum.addcmul_(noise, noise, value=weight + mirrored_weight)
+        return noise_sum, square_sum
+
 
 @dataclass(frozen=True)
 class NES(Policy[NESState]):
@@ -161,15 +178,14 @@ class NES(Policy[NESState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> NESState:
         """Start at the domain's initial point, with `sigma` of each half range."""
         default = 4 + int(3 * math.log(domain.dim))
-        population = self.population or default + default % 2
-        deviation = torch.full_like(domain.start, self.sigma)
+        default += default % 2  # even, for pairs
         return NESState(
             domain,
             draw_seed(generator),
             compute_half_widths(domain),
-            domain.initial_point,
-            deviation,
-            population,
+            mean=domain.initial_point,
+            deviation=torch.full_like(domain.start, self.sigma),
+            population=self.population or default,
         )
 
     def propose(self, state: NESState, n: int) -> tuple[tuple[Proposal, ...], NESState]:
@@ -185,27 +201,17 @@ class NES(Policy[NESState]):
         """Add evaluations to the generation; once it is complete, move the
         distribution.
 
-        The formulas are those of `NES`; both samples of a pair are added up at once.
+        With weights w_k of the objectives and standard normal samples s_k:
+
+            mean      <- P(mean + deviation * sum_k w_k s_k)
+            deviation <- deviation * exp(rate / 2 * sum_k w_k (s_k^2 - 1))
         """
-        state = replace(
-            state,
-            values=(
-                *state.values,
-                *(evaluation.objective for _, evaluation in evaluated),
-            ),
-        )
+        new_values = [evaluation.objective for _, evaluation in evaluated]
+        state = replace(state, values=(*state.values, *new_values))
         if len(state.values) < state.population:
             return state
-        weights = utilities(state.values)
         d = state.domain.dim
-        mean_gradient = torch.zeros(d)  # sum_k w_k s_k
-        square_sum = torch.zeros(d)  # sum_k w_k s_k^2
-        for number in range(0, state.population, 2):
-            noise = state.noise(number)
-            weight = weights[number]
-            mirrored_weight = weights[number + 1]
-            mean_gradient.add_(noise, alpha=weight - mirrored_weight)
-            square_sum.addcmul_(noise, noise, value=weight + mirrored_weight)
+        mean_gradient, square_sum = state.sum_weighted_noise()
         # weights sum to zero, so the -1 of every term of the deviation drops out
         rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))
         deviation = (state.deviation * square_sum.mul_(rate / 2.0).exp_()).clamp_(
@@ -294,8 +300,10 @@ class CMAESState:
         )
 
     def project(self, x: Float64Array) -> tuple[Tensor, float]:
-        """Return the configuration for coordinates x (d,), and how far they lie outside
-        the domain: mean squared distance over the elements, in half ranges.
+        """Return the configuration for pycma's coordinates x (d,), and how far they lie
+        outside the domain: mean squared distance over the elements, in half ranges.
+
+        Periodic elements wrap, so that they are never outside.
         """
         unprojected = torch.add(
             self.origin, self.half_widths * torch.from_numpy(x).float()
@@ -307,9 +315,9 @@ class CMAESState:
         return u, float(torch.dot(excess, excess)) / len(x)
 
     def ask(self) -> CMAESState:
-        """Return the state with the points of the next generation.
+        """Return the state with the points of the next generation, sampled by pycma.
 
-        It changes the strategy, which no other state may hold yet.
+        It changes the strategy, pycma's object, which no other state may hold yet.
         """
         number = self.generation + 1
         with _isolate_numpy_random(self.seed, number):
@@ -317,10 +325,12 @@ class CMAESState:
         return replace(self, generation=number, points=points, values=(), violations=())
 
     def tell(self) -> CMAESState:
-        """Return the state with a copy of the strategy that has learnt the generation.
+        """Return the state with a copy of the strategy that has learnt the objectives
+        of a complete generation.
 
         What could not be evaluated counts as worse than the worst, by the distance of
-        the quartiles; points outside the domain are penalised, see `CMAES`.
+        the quartiles. Points outside the domain, whose projections were evaluated, are
+        penalised by their distance from it.
         """
         values = np.array(self.values)
         spread = 0.0
@@ -329,7 +339,7 @@ class CMAESState:
             lower_quartile, upper_quartile = np.percentile(values[is_finite], (25, 75))
             spread = float(upper_quartile - lower_quartile)
             values[~is_finite] = values[is_finite].min() - spread
-        else:
+        else:  # all equal: nothing is learnt
             values[:] = 0.0
         strategy = copy.deepcopy(self.strategy)
         # in units of the step size, and worth as much as the objectives differ
@@ -445,7 +455,8 @@ class CMAES(Policy[CMAESState]):
         if len(state.values) < len(state.points):
             return state
         state = state.tell()
-        if float(state.stds.max()) > MIN_STEP_SIZE:
+        has_converged = float(state.stds.max()) <= MIN_STEP_SIZE
+        if not has_converged:
             return state.ask()
         best_run = state.best_run
         if best_run is None or state.best > best_run[0]:
@@ -464,17 +475,16 @@ class CMAES(Policy[CMAESState]):
         return state.distribution
 
     def _make_strategy(self, d: int, population: int, seed: int) -> Any:
-        """Return pycma's strategy for d coordinates, around 0 with the width `sigma`.
-
-        It writes no files and prints nothing. A seed of NaN leaves numpy's generator as
-        it is.
+        """Return pycma's strategy for d coordinates, around 0 with the standard
+        deviation `sigma`.
         """
         options = {
             "CMA_diagonal": d > MAX_FULL_DIM,
             "popsize": population,
             "randn": _sample_normal,
-            "seed": math.nan,
+            "seed": math.nan,  # leaves numpy's generator as it is
         }
+        # no files, and nothing printed
         options |= {"signals_filename": "", "verbose": -9, "verb_log": 0}
         with _isolate_numpy_random(seed, 0):
             # takes most of a second, and complains where there is no matplotlib

@@ -38,6 +38,15 @@ DISTINCTIVE_FRACTION = 0.5
 fraction of the uniform one's; an option, if its probability is more than this.
 """
 
+# columns of `MixtureState.log`
+(
+    OBJECTIVE_COLUMN,
+    FAILED_COLUMN,
+    UNKNOWN_COLUMN,
+    WEIGHT_COLUMN,
+    MAX_WEIGHT_COLUMN,
+) = range(5)
+
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
@@ -116,9 +125,9 @@ class Components:
         lower_cdf = torch.special.ndtr(lower_offset / self.stds)
         upper_cdf = torch.special.ndtr(upper_offset / self.stds)
         z = ranges.compute_offset(x[:, None], self.means) / self.stds
-        return -0.5 * z.square() - torch.log(
-            self.stds * math.sqrt(2.0 * math.pi) * (upper_cdf - lower_cdf)
-        )
+        # of the normal density, cut to the probability between the bounds
+        normalizer = self.stds * math.sqrt(2.0 * math.pi) * (upper_cdf - lower_cdf)
+        return -0.5 * z.square() - torch.log(normalizer)
 
     def _compute_categorical_log_densities(self, x: Tensor, ranges: Ranges) -> Tensor:
         """Return log densities (n, k, d) of the options that x lies in.
@@ -138,7 +147,7 @@ class Components:
         """Return one sample (d,) of the mixture, in fractions of each range.
 
         Numbers are sampled by inverting the distribution function between the bounds;
-        an option gives the center of its part of the range.
+        of a discrete choice, it is the center of the option's part of the range.
         """
         k = int(torch.multinomial(self.weights, 1, generator=generator))
         mean = self.means[k]
@@ -162,7 +171,8 @@ class Components:
     ) -> Components:
         """Return the components after one step of expectation and maximisation.
 
-        A quarter of the new weights is uniform, so that no component dies out.
+        A quarter of the new weights of the components is uniform, so that none dies
+        out.
 
         Args:
             x: (n, d) samples, in fractions of each range.
@@ -171,8 +181,9 @@ class Components:
             uniform_probs: (k, d, m) uniform probabilities of options, the prior.
         """
         log_densities = self.compute_log_densities(x, ranges)
-        responsibility = log_densities.softmax(dim=1) * weights[:, None]  # (n, k)
-        counts = responsibility.sum(dim=0)  # (k,)
+        # probability that a sample comes from a component, times its weight: (n, k)
+        responsibility = log_densities.softmax(dim=1) * weights[:, None]
+        counts = responsibility.sum(dim=0)  # (k,) samples of each component
         # (k, n); clamped, since a component may have no samples at all
         sample_weights = (responsibility / counts.clamp(min=1e-12)).T
         offset = ranges.compute_offset(x[:, None], self.means)  # (n, k, d)
@@ -193,7 +204,8 @@ class Components:
     def _divide_out_prior(
         self, mean_offset: Tensor, variance: Tensor, counts: Tensor, ranges: Ranges
     ) -> tuple[Tensor, Tensor]:
-        """Return means and standard deviations (k, d) of normal distributions.
+        """Return means and standard deviations (k, d) of normal distributions before
+        truncation, by the moments of samples of the truncated ones.
 
         Samples of a truncated normal distribution have about the moments of a normal
         density times the uniform one, taken as a normal density too (mean 1/2). So the
@@ -206,7 +218,8 @@ class Components:
             counts: (k, 1) samples of each component.
             ranges: of the elements.
         """
-        # below the uniform variance, so that the precision stays positive
+        # averaged with the uniform variance, the prior; below it, so that the precision
+        # stays positive
         shrunk_variance = (
             (counts * variance + PRIOR_COUNT * UNIFORM_STD**2) / (counts + PRIOR_COUNT)
         ).clamp(max=0.999 * UNIFORM_STD**2)
@@ -327,11 +340,11 @@ class MixtureState:
 
         None too for an angle whose range goes through 0, which two bounds cannot state.
         """
-        reach = 2.0 * std
-        lower = mean - reach
-        upper = mean + reach
+        is_distinctive = std < DISTINCTIVE_FRACTION * UNIFORM_STD
+        lower = mean - 2.0 * std
+        upper = mean + 2.0 * std
         crosses_zero = is_periodic and (lower < 0.0 or upper > 1.0)
-        if crosses_zero or not reach < 2.0 * DISTINCTIVE_FRACTION * UNIFORM_STD:
+        if crosses_zero or not is_distinctive:
             return None
         return max(0.0, lower), min(1.0, upper)
 
@@ -393,12 +406,18 @@ class Mixture(Policy[MixtureState]):
                 f"{domain.dim}; use pgd or auto"
             )
         ranges = Ranges(domain.options, policies.find_periodic(domain))
-        nothing = torch.empty(0, domain.dim, dtype=torch.float64)
-        log = torch.empty(0, 5, dtype=torch.float64)
+        no_points = torch.empty(0, domain.dim, dtype=torch.float64)
         state = MixtureState(
-            domain, policies.draw_seed(generator), ranges, 0, (), nothing, nothing, log
+            domain,
+            policies.draw_seed(generator),
+            ranges,
+            generation=0,
+            mixtures=(),
+            points=no_points,
+            evaluated_points=no_points,
+            log=torch.empty(0, 5, dtype=torch.float64),
         )
-        return self._begin_generation(state, None)
+        return self._begin_generation(state, mixture=None)
 
     def propose(
         self, state: MixtureState, n: int
@@ -422,6 +441,7 @@ class Mixture(Policy[MixtureState]):
             weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
         # The density of a generation is `even` at least.
         max_weight = 1.0 if mixture is None else 1.0 / self.even
+        # in the order of the columns of `log`
         rows = [
             (
                 evaluation.objective,
@@ -443,32 +463,42 @@ class Mixture(Policy[MixtureState]):
         return self._begin_generation(state, self._fit(state))
 
     def failures(self, state: MixtureState) -> policies.Failures:
-        """Return a failure for each component that has some, and the failure rate."""
-        with policies.limit_to_single_thread():
-            failure_rate = policies.estimate_failure_rate(
-                state.log[:, 3],
-                state.log[:, 4],
-                state.log[:, 1] > 0,
-                state.log[:, 2] > 0,
-            )
-        has_l2_block = any(block.norm == "l2" for block in state.domain.blocks)
-        n_failures = int((state.log[:, 1] * (1.0 - state.log[:, 2])).sum())
+        """Return a failure for each component that has some, and the failure rate.
+
+        In an l2 ball there is no rate: points are projected onto it, so that the
+        uniform ones are not uniform there.
+        """
+        has_failed = state.log[:, FAILED_COLUMN] > 0
+        is_unknown = state.log[:, UNKNOWN_COLUMN] > 0
+        failure_rate = None
+        if all(block.norm != "l2" for block in state.domain.blocks):
+            with policies.limit_to_single_thread():
+                failure_rate = policies.estimate_failure_rate(
+                    state.log[:, WEIGHT_COLUMN],
+                    state.log[:, MAX_WEIGHT_COLUMN],
+                    has_failed,
+                    is_unknown,
+                )
         return policies.Failures(
             self._list_examples(state),
-            (),
-            n_failures,
-            len(state.log),
-            None,
-            None if has_l2_block else failure_rate,
+            over=(),
+            n_failures=int((has_failed & ~is_unknown).sum()),
+            n_visited=len(state.log),
+            n_cells=None,
+            failure_rate=failure_rate,
         )
 
     def _list_examples(self, state: MixtureState) -> tuple[policies.FoundFailure, ...]:
-        """Return the worst failure in the window of each component that has some."""
+        """Return the worst failure in the window (the latest samples) of each component
+        of the mixture that has some, the components of most weight first.
+
+        Before the first mixture, it is the worst failure of all.
+        """
         log = state.log[-len(state.evaluated_points) :]
         mixture = state.mixtures[-1]
-        is_failure = log[:, 1].bool() & ~log[:, 2].bool()
+        is_failure = log[:, FAILED_COLUMN].bool() & ~log[:, UNKNOWN_COLUMN].bool()
         points = state.evaluated_points[is_failure]
-        objectives = log[is_failure, 0]
+        objectives = log[is_failure, OBJECTIVE_COLUMN]
         if not len(points):
             return ()
         component_of_point = torch.zeros(len(points))
@@ -486,9 +516,9 @@ class Mixture(Policy[MixtureState]):
             members = (component_of_point == k).nonzero().flatten()
             worst = int(members[objectives[members].argmax()])
             u = state.to_configuration(points[worst])
-            ranges = (
-                {} if mixture is None else state.find_distinctive_ranges(mixture, k)
-            )
+            ranges = {}
+            if mixture is not None:
+                ranges = state.find_distinctive_ranges(mixture, k)
             examples.append(policies.FoundFailure(u, float(objectives[worst]), ranges))
         return tuple(examples)
 
@@ -498,7 +528,7 @@ class Mixture(Policy[MixtureState]):
         """Begin the next generation: sample its points from a mixture.
 
         Each is uniform with probability `even`; without a mixture all are. Mixtures and
-        points that leave the window are dropped.
+        points that leave the window, the latest `WINDOW` samples, are dropped.
         """
         number = state.generation + 1
         rng = policies.seeded(state.seed, number)
@@ -511,6 +541,7 @@ class Mixture(Policy[MixtureState]):
             policies.option_center(points, n_options.clamp(min=1)),
             points,
         )
+        # the uniform points that remain are those of the fraction `even`
         for row in range(self.population):
             if mixture is not None and float(torch.rand(1, generator=rng)) >= self.even:
                 points[row] = mixture.sample(rng, state.ranges)
@@ -561,18 +592,20 @@ class Mixture(Policy[MixtureState]):
             weights *= weights.sum() / weights.square().sum()
             center_index = policies.select_diverse(
                 points,
-                log[is_elite, 0].tolist(),
+                log[is_elite, OBJECTIVE_COLUMN].tolist(),
                 ranges.is_periodic,
                 ranges.n_options > 0,
-                self.components,
+                limit=self.components,
             )
             means = points[center_index]
             uniform_probs = self._make_uniform_option_probs(len(means), ranges)
             mixture = Components(
-                torch.full((len(means),), 1.0 / len(means), dtype=torch.float64),
-                means,
-                torch.full_like(means, 0.5 * UNIFORM_STD),
-                uniform_probs,
+                weights=torch.full(
+                    (len(means),), 1.0 / len(means), dtype=torch.float64
+                ),
+                means=means,
+                stds=torch.full_like(means, 0.5 * UNIFORM_STD),
+                option_probs=uniform_probs,
             )
             for _ in range(N_FIT_ROUNDS):
                 mixture = mixture.maximize(points, weights, ranges, uniform_probs)
@@ -582,14 +615,15 @@ class Mixture(Policy[MixtureState]):
     def _find_elite(log: Tensor) -> Tensor:
         """Return which samples a mixture is fitted to, (n,) bool.
 
-        These are the failures; where they are few, the largest objectives too.
+        These are the failures; where they are few, the largest objectives too. Of a
+        sample that could not be evaluated ("unknown") there is no objective.
         """
-        is_known = ~log[:, 2].bool()
-        is_elite = is_known & log[:, 1].bool()
+        is_known = ~log[:, UNKNOWN_COLUMN].bool()
+        is_elite = is_known & log[:, FAILED_COLUMN].bool()
         if int(is_elite.sum()) < MIN_ELITE:
             n_elite = max(MIN_ELITE, math.ceil(ELITE_FRACTION * len(log)))
             n_elite = min(int(is_known.sum()), n_elite)
-            objectives = torch.where(is_known, log[:, 0], -math.inf)
+            objectives = torch.where(is_known, log[:, OBJECTIVE_COLUMN], -math.inf)
             is_elite[objectives.topk(n_elite).indices] = True
         return is_elite
 

@@ -14,7 +14,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Domain, compute_half_widths
+from advsearch.attacks.domain import Block, Domain, compute_half_widths
 from advsearch.attacks.evaluation import (
     NO_COUNTS,
     Counts,
@@ -63,26 +63,34 @@ def clip_gradient(
     clipped_gradient = gradient.clone()
     has_outliers = False
     for block, part in domain.list_block_slices():
-        if (
-            block.norm != "box"
-            and block.size >= MIN_CLIPPED_SIZE
-            and bool(clipped_gradient[part].any())
-        ):
-            magnitudes = clipped_gradient[part].abs()
-            n_medians = CLIP if block.norm == "linf" else CLIP_L2
-            limit = n_medians * float(magnitudes[magnitudes > 0].median())
-            if float(magnitudes.amax()) > limit:
-                has_outliers = True
-                clipped_gradient[part] = clipped_gradient[part].clamp(-limit, limit)
+        limit = _find_element_limit(block, gradient[part])
+        if float(gradient[part].abs().amax()) > limit:
+            has_outliers = True
+            clipped_gradient[part] = clipped_gradient[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(clipped_gradient))
     lengths = (*lengths, length)[-MEMORY:]
     # the upper one of an even number
     median_length = sorted(lengths)[len(lengths) // 2]
-    is_too_long = length > CLIP * median_length > 0.0
+    max_length = CLIP * median_length
+    is_too_long = length > max_length > 0.0
     if is_too_long:
-        clipped_gradient = clipped_gradient * (CLIP * median_length / length)
+        clipped_gradient = clipped_gradient * (max_length / length)
     counts = Counts(cut=int(has_outliers), shortened=int(is_too_long))
     return clipped_gradient, lengths, counts
+
+
+def _find_element_limit(block: Block, gradient: Tensor) -> float:
+    """Return the magnitude above which an element of a block's gradient is an outlier.
+
+    It is a multiple of the median magnitude of the elements that are not zero; infinity
+    outside norm balls, in small blocks, and if all elements are zero.
+    """
+    has_limit = block.norm != "box" and block.size >= MIN_CLIPPED_SIZE
+    if not has_limit or not bool(gradient.any()):
+        return math.inf
+    magnitudes = gradient.abs()
+    n_medians = CLIP if block.norm == "linf" else CLIP_L2
+    return n_medians * float(magnitudes[magnitudes > 0].median())
 
 
 FIRST_WINDOW = 0.22
@@ -155,19 +163,21 @@ class Window:
         """Return whether the step size is due for halving (conditions 1 and 2 of
         Auto-PGD).
 
-        That is if too few steps improved the objective, or if the best of the search
-        has not moved since the last checkpoint although the step size was not halved
-        there.
+        That is if too few steps improved the objective, or if the best objective of the
+        search, `best`, has not grown since the last checkpoint although the step size
+        was not halved there.
         """
-        return self.n_improved < MIN_IMPROVING_FRACTION * len(self.values) or (
-            not self.was_halved and best <= self.reference_best
+        has_improved_seldom = self.n_improved < MIN_IMPROVING_FRACTION * len(
+            self.values
         )
+        has_no_new_best = not self.was_halved and best <= self.reference_best
+        return has_improved_seldom or has_no_new_best
 
     def lags(self, best: float) -> bool:
-        """Return whether `best` beats the mean of this window by more than noise
-        explains.
+        """Return whether `best`, the best objective of the search, beats the mean of
+        this window by more than noise explains.
 
-        That is by more than two standard deviations of the window's values.
+        That is by more than two standard deviations of the window's objectives.
         """
         mean = sum(self.values) / len(self.values)
         squared_deviations = sum((value - mean) ** 2 for value in self.values)
@@ -188,7 +198,12 @@ class Window:
             round(MIN_WINDOW_FRACTION * steps),
             self.length - max(1, round(WINDOW_DECREASE * steps)),
         )
-        return Window(length, (), self.values[-1], 0, best, halved)
+        return Window(
+            length,
+            previous=self.values[-1],
+            reference_best=best,
+            was_halved=halved,
+        )
 
 
 NO_SQUARES = torch.zeros(())
@@ -273,24 +288,27 @@ class AscentPolicy(Policy[Ascent]):
                 replace(state, step_size=state.step_size / 2, counts=counts)
             )
         if evaluation.gradient is not None:
-            gradient, lengths, outliers = clip_gradient(
-                state.domain, evaluation.gradient, state.lengths
-            )
-            state = replace(
-                state,
-                lengths=lengths,
-                counts=state.counts + outliers,
-                n_flat=state.n_flat + 1,
-            )
-            if bool(gradient.any()):
-                state = replace(
-                    self.learn(state, gradient),
-                    n_updates=state.n_updates + 1,
-                    n_flat=0,
-                )
+            state = self._accumulate(state, evaluation.gradient)
         if state.peak is None or evaluation.objective > state.peak.objective:
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
         return self.step(state, u, evaluation.objective)
+
+    def _accumulate(self, state: Ascent, gradient: Tensor) -> Ascent:
+        """Return the state with a gradient (d,), without its outliers, accumulated.
+
+        A gradient of zero (a "flat" one) is only counted: how many come in a row.
+        """
+        clipped_gradient, lengths, outliers = clip_gradient(
+            state.domain, gradient, state.lengths
+        )
+        state = replace(state, lengths=lengths, counts=state.counts + outliers)
+        if not bool(clipped_gradient.any()):
+            return replace(state, n_flat=state.n_flat + 1)
+        return replace(
+            self.learn(state, clipped_gradient),
+            n_updates=state.n_updates + 1,
+            n_flat=0,
+        )
 
     def counts(self, state: Ascent) -> Counts:
         return state.counts
@@ -387,7 +405,7 @@ class PGD(AscentPolicy):
             u = domain.sample(seeded(seed, 0))[0]
         # every step needs a gradient, which costs renders too
         steps = max(1, steps // (1 + domain.gradient_cost))
-        if domain.exact:
+        if domain.exact:  # without noise all windows are short
             window_length = max(MIN_WINDOW_EXACT, round(MIN_WINDOW_FRACTION * steps))
         else:
             window_length = max(MIN_WINDOW, round(FIRST_WINDOW * steps))
@@ -396,8 +414,8 @@ class PGD(AscentPolicy):
             steps,
             seed,
             u,
-            torch.zeros_like(u),
-            self.step_size,
+            direction=torch.zeros_like(u),
+            step_size=self.step_size,
             window=Window(window_length),
         )
 
@@ -407,8 +425,8 @@ class PGD(AscentPolicy):
         return state.step_size
 
     def retreat(self, state: Ascent) -> Ascent:
-        """Go back to the best configuration, or else try a random step from the
-        start.
+        """Go back to the best configuration, or else try a random step from the start
+        (a direction of zero means a random one).
         """
         if state.peak is None:
             return self._move_uphill(
@@ -445,15 +463,16 @@ class PGD(AscentPolicy):
         return self._end_noisy_window(state, window, u)
 
     def _end_exact_window(self, state: Ascent, window: Window) -> Ascent:
-        """Halve the step size if a window without noise added nothing to the one
-        before.
+        """Halve the step size if the best objective of a window, without noise, is not
+        clearly above that of the window before; start the next one, as long.
 
         It is compared with that window, not with the best of the search, which may stem
-        from another matrix of light transport. The next window is as long.
+        from another matrix of light transport.
         """
         best = max(window.values)
         gain = best - window.reference_best
-        is_idle = gain <= MIN_WINDOW_GAIN * (best - state.start_objective)
+        gain_of_search = best - state.start_objective
+        is_idle = gain <= MIN_WINDOW_GAIN * gain_of_search
         if is_idle:
             step_size = state.step_size / 2
             n_idle_windows = state.n_idle_windows + 1
@@ -468,10 +487,12 @@ class PGD(AscentPolicy):
         )
 
     def _end_noisy_window(self, state: Ascent, window: Window, u: Tensor) -> Ascent:
-        """Halve the step size if the objective stalled in a window, and take a step.
+        """Halve the step size if the objective stalled in a window, and take a step
+        from u, the latest configuration.
 
-        If the window lags behind the best evaluation besides, the step goes from there
-        instead of u, with the direction of that time, and counts as rejected.
+        If besides the window lags behind the best evaluation of the search (the peak),
+        the step starts there instead, in the direction of that time; the steps since
+        then count as a rejected one.
         """
         peak = state.peak
         best = peak.objective if peak else -math.inf
@@ -493,8 +514,8 @@ class PGD(AscentPolicy):
         uphill = state.direction
         if not bool(uphill.any()):
             uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
-        move = torch.add(u, state.domain.steepest(u, uphill), alpha=self.pace(state))
-        return replace(state, u=state.domain.project(move))
+        moved_u = torch.add(u, state.domain.steepest(u, uphill), alpha=self.pace(state))
+        return replace(state, u=state.domain.project(moved_u))
 
 
 @dataclass(frozen=True)
@@ -542,15 +563,15 @@ class Adam(AscentPolicy):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         """Start at the domain's initial point, with means of zero."""
+        # every step needs a gradient, which costs renders too
         steps = max(1, steps // (1 + domain.gradient_cost))
-        zero = torch.zeros_like(domain.start)
         return Ascent(
             domain,
             steps,
             draw_seed(generator),
-            domain.initial_point,
-            zero,
-            self.step_size,
+            u=domain.initial_point,
+            direction=torch.zeros_like(domain.start),
+            step_size=self.step_size,
         )
 
     def pace(self, state: Ascent) -> float:
@@ -567,7 +588,11 @@ class Adam(AscentPolicy):
         )
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
-        """Average the gradient and its squares; in an l2 block, the mean square."""
+        """Add a gradient to the decayed means of gradients and of their squares.
+
+        In an l2 block the square of each element is the mean over the block: there the
+        best step is along the gradient and not along its signs.
+        """
         squares = gradient.square()
         for block, part in state.domain.list_block_slices():
             if block.norm == "l2":

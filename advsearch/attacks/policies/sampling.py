@@ -124,10 +124,11 @@ class Sobol(NonAdaptivePolicy):
                 "policy random, nes, pgd or auto"
             )
         seed = draw_seed(generator)
-        # the smallest power of two for all renders, or for the maximum of a chunk
-        max_points = max(1, MAX_CHUNK_NUMBERS // size)
+        max_points = max(1, MAX_CHUNK_NUMBERS // size)  # of a chunk
+        # rounded up to a power of two, as Sobol points are balanced in such numbers
         count = 2 ** max(0, min(steps - 1, max_points - 1).bit_length())
-        return PointsState(domain, seed, sample_sobol_points(size, seed, 0, count))
+        points = sample_sobol_points(size, seed, begin=0, count=count)
+        return PointsState(domain, seed, points)
 
     def propose(
         self, state: PointsState, n: int
@@ -174,8 +175,9 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
         if block.options:
             u[part] = option_center(x[part], block.options)
         elif block.norm == "l2" and block.epsilon is not None:
-            # normal quantiles, finite also at 0 and 1
+            # normal quantiles, clamped to be finite also at 0 and 1
             direction = torch.special.ndtri(x[part].double().clamp(1e-9, 1.0 - 1e-9))
+            # the radius of a uniform point of the ball
             length = block.epsilon * next(radii) ** (1.0 / block.size)
             norm = max(float(torch.linalg.vector_norm(direction)), 1e-30)
             u[part] = domain.start[part] + (direction * (length / norm)).float()
@@ -260,8 +262,13 @@ def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
 def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Tensor:
     """Return the indices of all points of a grid, (n,), the coarse ones first.
 
-    They are sorted by the largest level of a point, then by the sum of its levels. The
-    last axis of the grid runs fastest.
+    A value on an axis has level 0 at its ends, 1 in the middle, 2 at the quarters, and
+    so on. Points are sorted by the largest level of their values, then by the sum of
+    these. The last axis of the grid runs fastest.
+
+    Args:
+        blocks: of each axis.
+        counts: number of values of each axis.
     """
     # of all points of the grid over the axes so far
     max_level = torch.zeros(1, dtype=torch.long)
@@ -270,6 +277,7 @@ def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Ten
         # each point so far with each value of this axis
         max_level = torch.maximum(max_level[:, None], level).flatten()
         level_sum = (level_sum[:, None] + level).flatten()
+    # a number of two digits: any difference of `max_level` exceeds all of `level_sum`
     sort_key = max_level * (int(level_sum.max()) + 1) + level_sum
     return sort_key.argsort(stable=True)
 
@@ -298,7 +306,9 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
         combinations_text = ""
         if n_combinations > 1:
             combinations_text = f" and {n_combinations} combinations of options"
-        renders_text = str(min_renders) if min_renders < 10**9 else "billions of"
+        renders_text = str(min_renders)
+        if min_renders >= 10**9:
+            renders_text = "billions of"
         raise InputError(
             f"policy 'grid': {min_values} values for each of {n_numbers} "
             f"numbers{combinations_text} are {renders_text} renders, and "
@@ -324,7 +334,7 @@ def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
     counts = [count or values_each for count in options]
     total = math.prod(counts)
     has_grown = True
-    while has_grown:
+    while has_grown:  # one more value for each number in turn, as long as that fits
         has_grown = False
         for index, n_options in enumerate(options):
             grown_total = total // counts[index] * (counts[index] + 1)
@@ -339,14 +349,14 @@ def _compute_levels(block: Block, count: int) -> Tensor:
     """Return the level (count,) of each value of an axis: how often the axis must be
     halved until the value is met.
 
-    It is 0 for both ends of a number's range and for every option. The end of an angle
-    is its beginning, which is no value of its own.
+    It is 0 for both ends of a number's range and for every option.
     """
     level = torch.zeros(count, dtype=torch.long)
     if block.options:
         return level
+    # the end of an angle is its beginning, which is no value of its own
     last = count if block.periodic else count - 1
-    gaps = [(0, last, 1)]  # (lower index, upper index, level of what lies between)
+    gaps = [(0, last, 1)]  # (lower index, upper index, level of the middle between)
     while gaps:
         lower, upper, depth = gaps.pop()
         middle = (lower + upper) // 2

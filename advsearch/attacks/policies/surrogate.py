@@ -54,7 +54,9 @@ class BoxCoordinates:
         return ((u[..., self.indices] - self.low) / self.width).clamp_(0.0, 1.0)
 
     def to_configuration(self, u: Tensor, x: Tensor) -> Tensor:
-        """Return a copy of configurations (..., d), moved to points (..., k)."""
+        """Return a copy of configurations (..., d) whose box coordinates are the points
+        x (..., k) of the unit box; the other elements of u stay.
+        """
         u = u.clone()
         u[..., self.indices] = torch.clamp(
             self.low + self.width * x, self.low, self.low + self.width
@@ -86,10 +88,12 @@ class BoxCoordinates:
         random; choices are sampled anew, or stay.
         """
         n, k = x.shape
+        # log-uniform from `MIN_MOVE` to `MAX_MOVE`
         log_range = math.log(MAX_MOVE / MIN_MOVE)
         size = MIN_MOVE * torch.exp(log_range * torch.rand(n, 1, generator=generator))
         is_moved = torch.rand(n, k, generator=generator) < N_MOVED_COORDINATES / k
-        is_moved[torch.arange(n), torch.randint(k, (n,), generator=generator)] = True
+        always_moved = torch.randint(k, (n,), generator=generator)
+        is_moved[torch.arange(n), always_moved] = True
         noise = torch.randn(n, k, generator=generator)
         is_choice = self.options > 0
         x = torch.where(is_choice, x, x + is_moved * size * noise)
@@ -214,6 +218,7 @@ class Surrogate:
         cross = kernel(self.box.embed(x, lengths), self.box.embed(self.x, lengths))
         solved = torch.linalg.solve_triangular(self.factor, cross.mT, upper=False)
         # not below 0 by rounding, where a point is known
+        # fraction of the signal's variance that the known points leave
         unexplained = (1.0 - solved.square().sum(dim=0)).clamp_(min=1e-12)
         return self.mean + cross @ self.weights, (self.variance * unexplained).sqrt_()
 
@@ -266,7 +271,8 @@ class Observations:
         values = torch.where(is_finite, values, values[is_finite].min())
         scales = self.scales
         n_fitted = self.n_fitted
-        if scales is None or n - n_fitted >= max(REFIT_INTERVAL, n_fitted // 10):
+        refit_interval = max(REFIT_INTERVAL, n_fitted // 10)
+        if scales is None or n - n_fitted >= refit_interval:
             used = _select_best_and_latest(values, MEMORY)
             scales = _find_best_scales(self.box, self.points[used], values[used])
             n_fitted = n
@@ -279,11 +285,12 @@ def _select_best_and_latest(values: Tensor, memory: int) -> Tensor:
     """Return the indices of the `memory` last values, after those of the `memory`
     largest before them; of all values, in their order, if there are no more.
     """
-    n_before_last = len(values) - memory
-    if n_before_last <= memory:
+    n_earlier = len(values) - memory
+    if n_earlier <= memory:
         return torch.arange(len(values))
-    order = values[:n_before_last].argsort(descending=True, stable=True)
-    return torch.cat([order[:memory], torch.arange(n_before_last, len(values))])
+    order = values[:n_earlier].argsort(descending=True, stable=True)
+    latest = torch.arange(n_earlier, len(values))
+    return torch.cat([order[:memory], latest])
 
 
 def kernel(a: Tensor, b: Tensor) -> Tensor:
@@ -295,10 +302,10 @@ def kernel(a: Tensor, b: Tensor) -> Tensor:
 def fit(
     box: BoxCoordinates, x: Tensor, y: Tensor, scales: Scales | None = None
 ) -> Surrogate:
-    """Return the process for values y (n,) at points x (n, k).
+    """Return the Gaussian process for values y (n,) at points x (n, k) of the unit box.
 
-    Its mean and variance are those of maximum likelihood; so are the scales, unless
-    they are passed.
+    Its mean and variance are those of maximum likelihood; so are the scales (lengths of
+    the kernel and variance of the noise), unless they are passed.
     """
     scales = scales or _find_best_scales(box, x, y)
     features = box.embed(x, scales.lengths)
@@ -341,6 +348,7 @@ def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
             for noise in NOISE_VARIANCES
         ]
     )
+    # a single coordinate has a length of its own already; many share one
     if not 1 < k <= MAX_SCALED_DIM:
         return best.scales
     for coordinate in range(k):
@@ -350,7 +358,7 @@ def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
             changed_length = float(lengths[coordinate]) * factor
             lengths[coordinate] = min(length_unit * MAX_LENGTH, changed_length)
             candidates.append(Scales(lengths, best.scales.noise))
-        other = find_most_likely(candidates)
-        if other.likelihood > best.likelihood + MIN_LIKELIHOOD_GAIN:
-            best = other
+        changed = find_most_likely(candidates)
+        if changed.likelihood > best.likelihood + MIN_LIKELIHOOD_GAIN:
+            best = changed
     return best.scales

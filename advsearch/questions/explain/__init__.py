@@ -133,7 +133,9 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         environment=settings.join_names(sweep.summary.environment for sweep in sweeps),
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
+        # right, of, interval, share and outcomes of all rows
         **vars(findings.count_right(table)),
+        # draws, where several rows share one
         units=None if table["unit"].is_unique else table["unit"].nunique(),
         rules=rule_rows,
         not_told=findings.make_rejected_rule(found_rules.best_rejected, len(table)),
@@ -205,7 +207,11 @@ def _confirm_rules(renders: Any, found_rules: Any) -> list[RuleRow]:
 def read_table(
     sweeps: Sequence[workbench.StoredSweep],
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the rows of sweeps that have the object in view, and what varies in them.
+    """Return the rows of sweeps that have the object in view, twice.
+
+    Returns:
+        All columns of the rows; and a table of the parameters that vary in all of them,
+        whose names and units are its `attrs["units"]`.
 
     Raises:
         InputError: there are too few rows, or nothing varies in all of them.

@@ -70,10 +70,10 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
 
 
 def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> bool:
-    """Return whether points (n, d) have a higher silhouette than each reference.
+    """Return whether points (n, d) cluster better than each of `N_REFERENCES` clouds
+    without clusters: by a higher silhouette.
 
-    References have no clusters: as many points, normal with the same deviation in each
-    dimension.
+    A cloud has as many points, normal with the same deviation in each dimension.
 
     Args:
         seed: of the references.
@@ -107,8 +107,8 @@ def cluster_points(points: FloatArray) -> tuple[float, IntArray]:
     compute_silhouette = rules.import_library("sklearn.metrics").silhouette_score
     best_silhouette = -1.0
     best_cluster = np.zeros(len(points), dtype=np.int64)
-    # The silhouette needs fewer clusters than points, and k-means that many different
-    # ones.
+    # The silhouette needs fewer clusters than points, and k-means as many different
+    # points as clusters; rounded, as points that differ by rounding are the same.
     n_distinct = len(np.unique(points.round(9), axis=0))
     max_clusters = min(MAX_CLUSTERS, n_distinct - 1)
     for k in range(2, max_clusters + 1):

@@ -44,10 +44,10 @@ def find_envelope(
     """
     if choosing.empty:
         return None
-    # At a high accuracy the reserve is half of what is left to 1, so that it can be
-    # reached.
+    # of the choosing rows; at a high accuracy the reserve is half of what is left to 1,
+    # so that it can be reached
     required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
-    box: rules.RuleConditions = ()
+    box: rules.RuleConditions = ()  # without conditions: everything
     inside = choosing
     while rules.estimate_interval(inside)[0] < required:
         smaller_box = find_best_peel(box, inside, choosing)
@@ -91,9 +91,9 @@ def find_best_peel(
 def list_peels(
     box: rules.RuleConditions, inside: pd.DataFrame
 ) -> Iterator[rules.RuleConditions]:
-    """Yield boxes that are slightly smaller than `box`, by one narrower condition.
+    """Yield boxes that are slightly smaller than `box`, by one narrower condition each.
 
-    A factor that the box does not restrict yet gets its first condition.
+    A factor (a parameter) that the box does not restrict yet gets its first condition.
 
     Args:
         box: the conditions of the box.
@@ -103,7 +103,8 @@ def list_peels(
     for factor, unit in inside.attrs["units"].items():
         condition = condition_of_factor.get(factor, rules.RuleCondition(factor, unit))
         for smaller in list_factor_peels(condition, inside[factor]):
-            if smaller != condition and smaller.low < smaller.high:
+            is_empty = smaller.low >= smaller.high
+            if smaller != condition and not is_empty:
                 conditions = {**condition_of_factor, factor: smaller}
                 # conditions in the order of the factors, whichever came first
                 yield tuple(
@@ -116,39 +117,52 @@ def list_peels(
 def list_factor_peels(
     condition: rules.RuleCondition, column: pd.Series
 ) -> Iterator[rules.RuleCondition]:
-    """Yield conditions without one name, or without the lowest or highest values.
-
-    A condition on numbers is low < value <= high. A peel takes `PEELED_FRACTION` of the
-    values, up to a bound that is rounded to three digits; where that would take none of
-    them, or all, it takes just the lowest or the highest value.
+    """Yield slightly narrower conditions on a factor: without one of its names, or
+    without its lowest or its highest numbers.
 
     Args:
-        condition: of the box.
-        column: values of the rows inside the box.
+        condition: on the factor, of the box.
+        column: values of the factor in the rows inside the box.
     """
     if column.dtype == "category":
         names = condition.options or frozenset(column.cat.categories)
         if len(names) > 1:
-            yield from (
-                replace(condition, options=names - {name}) for name in sorted(names)
-            )
+            for name in sorted(names):
+                yield replace(condition, options=names - {name})
         return
-
     values = column.to_numpy()
-    lowest = values.min()
-    highest = values.max()
-    low = _round_to_3_digits(np.quantile(values, PEELED_FRACTION))
-    if not lowest <= low < highest:
-        low = float(lowest)
-    yield replace(condition, low=low)
+    yield replace(condition, low=_find_higher_low(values))
+    high = _find_lower_high(values)
+    if high is not None:
+        yield replace(condition, high=high)
 
+
+def _find_higher_low(values: rules.FloatArray) -> float:
+    """Return the `low` of a condition low < value <= high that leaves out the lowest
+    values (n,): `PEELED_FRACTION` of them, with the bound rounded to three digits.
+
+    Where rounding would leave out none or all of them, just the lowest is left out.
+    """
+    lowest = values.min()
+    low = _round_to_3_digits(np.quantile(values, PEELED_FRACTION))
+    leaves_out_some = lowest <= low < values.max()
+    return low if leaves_out_some else float(lowest)
+
+
+def _find_lower_high(values: rules.FloatArray) -> float | None:
+    """Return the `high` of a condition low < value <= high that leaves out the highest
+    values (n,): `PEELED_FRACTION` of them, with the bound rounded to three digits.
+
+    Where rounding would leave out none or all of them, just the highest is left out.
+    None if all values are the same.
+    """
+    highest = values.max()
     high = _round_to_3_digits(np.quantile(values, 1.0 - PEELED_FRACTION))
-    if not lowest <= high < highest:
-        lower_values = values[values < highest]
-        if not len(lower_values):
-            return
-        high = float(lower_values.max())
-    yield replace(condition, high=high)
+    leaves_out_some = values.min() <= high < highest
+    if leaves_out_some:
+        return high
+    lower_values = values[values < highest]
+    return float(lower_values.max()) if len(lower_values) else None
 
 
 def _round_to_3_digits(value: float) -> float:

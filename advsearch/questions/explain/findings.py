@@ -41,9 +41,11 @@ def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
 def make_rejected_rule(
     rule: rules.CountedRule | None, n_rows: int
 ) -> RejectedRule | None:
-    """Return the result of a rule that is not significant among `n_rows` rows.
+    """Return the result of a rule that is not significant among `n_rows` rows; None
+    without a rule.
 
-    It states how many rows it would take, or None if no number makes it significant.
+    Its field `rows` is how many rows with the same rates would make it significant;
+    None if no number does.
     """
     if rule is None:
         return None
@@ -59,7 +61,8 @@ def make_rejected_rule(
 
 def round_up(count: float) -> int:
     """Round up to two significant digits: 173.2 becomes 180."""
-    step: int = 10 ** max(0, math.floor(math.log10(count)) - 1)
+    n_digits = math.floor(math.log10(count)) + 1  # before the decimal point
+    step: int = 10 ** max(0, n_digits - 2)
     return math.ceil(count / step) * step
 
 

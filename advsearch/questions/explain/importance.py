@@ -62,30 +62,43 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
         return []
     table = rules.merge_repeats(table)
     sample = ClusteredPredictions(table)
-    factors = list(table.attrs["units"])
-
     n_groups = round(sample.n_clusters ** (1.0 / 3.0))
     single_weights = [
         sample.estimate_weight([factor], cut_into_groups(table[factor], n_groups))
-        for factor in factors
+        for factor in table.attrs["units"]
     ]
+    pair_weights = _find_interacting_pairs(table, sample)
+    return [*sort_by_fraction(single_weights), *sort_by_fraction(pair_weights)]
 
-    n_coarse_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
-    coarse_groups = {
-        factor: cut_into_groups(table[factor], n_coarse_groups) for factor in factors
+
+def _find_interacting_pairs(
+    table: pd.DataFrame, sample: ClusteredPredictions
+) -> list[ParameterWeight]:
+    """Return the weights of the pairs of factors that interact significantly: together
+    they decide more than the sum of what each decides alone.
+
+    Args:
+        table: the predictions and the values of their factors.
+        sample: the same predictions.
+    """
+    # as many groups of each factor that the cells of two have enough rows on average
+    n_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
+    group_of_factor = {
+        factor: cut_into_groups(table[factor], n_groups)
+        for factor in table.attrs["units"]
     }
-    pairs = list(combinations(factors, 2))
+    pairs = list(combinations(group_of_factor, 2))
     pair_weights = []
     for factor_a, factor_b in pairs:
-        joint_group = cross_groups(coarse_groups[factor_a], coarse_groups[factor_b])
-        p_value = sample.interaction_p_value(
-            joint_group, coarse_groups[factor_a], coarse_groups[factor_b]
-        )
+        group_a = group_of_factor[factor_a]
+        group_b = group_of_factor[factor_b]
+        joint_group = cross_groups(group_a, group_b)
+        p_value = sample.interaction_p_value(joint_group, group_a, group_b)
         if p_value < SIGNIFICANCE / len(pairs):
             pair_weights.append(
                 sample.estimate_weight([factor_a, factor_b], joint_group)
             )
-    return [*sort_by_fraction(single_weights), *sort_by_fraction(pair_weights)]
+    return pair_weights
 
 
 def sort_by_fraction(weights: list[ParameterWeight]) -> list[ParameterWeight]:
@@ -102,6 +115,7 @@ def cut_into_groups(column: pd.Series, n_groups: int) -> IntArray:
         return np.asarray(column.cat.codes, dtype=np.int64)
     values = column.to_numpy()
     n_bins = min(max(2, n_groups), MAX_GROUPS)
+    # quantiles between the groups, each once: many rows may have the same value
     inner_edges = np.unique(
         np.quantile(values, np.linspace(0.0, 1.0, n_bins + 1)[1:-1])
     )
@@ -109,7 +123,10 @@ def cut_into_groups(column: pd.Series, n_groups: int) -> IntArray:
 
 
 def cross_groups(first: IntArray, second: IntArray) -> IntArray:
-    """Return the group of each row (n,) by both of two groupings at once."""
+    """Return the group of each row (n,) by both of two groupings at once.
+
+    Rows are in the same group if they are in both groupings.
+    """
     return first * (int(second.max()) + 1) + second
 
 
@@ -178,7 +195,7 @@ class ClusteredPredictions:
         """
         share, n_groups = self.explained_fraction(group)
         expected_statistic = self.expected_statistic(group)
-        if n_groups < 2 or math.isnan(expected_statistic):
+        if n_groups < 2 or math.isnan(expected_statistic):  # nothing is shown
             return ParameterWeight(
                 parameters=factors, share=0.0, interval=(0.0, 1.0), parts=n_groups
             )
@@ -238,6 +255,8 @@ class ClusteredPredictions:
         clusters_per_group = np.bincount(cell_group, minlength=len(group_weight))[
             is_used
         ]
+        # a variance inside each group needs two clusters there, and one over all of them
+        # more clusters than groups
         if (
             self.n_clusters < 2
             or self.n_clusters <= n_groups
@@ -351,8 +370,13 @@ def within_group_variance(
 def noncentrality_interval(
     statistic: float, degrees: int, error_degrees: float
 ) -> tuple[float, float]:
-    """Return the 95 % interval of the noncentrality; see `find_noncentrality`."""
-    # A statistic below its degrees of freedom is smaller than by chance alone.
+    """Return the 95 % interval of the noncentrality of a statistic's distribution.
+
+    At each end, the statistic is a quantile of 97.5 or 2.5 % (`find_noncentrality`,
+    which has the arguments).
+    """
+    # A statistic below its degrees of freedom, the expectation by chance alone, would
+    # make the interval end too early.
     upper_statistic = max(statistic, float(degrees))
     tail = (1.0 - statistics.intervals.CONFIDENCE) / 2.0
     lower = find_noncentrality(statistic, degrees, error_degrees, 1.0 - tail)
@@ -363,10 +387,11 @@ def noncentrality_interval(
 def find_noncentrality(
     statistic: float, degrees: int, error_degrees: float, probability: float
 ) -> float:
-    """Find the noncentrality that gives values up to a statistic some probability.
+    """Find the noncentrality of a distribution at which the probability of values up to
+    the statistic is `probability`.
 
-    The larger the noncentrality, the smaller is the probability of values up to the
-    statistic. 0 if it is too small already without any.
+    The larger the noncentrality, the smaller is that probability. 0 if it is too small
+    already without any.
 
     Args:
         statistic: of a noncentral chi-squared distribution, or `degrees` times one of

@@ -131,8 +131,8 @@ class Renders:
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
         covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
-        # Configurations that earlier rules cover are left out, so that more are
-        # rendered.
+        # What earlier rules cover is left out of the renders too; so the smaller the rest
+        # is, the more are rendered.
         uncovered_fraction = max(
             float(is_outside(earlier_conditions, covered_rows).mean()),
             MIN_UNCOVERED_FRACTION,
@@ -176,9 +176,9 @@ class Renders:
                 self.config.confirm / len(self.sweeps) / n_arcs / uncovered_fraction
             )
             for arc in range(n_arcs):
-                # a number of its own, for the seed
-                part = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
-                seed = seeds.stream(self.config.seed, "confirm", part)
+                # a different number for each rule, sweep and arc
+                number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
+                seed = seeds.stream(self.config.seed, "confirm", number)
                 self.progress.message(
                     f"rule {index + 1}: rendering about {samples} "
                     "configurations inside it"
@@ -194,7 +194,7 @@ class Renders:
                     continue
                 inside = select_inside(rows, rule.conditions, earlier_conditions)
                 # draws of other sweeps may have the same numbers
-                unit = inside["unit"].astype(str) + f" of {part}"
+                unit = inside["unit"].astype(str) + f" of {number}"
                 fresh_frames.append(inside.assign(unit=unit))
         return fresh_frames
 
@@ -222,6 +222,7 @@ class Renders:
                 for factor in self.table.attrs["units"]
                 if factor not in rule_factors
             ]
+            # first all factors of the rule, then the others one by one
             for factors in (rule_factors, *([factor] for factor in other_factors)):
                 attempts = [
                     self._find_nearest_right(f"pair-{number}", index, factor)
@@ -269,15 +270,15 @@ class Renders:
             return None
         self._tried_failures.add(index)
 
-        frame_a, frame_b = frames
+        frame_a, frame_b = frames  # the same configurations, with different noise
         wrong_value = failure[factor]
         values = frame_a[factor].tolist()  # the failure's own value is among them
         failure_row = values.index(wrong_value)
         is_right = np.asarray(frame_a["correct"] & frame_b["correct"])
-        is_failure = not (
+        is_wrong_in_both = not (
             frame_a["correct"][failure_row] or frame_b["correct"][failure_row]
         )
-        if not is_failure or not is_right.any():
+        if not is_wrong_in_both or not is_right.any():
             return None
         nearest_row = self._find_nearest_value(factor, is_right, values, wrong_value)
         return NearestRight(
@@ -364,23 +365,10 @@ class Renders:
         self.progress.stage(
             "rendering failures again", len(sampled), hint="`clusters` says how many"
         )
-        try:
-            with self.context.until_interrupted():
-                batches = [
-                    self.render_again(self.sweeps[index], rows["step"].tolist())
-                    for index, rows in sampled.groupby("sweep")
-                ]
-        except (InputError, errors.ModelError) as error:
-            self.warnings.append(f"No failures were grouped: {error}")
+        rendered = self._render_failures(sampled)
+        if rendered is None:
             return None
-        if self.context.ending == results.INTERRUPTED:
-            self.interrupted = True
-            return None
-        self.n_renders += len(sampled)
-
-        # Rows are sorted by sweep, so that images are in their order.
-        images = torch.cat([batch_images for batch_images, _ in batches])
-        compute_features = batches[0][1]  # the same in all: there is one model
+        images, compute_features = rendered
         clusters = find_clusters(
             compute_features(images).double().numpy(), self.config.seed
         )
@@ -397,6 +385,36 @@ class Renders:
             apart=clusters.apart,
             listed=described_clusters,
         )
+
+    def _render_failures(
+        self, sampled: pd.DataFrame
+    ) -> tuple[torch.Tensor, Any] | None:
+        """Render failures of one model again.
+
+        Args:
+            sampled: their rows, sorted by sweep.
+
+        Returns:
+            The images (n, H, W, 3) in the order of the rows, and what computes the
+            features of the model. None if it was interrupted, or they could not be
+            rendered, of which there is a warning.
+        """
+        try:
+            with self.context.until_interrupted():
+                batches = [
+                    self.render_again(self.sweeps[index], rows["step"].tolist())
+                    for index, rows in sampled.groupby("sweep")
+                ]
+        except (InputError, errors.ModelError) as error:
+            self.warnings.append(f"No failures were grouped: {error}")
+            return None
+        if self.context.ending == results.INTERRUPTED:
+            self.interrupted = True
+            return None
+        self.n_renders += len(sampled)
+        images = torch.cat([batch_images for batch_images, _ in batches])
+        _, compute_features = batches[0]  # the same in all: there is one model
+        return images, compute_features
 
     def _warn_about_selection(self, selected: Sequence[int]) -> None:
         """Add a warning if failures of one of several models are clustered."""
@@ -430,18 +448,10 @@ class Renders:
 
         Features are those of one model: the first one that was swept by itself.
         """
-        models = next(
-            (
-                sweep.config.models
-                for sweep in self.sweeps
-                if len(sweep.config.models) == 1
-            ),
-            None,
-        )
+        models_of_sweeps = [sweep.config.models for sweep in self.sweeps]
+        single = next((names for names in models_of_sweeps if len(names) == 1), None)
         return [
-            index
-            for index, sweep in enumerate(self.sweeps)
-            if sweep.config.models == models
+            index for index, names in enumerate(models_of_sweeps) if names == single
         ]
 
     def render_again(
@@ -466,13 +476,17 @@ class Renders:
 
 
 def count_arcs(config: SweepConfig, conditions: rules.RuleConditions) -> int:
-    """Return the number of sweeps that cover the arcs of conditions on angles."""
+    """Return the number of sweeps that cover the arcs of conditions on angles.
+
+    A condition on an angle may be two arcs of the circle, each of which needs a sweep;
+    conditions on other factors have no arcs, and need one sweep.
+    """
     n_arcs = [
         len(condition.arcs)
         for condition in conditions
         if is_sampled(config, condition.factor)
     ]
-    return max(n_arcs, default=1) or 1
+    return max([1, *n_arcs])
 
 
 def select_inside(
@@ -536,6 +550,6 @@ def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
     values = [
         column.cat.codes if column.dtype == "category" else column for column in columns
     ]
-    # Sorting the order of the values gives their ranks.
+    # The order of the order is the rank: where each row stands among the sorted ones.
     order = np.stack(values, axis=1).astype(np.float64).argsort(axis=0)
     return order.argsort(axis=0) / len(table)

@@ -225,17 +225,7 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
         f"{number}. {describe_rule_row(number, rule)}"
         for number, rule in enumerate(result.rules, start=1)
     ]
-    note = ""
-    headline = (
-        f"No rule is told from chance in {result.total:,} rows, of which one half "
-        f"chooses and the other counts: the model is right in {result.text}."
-    )
-    if result.rules:
-        note = RULES_NOTE
-        headline = (
-            f"{wording.format_count(len(result.rules), 'rule')} under which the model is "
-            "wrong more often than elsewhere."
-        )
+    note = RULES_NOTE if result.rules else ""
     sections = [
         ResultPart(
             "Rules", [*rule_sentences, describe_rejected_rule(result)], note=note
@@ -259,7 +249,21 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
         "sweeps": ", ".join(result.sweeps),
         "parameters": ", ".join(result.parameters),
     }
-    return ShownResult(headline, sections, facts, about=[result.object, result.model])
+    about = [result.object, result.model]
+    return ShownResult(_make_headline(result), sections, facts, about)
+
+
+def _make_headline(result: ExplainResult) -> str:
+    """Return the sentence that a reader sees first: how many rules there are."""
+    if not result.rules:
+        return (
+            f"No rule is told from chance in {result.total:,} rows, of which one half "
+            f"chooses and the other counts: the model is right in {result.text}."
+        )
+    return (
+        f"{wording.format_count(len(result.rules), 'rule')} under which the model is "
+        "wrong more often than elsewhere."
+    )
 
 
 def _pair_section(pair: NearestRight) -> ResultPart:
@@ -356,20 +360,22 @@ def describe_envelope(result: ExplainResult) -> str:
 
 def describe_pairs(result: ExplainResult) -> str:
     """Describe for how many failures a nearby right configuration was found."""
-    failures = result.total - result.right
-    left = failures - result.pairs_sought
-    others = (
-        f" The other {left} were not tried; `pairs` says how many are." if left else ""
-    )
-    return (
-        f"Of the {result.pairs_sought} most typical of {failures} failures, "
+    n_failures = result.total - result.right
+    text = (
+        f"Of the {result.pairs_sought} most typical of {n_failures} failures, "
         f"{len(result.pairs)} are right once one "
-        f"parameter is another.{others}"
+        "parameter is another."
     )
+    n_untried = n_failures - result.pairs_sought
+    if n_untried:
+        text += f" The other {n_untried} were not tried; `pairs` says how many are."
+    return text
 
 
 def _cluster_section(clusters: FailureClusters) -> ResultPart:
-    """Return the kinds of failures, each with its most typical image."""
+    """Return the part of the page about the kinds of failures (their clusters): how
+    many there are, and the most typical image of each.
+    """
     failures = f"the {clusters.failures} failures that were rendered again"
     text = f"One kind: {failures} are alike by {clusters.features}."
     if clusters.silhouette is not None:
@@ -391,30 +397,48 @@ def _cluster_section(clusters: FailureClusters) -> ResultPart:
 
 
 def make_explain_claims(result: ExplainResult) -> Iterator[views.Claim]:
-    """Yield the claims that the rules and the envelope support."""
+    """Yield the claims that the rules and the envelope (a box of values inside which
+    the model has the accuracy that was asked for) support.
+    """
     for number, rule in enumerate(result.rules, 1):
-        counts: RightCounts = rule.confirmed or rule
-        source = "rows that did not choose the rule"
-        if rule.confirmed:
-            source = "fresh renders"
-        extent = counts.make_extent(f"right, of {source}")
-        where = f"{wording.format_conditions(rule.conditions)} (rule {number})"
-        inside = f"{wording.format_extent(extent)} {source}"
-        statement = (
-            f"Where {where} the model is right in {inside}; elsewhere in "
-            f"{rule.elsewhere.text}."
-        )
-        yield views.Claim(kind="measured", statement=statement, extent=extent)
+        yield _make_rule_claim(number, rule)
     box = result.envelope
     if box is not None and box.held and box.total:
-        extent = box.make_extent("right, of rows that did not choose the box")
-        where = wording.format_conditions(box.conditions)
-        inside = f"{wording.format_extent(extent)} configurations that did not choose this box"
-        statement = (
-            f"Inside {where} the model is right in {inside}; the sweeps drew no others."
-        )
-        yield views.Claim(kind="measured", statement=statement, extent=extent)
+        yield _make_envelope_claim(box)
     elif not result.rules:
         reason = "no box of values was shown to keep the accuracy that was asked for"
         statement = f"Nothing is claimed: {reason}. {describe_envelope(result)}"
         yield views.Claim(kind="nothing claimed", statement=statement, extent=None)
+
+
+def _make_rule_claim(number: int, rule: RuleRow) -> views.Claim:
+    """Return what is claimed of a rule, by its number from 1.
+
+    The counts are those of fresh renders if there are any; else of the rows that did
+    not choose it.
+    """
+    counts: RightCounts = rule.confirmed or rule
+    source = "rows that did not choose the rule"
+    if rule.confirmed:
+        source = "fresh renders"
+    extent = counts.make_extent(f"right, of {source}")
+    where = f"{wording.format_conditions(rule.conditions)} (rule {number})"
+    inside = f"{wording.format_extent(extent)} {source}"
+    statement = (
+        f"Where {where} the model is right in {inside}; elsewhere in "
+        f"{rule.elsewhere.text}."
+    )
+    return views.Claim(kind="measured", statement=statement, extent=extent)
+
+
+def _make_envelope_claim(box: EnvelopeRow) -> views.Claim:
+    """Return what is claimed of a box of values that holds, by the rows that did not
+    choose it.
+    """
+    extent = box.make_extent("right, of rows that did not choose the box")
+    where = wording.format_conditions(box.conditions)
+    statement = (
+        f"Inside {where} the model is right in {wording.format_extent(extent)} "
+        "configurations that did not choose this box; the sweeps drew no others."
+    )
+    return views.Claim(kind="measured", statement=statement, extent=extent)

@@ -39,10 +39,11 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
         rows["image"] = name_images(sweep, rows)
         frames.append(rows.assign(sweep=index))
 
-    units = {
-        name: unit for frame in frames for name, unit in frame.attrs["units"].items()
-    }
-    units = {**units, **dict.fromkeys(SCENE_SETTINGS, "")}
+    # of each parameter that any sweep has, and of the settings, which have none
+    units = dict[str, str]()
+    for frame in frames:
+        units |= frame.attrs["units"]
+    units |= dict.fromkeys(SCENE_SETTINGS, "")
     table = pd.concat(frames, ignore_index=True)
     table = table[~table.duplicated("image")].reset_index(drop=True)
     for name in units:
@@ -66,6 +67,7 @@ def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """
     if sweep.summary.sampler is not None:
         return [f"draw {sweep.config.seed} {unit}" for unit in rows["unit"]]
+    # all that a draw is made of, but not what is predicted of it
     columns = [
         name
         for name in ("object", "environment", *rows.attrs["units"])

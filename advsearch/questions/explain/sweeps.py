@@ -45,53 +45,64 @@ def make_sweep_inside(
     values_inside = {
         name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]
     }
-
-    outer = cut_scene_settings(config, values_inside)
+    scene_settings = cut_scene_settings(config, values_inside)
     n_scenes = math.prod(
-        len(settings.split_names(names)) if names else 1 for names in outer.values()
+        len(settings.split_names(names)) if names else 1
+        for names in scene_settings.values()
     )
-
-    grid: dict[str, Any] = {
+    full_grid = {
         name: values_inside.get(name, values) for name, values in config.grid.items()
     }
-    axis_sizes = {
-        name: len(values) if isinstance(values, list) else 1
-        for name, values in grid.items()
-    }
-    while (
-        math.prod(axis_sizes.values()) * n_scenes > 2 * samples
-        and max(axis_sizes.values(), default=1) > 1
-    ):
-        longest = max(axis_sizes, key=axis_sizes.__getitem__)
-        grid[longest] = grid[longest][::2]
-        axis_sizes[longest] = len(grid[longest])
-    n_points = math.prod(axis_sizes.values()) * n_scenes
-
+    grid = thin_grid(full_grid, max_points=2 * samples / n_scenes)
+    n_configurations = count_grid_points(grid) * n_scenes
     controls = cut_controls(config, table, conditions, arc)
-    draws = math.ceil(samples / n_points) if controls else None
+    # of each point of the grid in each scene, if anything is sampled
+    draws = math.ceil(samples / n_configurations) if controls else None
     return make_minimal_config(
-        config, grid=grid, controls=controls, samples=draws, seed=seed, **outer
+        config, grid=grid, controls=controls, samples=draws, seed=seed, **scene_settings
     )
+
+
+def thin_grid(grid: Mapping[str, Any], max_points: float) -> dict[str, Any]:
+    """Return a grid from whose longest axis every second value is left out, until it
+    has at most `max_points` points, or a single one.
+    """
+    thinned = dict(grid)
+    while count_grid_points(thinned) > max(max_points, 1):
+        longest = max(thinned, key=lambda name: count_axis_values(thinned[name]))
+        thinned[longest] = thinned[longest][::2]
+    return thinned
+
+
+def count_grid_points(grid: Mapping[str, Any]) -> int:
+    """Return the number of points of a grid, whose axes have values by name."""
+    return math.prod(map(count_axis_values, grid.values()))
+
+
+def count_axis_values(values: Any) -> int:
+    """Return the number of values of an axis; something else than a list is one."""
+    return len(values) if isinstance(values, list) else 1
 
 
 def cut_scene_settings(
     config: SweepConfig, values_inside: Mapping[str, Sequence[Any]]
 ) -> dict[str, str | None]:
-    """Return the objects, environments and models that have rows under conditions.
+    """Return the settings object, environment and model with only those names that have
+    rows under conditions; unchanged where there are no such rows.
 
     Args:
         config: settings of the sweep.
         values_inside: values that each factor has under the conditions.
     """
-    outer = {name: getattr(config, name) for name in SCENE_SETTINGS}
-    for name, setting in outer.items():
+    scene_settings = {name: getattr(config, name) for name in SCENE_SETTINGS}
+    for name, setting in scene_settings.items():
         if name not in values_inside or setting is None:
             continue
         names: list[str] = []
         for value in values_inside[name]:
             names += find_names(config, name, value)
-        outer[name] = ",".join(names) or setting
-    return outer
+        scene_settings[name] = ",".join(names) or setting
+    return scene_settings
 
 
 def cut_controls(
@@ -113,16 +124,17 @@ def cut_controls(
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
-        if condition.options is not None or not is_sampled(config, condition.factor):
+        is_of_names = condition.options is not None
+        if is_of_names or not is_sampled(config, condition.factor):
             continue
         instance, _, parameter = condition.factor.partition(".")
         declared = config.declared_parameters(instance) or {}
-        if condition.turn:
+        if condition.turn:  # an angle
             low, high = condition.arcs[arc % len(condition.arcs)]
         else:
             low = max(condition.low, float(table[condition.factor].min()))
             high = min(condition.high, float(table[condition.factor].max()))
-        if high > declared[parameter].high:
+        if high > declared[parameter].high:  # an angle that passes 360 degrees
             continue
         has_ranges = bool(declared.keys() & config.controls[instance].keys())
         if not has_ranges:
@@ -172,26 +184,17 @@ def make_sweep_along(
         table: the rows, whose values the factor has.
         seed: of the noise.
     """
-    column = table[factor]
-    if column.dtype == "category":
-        candidates: Sequence[float | str] = column.cat.categories.tolist()
-    else:
-        candidates = [
-            float(f"{value:.4g}")
-            for value in np.linspace(column.min(), column.max(), N_VALUES_ALONG)
-        ]
-    values = list(dict.fromkeys([row[factor], *candidates]))
-
+    values = list_values_along(table[factor], row[factor])
     grid: dict[str, object] = {
         name: [row[name]] for name in row if "." in name and is_settable(config, name)
     }
     # settings that are no axes: object, environment and model
-    outer = {
+    scene_settings = {
         name: next(iter(find_names(config, name, str(row[name]))), None)
         for name in SCENE_SETTINGS
     }
     if factor in SCENE_SETTINGS:
-        outer[factor] = ",".join(
+        scene_settings[factor] = ",".join(
             name for value in values for name in find_names(config, factor, str(value))
         )
     else:
@@ -211,8 +214,22 @@ def make_sweep_along(
         samples=None,
         seed=seed,
         **changes,
-        **outer,
+        **scene_settings,
     )
+
+
+def list_values_along(column: pd.Series, first: float | str) -> list[float | str]:
+    """Return the values of a factor that are tried: `first`, then all names of the
+    column, or `N_VALUES_ALONG` evenly spaced numbers of its range.
+    """
+    if column.dtype == "category":
+        candidates: Sequence[float | str] = column.cat.categories.tolist()
+    else:
+        candidates = [
+            float(f"{value:.4g}")
+            for value in np.linspace(column.min(), column.max(), N_VALUES_ALONG)
+        ]
+    return list(dict.fromkeys([first, *candidates]))  # each once
 
 
 def select_choices(
@@ -243,9 +260,11 @@ def select_choices(
 
 def is_sampled(config: SweepConfig, factor: str) -> bool:
     """Return whether a sweep samples a parameter from a range that can be set."""
+    # a parameter is called "control.parameter"; others are settings
     instance, dot, parameter = factor.partition(".")
-    is_frame = bool(config.path) and parameter == "time"
-    if not dot or is_frame or factor in config.grid or instance not in config.controls:
+    is_parameter = bool(dot) and instance in config.controls
+    is_frame = bool(config.path) and parameter == "time"  # of a drive
+    if not is_parameter or is_frame or factor in config.grid:
         return False
     return parameter in (config.declared_parameters(instance) or ())
 
@@ -279,6 +298,6 @@ def make_minimal_config(config: SweepConfig, **changes: object) -> SweepConfig:
         "aov": None,
         "surface": False,
     }
-    # where nothing is sampled, that is the default
+    # a sampler that was chosen would be refused where nothing is sampled
     sampler = {} if changes.get("controls") else {"sampler": "sobol"}
     return SweepConfig(**{**config.to_json(), **quiet, **changes, **sampler})
