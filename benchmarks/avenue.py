@@ -2,16 +2,19 @@
 ball around a road.
 
     python benchmarks/avenue.py [--size 300] [--spp 16] [--rounds 5] [--steps 40]
-    python benchmarks/avenue.py --attacks                              # whole attacks alone
+    python benchmarks/avenue.py --attacks [--distances 10 30 60] [--seeds 1]
     python benchmarks/avenue.py --searches [--distances 10 30 60] [--seeds 1]
     python benchmarks/avenue.py --loading [--rounds 5] [--environments avenue room]
+    python benchmarks/avenue.py --roulette [--size 96]
 
 It prints processor time as ratios: a warm picture (a primal render with the denoiser's
 guides), the gradient of a texture, and a search of `--steps` steps with both; and the
 seconds and the memory of loading each. Left out are the model, the random search
-beside, verification and the report, which do not know where the car stands. Last come
-whole attacks on the texture with all of that, each in a process of its own, and the
-most memory that each process has had.
+beside, verification and the report, which do not know where the car stands.
+
+`--attacks` measures whole attacks on the texture with all of that, each in a process of
+its own, the most memory that each process has had, and in how many of the seeds they
+are found. The model is to call the car something else than at the start.
 
 `--searches` measures the search of an attack alone, as a run makes it: with the window
 of the picture that it chooses, and with whole pictures, both by matrices of light
@@ -20,6 +23,9 @@ found are wrong. The model is to call the car what it calls it at the start.
 
 `--loading` measures what it takes to load a car in each place, in a process of its own
 that has imported everything and loaded another scene before; and the imports.
+found are wrong.
+
+`--roulette` measures images of the avenue by where Russian roulette begins.
 """
 
 from __future__ import annotations
@@ -51,6 +57,8 @@ from advsearch.questions.attack.carry_out import load_parts, make_problem
 from advsearch.questions.attack.run import choose_policy
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.library import list_environments
+from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE_DEPTH
+from advsearch.scene.mitsuba_backend.variant import population
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import LinearRenderer
 
@@ -82,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         default=15.0,
         help="of the camera, metres (default 15)",
     )
-    parser.add_argument("--attacks", action="store_true", help="whole attacks alone")
+    parser.add_argument("--attacks", action="store_true", help="whole attacks")
     parser.add_argument("--searches", action="store_true", help="searches alone")
     parser.add_argument("--loading", action="store_true", help="loading alone")
     parser.add_argument(
@@ -91,14 +99,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         default=[*list_environments("street"), *list_environments("place")],
         help="of `--loading` (default: all places)",
     )
+    parser.add_argument("--roulette", action="store_true", help="images alone")
     parser.add_argument(
         "--distances",
         type=float,
         nargs="+",
         default=[10.0, 30.0, 60.0],
-        help="of the camera in `--searches`, metres",
+        help="of the camera in `--attacks` and `--searches`, metres",
     )
-    parser.add_argument("--seeds", type=int, default=1, help="of `--searches`")
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="of `--attacks` and `--searches`"
+    )
     parser.add_argument(
         "--renders",
         type=int,
@@ -113,19 +124,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         for distance in args.distances:
             _compare_searches(distance, args)
         return 0
-    if not args.attacks:
+    if args.attacks:
+        for distance in args.distances:
+            _compare_attacks(distance, args)
+    elif args.roulette:
+        _compare_roulette(args)
+    else:
         _compare(args)
-    costs = {place: _in_a_process(place, args) for place in PLACES}
-    _tell(
-        f"attack of {args.steps} steps",
-        {place: seconds for place, (seconds, _) in costs.items()},
-    )
-    most = {place: memory for place, (_, memory) in costs.items()}
-    print(
-        "memory of the attack: avenue / street = "
-        f"{most['avenue'] / most['street']:.2f}   "
-        f"(MB at most: {', '.join(f'{place} {memory:.0f}' for place, memory in most.items())})"
-    )
     return 0
 
 
@@ -165,40 +170,75 @@ def _compare(args: argparse.Namespace) -> None:
     _tell(f"search of {args.steps} steps", searched)
 
 
-def _in_a_process(place: str, args: argparse.Namespace) -> tuple[float, float]:
-    """Processor seconds and the most memory, MB, of an attack in a process of its
-    own.
-    """
-    asked = json.dumps(
+class AttackCost(NamedTuple):
+    """What a whole attack took, and what became of it."""
+
+    seconds: float  # of the processor
+    memory: float  # largest, MB
+    ending: str  # value of `Ending`
+    trials: int  # of the adversarial configuration
+
+
+def _compare_attacks(distance: float, args: argparse.Namespace) -> None:
+    """Print what whole attacks at a distance take in each place."""
+    costs = {}
+    for place in PLACES:
+        costs[place] = [
+            _attack_in_process(place, distance, seed, args)
+            for seed in range(args.seeds)
+        ]
+        for seed, cost in enumerate(costs[place]):
+            print(
+                f"  {distance:.0f} m, {place}, seed {seed}: {cost.seconds:.1f} "
+                f"processor seconds, {cost.memory:.0f} MB, {cost.ending} "
+                f"({cost.trials} trials)",
+                flush=True,
+            )
+    _tell(
+        f"{distance:.0f} m, attack of {args.steps} steps",
         {
-            "place": place,
-            "steps": args.steps,
-            "resolution": args.size,
-            "distance": args.distance,
-        }
+            place: statistics.fmean(cost.seconds for cost in of_place)
+            for place, of_place in costs.items()
+        },
     )
+
+
+def _attack_in_process(
+    place: str, distance: float, seed: int, args: argparse.Namespace
+) -> AttackCost:
+    """Attack once, in a process of its own."""
+    settings = {
+        "place": place,
+        "camera": _camera(distance),
+        "steps": args.steps,
+        "resolution": args.size,
+        "seed": seed,
+        "label": _find_label(place, distance, args.size),
+    }
     done = subprocess.run(
-        [sys.executable, "-c", ATTACK, asked],
+        [sys.executable, "-c", ATTACK, json.dumps(settings)],
         check=True,
         stdout=subprocess.PIPE,
         text=True,
     )
-    seconds, memory = json.loads(done.stdout.splitlines()[-1])
-    return seconds, memory
+    return AttackCost(*json.loads(done.stdout.splitlines()[-1]))
 
 
 ATTACK = """
 import json, resource, sys, tempfile, advsearch
-asked = json.loads(sys.argv[1])
-settings = {"camera.azimuth": 0.0, "camera.elevation": 5.0, "camera.distance": asked["distance"]}
-with tempfile.TemporaryDirectory() as folder:
-    advsearch.attack(
-        advsearch.load_scene("car", asked["place"], settings=settings), controls="texture", steps=asked["steps"],
-        resolution=asked["resolution"], run=folder + "/run", progress=False,
-        label="mug", minimise=True,  # the bundled model knows no cars: it is to call this one a mug
+settings = json.loads(sys.argv[1])
+scene = advsearch.load_scene("car", settings["place"], settings=settings["camera"])
+with tempfile.TemporaryDirectory() as directory:
+    result = advsearch.attack(
+        scene, controls="texture", steps=settings["steps"], seed=settings["seed"],
+        resolution=settings["resolution"], label=settings["label"],
+        run=directory + "/run", progress=False,
     )
 used = resource.getrusage(resource.RUSAGE_SELF)
-print(json.dumps([used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0]))
+seconds = used.ru_utime + used.ru_stime
+summary = result.summary
+trials = summary.verified.trials if summary.verified else 0
+print(json.dumps([seconds, used.ru_maxrss / 1024.0, summary.ending, trials]))
 """
 
 
@@ -233,6 +273,38 @@ def _print_loading(environments: Sequence[str], rounds: int) -> None:
         both = statistics.median(cost[1] + cost[2] for cost in costs)
         numbers = "  ".join(f"{seconds:8.2f}" for seconds in [*medians, both])
         print(f"{environment:18} {numbers}", flush=True)
+def _compare_roulette(args: argparse.Namespace) -> None:
+    """Print time and squared error of images of the avenue, with and without roulette.
+
+    Errors are those of the displayed and denoised image, in squared levels of 255, from
+    one of many samples without roulette.
+    """
+    scene = load_scene("car", "avenue", settings=_camera(args.distance))
+    renderer = scene.renderer(["texture"], resolution=args.size)
+    backend = renderer.scene
+    first_bounce = backend.roulette_depth
+    true_image = torch.zeros(())
+    for depth in (NO_ROULETTE_DEPTH, first_bounce + 2, first_bounce + 1, first_bounce):
+        backend.roulette_depth = depth
+        backend._integrators.clear()
+        population.changes += 1
+        with torch.no_grad():
+            if depth == NO_ROULETTE_DEPTH:
+                true_image = renderer(renderer.start, 0, 16 * args.spp)
+            renderer(renderer.start, 1, args.spp)
+            begin = time.process_time()
+            images = [
+                renderer(renderer.start, 2 + number, args.spp)
+                for number in range(args.rounds)
+            ]
+            seconds = (time.process_time() - begin) / args.rounds
+        errors = [float((image - true_image).square().mean()) for image in images]
+        square = 255.0**2 * statistics.fmean(errors)
+        print(
+            f"roulette from bounce {depth} on: {seconds:.3f} processor seconds, "
+            f"squared error {square:.2f}, times time {square * seconds:.2f}",
+            flush=True,
+        )
 
 
 def _camera(distance: float) -> dict[str, float]:

@@ -292,15 +292,15 @@ def _time_gradients(
     spp: int,
     repeats: int,
 ) -> tuple[list[float], list[float]]:
-    """The median seconds of a gradient by each renderer, and its squared error."""
+    """The median processor seconds of a gradient by each, and its squared error."""
     for way in ways:
         way.gradient(loss, u, 0, spp)
     found: list[list[tuple[float, float]]] = [[] for _ in ways]
     for number in range(repeats):
         for way, results in zip(ways, found, strict=True):
-            begun = time.perf_counter()
+            begun = time.process_time()
             estimate = way.gradient(loss, u, seeds.stream(2, "working", number), spp)[1]
-            seconds = time.perf_counter() - begun
+            seconds = time.process_time() - begun
             results.append((seconds, float((estimate - truth).square().sum())))
     times = [statistics.median(one[0] for one in results) for results in found]
     errors = [statistics.fmean(one[1] for one in results) for results in found]

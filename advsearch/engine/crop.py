@@ -2,8 +2,8 @@
 
 The rest of each image is that of a whole one. It is rendered again every
 `COMPARISON_INTERVAL` evaluations, which also measures what was missed. Where this is
-too much twice in a row, the rest of the search renders whole images. The ranking and
-all trials do so anyway. How the window is chosen: `advsearch.engine.windows`.
+too much twice in a row, the rest of the search renders whole images. All trials do so
+anyway. How the window is chosen: `advsearch.engine.windows`.
 """
 
 from __future__ import annotations
@@ -87,6 +87,11 @@ class CroppedSearch(PredictedSearch):
         self.n_traced += 1
         self._current[kind] = image, renderer
         return renderer
+
+    def get_window_renderer(self, kind: str) -> Renderer | None:
+        if self.windowing is None or kind in self.first_traced:
+            return None
+        return self._current.get(kind, self._current["start"])[1]
 
     def replay(self, query: Query) -> None:
         self._update(query)

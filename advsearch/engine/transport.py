@@ -3,7 +3,7 @@
 The matrix of light transport predicts images where nothing varies by chance. Every
 `COMPARISON_INTERVAL` evaluations predictions are compared with traced images: where
 they are too far off (`engine.acceptance`), the matrix is computed again. The ranking
-and all trials trace paths.
+and all trials trace paths; the ranking does so in the window.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from advsearch.engine.windows import (
 from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.predictor import Predictor, Refusal, RefusalCause
+from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import (
     count_lights,
     count_samples,
@@ -194,6 +195,27 @@ class PredictedSearch(ABC):
         """
         return map(self.evaluate, queries)
 
+    def get_window_renderer(self, kind: str) -> Renderer | None:
+        """Return what traces the window alone, at the end of a kind of search.
+
+        None where whole images are rendered.
+        """
+        return None
+
+    def rank_all(
+        self, queries: Sequence[Query], trace: Evaluate
+    ) -> Iterator[Evaluation]:
+        """Evaluate queries of a ranking, all of one kind, lazily.
+
+        Paths are traced, in the window if there is one. `trace` evaluates whole images.
+        """
+        renderer = self.get_window_renderer(queries[0].kind)
+        if renderer is None:
+            yield from trace(queries)
+            return
+        for query in queries:
+            yield self.problem.evaluate_full(query, query.u, query.seed, renderer)[0]
+
     @abstractmethod
     def measure_size(self) -> tuple[int, int]:
         """Return the entries of the matrices, for one color channel, and their
@@ -338,6 +360,12 @@ class Transport(PredictedSearch):
             predictor = make_predictor(renderer, u, seed, tick)
         self.n_traced += predictor.n_traced_images
         return predictor
+
+    def get_window_renderer(self, kind: str) -> Renderer | None:
+        if self.window is None or kind in self.first_traced:
+            return None
+        predictor = self._current.get(kind, self.start)
+        return self.problem.renderer.copy_with(crop=predictor.path_renderer.crop)
 
     def replay(self, query: Query) -> None:
         self._update_predictor(query)

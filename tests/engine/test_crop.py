@@ -163,8 +163,8 @@ def test_a_search_that_needs_whole_pictures_says_why(changes: dict[str, Any], re
 
 
 @pytest.mark.medium
-def test_a_resumed_search_has_the_same_rows(tmp_path: Path) -> None:
-    """Window and surroundings are found again, also after a comparison."""
+def test_a_resumed_search_and_one_with_workers_have_the_same_rows(tmp_path: Path) -> None:
+    """Window and surroundings are found again, also after a comparison and for the ranking."""
     settings = {**SMALL, "deterministic": True}
     whole = attack_once(AttackConfig(**settings, run=str(tmp_path / "whole"))).summary
     assert whole.transport is not None and whole.transport.way == "crop"
@@ -174,6 +174,8 @@ def test_a_resumed_search_has_the_same_rows(tmp_path: Path) -> None:
     assert attack_once(config, progress=Impatient(22)).summary.ending == "interrupted"
     attack_once(config, resumed=tmp_path / "parts")
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
+    attack_once(AttackConfig(**settings, run=str(tmp_path / "workers"), workers=2))
+    assert rows(tmp_path / "workers") == rows(tmp_path / "whole")
 
 
 @pytest.mark.medium

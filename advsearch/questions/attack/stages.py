@@ -483,16 +483,18 @@ class Searches:
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries with predicted or rendered images.
 
-        Only steps of a search are predicted; its ranking, and what verifies, is
-        rendered. Print terms are subtracted from the objective.
+        Only steps of a search are predicted. Its ranking is rendered, in the window of
+        the predictor, and what verifies in full. Print terms are subtracted from the objective.
 
         Args:
             queries: all of one phase.
         """
         traced = self.journal.evaluator
         predictor = self.findings.predictor
-        if predictor is None or not queries or queries[0].phase != "search":
+        if predictor is None or not queries:
             evaluations = traced(queries)
+        elif queries[0].phase == "ranking":
+            evaluations = predictor.rank_all(queries, traced)
         else:
             evaluations = predictor.evaluate_all(queries, traced)
         for query, evaluation in zip(queries, evaluations, strict=True):

@@ -196,8 +196,9 @@ def scene_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
 
     # Mitsuba's path integrator renders no volumes.
     if not scene.is_volumetric:
-        make_problem = partial(with_scene, problem, integrator="path")
-        description = "Mitsuba's path in place of prb"
+        integrator = "prb" if scene.integrator == "path" else "path"
+        make_problem = partial(with_scene, problem, integrator=integrator)
+        description = f"Mitsuba's {integrator} in place of {scene.integrator}"
         yield ReplayCondition("integrator", description, make_problem, spp)
 
     sampler = "independent"

@@ -56,11 +56,16 @@ from advsearch.scene.window import Window
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE_DEPTH = 1000
-ROULETTE_DEPTH = 2
-"""Segments after which Russian roulette starts.
+ROULETTE_DEPTH = 1
+"""Bounces after which Russian roulette may end a path of a primal render.
 
-It never starts where paths soon leave the scene by themselves. Among houses it saves a
-third of the time without more noise; from 1 on, single gradients were a fifth off.
+It never does where paths soon leave the scene by themselves. Among houses it halves the
+time of images, and squared error times time once they are denoised
+(`benchmarks/avenue.py --roulette`).
+"""
+GRADIENT_ROULETTE_DEPTH = 2
+"""Likewise, after the first, of an adjoint: from 1 on, single gradients were a fifth
+off.
 """
 # samples per pixel of the shadow term; without it the gradient of an object on the
 # ground has a cosine of 0.66 to the true one
@@ -80,7 +85,8 @@ class MitsubaScene:
         parameters: Mitsuba's own.
         plane_radiance: (3,) of the plane that takes the shadow in a photograph, without
             the object; None if there is none.
-        roulette_depth: segments of a light path after which Russian roulette starts.
+        integrator: Mitsuba's name of the path integrator of primal renders.
+        roulette_depth: bounces after which Russian roulette may end a path there.
         declared_inputs: for each input its key in `parameters`, and its definition.
         interior_inputs: the inputs that the interior adjoint differentiates correctly.
         window: the window of the image that is rendered; None for all of it.
@@ -95,7 +101,8 @@ class MitsubaScene:
         sampler: Mitsuba's name of the sampler; some round sample counts up, see
             `round_sample_count`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there
-            is no medium.
+            is no medium. None takes `path` where there is roulette, which can begin
+            with the first bounce there, and `prb` elsewhere.
     """
 
     def __init__(
@@ -107,7 +114,7 @@ class MitsubaScene:
         leave_out: Collection[str] = ALL_OMISSIONS,
         max_depth: int = MAX_DEPTH,
         sampler: str = SAMPLER,
-        integrator: str = "prb",
+        integrator: str | None = None,
     ) -> None:
         """Load a description into Mitsuba; arguments are those of the class."""
         with mitsuba_lock:
@@ -130,9 +137,13 @@ class MitsubaScene:
                 map(has_textured_emission, description.meshes.values())
             )
             self._freeze = "tracing" in leave_out and not unrecorded
-            self.roulette_depth = (
-                ROULETTE_DEPTH if is_enclosed(description) else NO_ROULETTE_DEPTH
-            )
+            self.integrator = integrator or "prb"
+            self.roulette_depth = NO_ROULETTE_DEPTH
+            self._gradient_roulette_depth = NO_ROULETTE_DEPTH
+            if is_enclosed(description):
+                self.integrator = integrator or "path"
+                self.roulette_depth = ROULETTE_DEPTH
+                self._gradient_roulette_depth = GRADIENT_ROULETTE_DEPTH
             self._pinhole = (
                 not description.thin_lens and description.camera_model is None
             )
@@ -154,7 +165,8 @@ class MitsubaScene:
             if description.has_opacity:
                 self._guides = {"type": "advsearch_guides"}
             self.is_volumetric = any(part.volumetric for part in description.parts)
-            self._path: Plugin = {"type": integrator}
+            # entries of every path integrator
+            self._path: Plugin = {}
             inputs = self._load_scene()
             self._sensor = self._scene.sensors()[0]
             self.parameters = mi.traverse(self._scene)
@@ -493,6 +505,8 @@ class MitsubaScene:
             if "boundary" not in self._leave_out and has_boundary:
                 method = "boundary"
                 extra = extra | self._buffers
+            if method == "path" and self.integrator != "prb":
+                method = "adjoint"
             image_gradient = cotangent.detach().to(torch.float32)
             color_gradient = image_gradient[..., :3]
             if self._backdrop:  # coverage has no derivative
@@ -757,22 +771,30 @@ class MitsubaScene:
     def _integrator(self, method: str) -> Any:
         """Return the integrator of a method at the current depth, loaded on first use.
 
-        The methods are "path", "hidden", which hides the environment, "guides" for the
-        denoiser, and "boundary" with the terms of moving outlines.
+        The methods are "path" for images, "adjoint" for derivatives of them, "hidden"
+        for both without the environment, "guides" for the denoiser, and "boundary" with
+        the terms of moving outlines.
         """
         key = method, self.depth
         if key not in self._integrators:
-            path = {
+            adjoint = {
                 "type": "prb",
+                "max_depth": self.depth,
+                "rr_depth": self._gradient_roulette_depth,
+                **self._path,
+            }
+            path = {
+                "type": self.integrator,
                 "max_depth": self.depth,
                 "rr_depth": self.roulette_depth,
                 **self._path,
             }
-            hidden = {**path, "hide_emitters": True}
+            hidden = {**adjoint, "hide_emitters": True}
             if self.plane_radiance is not None:
                 hidden["type"] = "advsearch_photograph"
             recipes: dict[str, Plugin] = {
                 "path": path,
+                "adjoint": adjoint,
                 "hidden": hidden,
                 "guides": self._guides,
                 "boundary": {
