@@ -92,6 +92,3 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     summary = run_and_save(curve, RunContext(config, resumed=Path("runs/study")))
     assert [row.object for row in summary.table] == ["mug", "bowl", "vase", "pan"]
     assert len(asked) == 4, "two before the stop, two after it"
-
-
-# ---- rendered -------------------------------------------------------------------------------------------------------

@@ -202,9 +202,6 @@ def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
     assert torch.equal(result.best_u, at(0.2))
 
 
-# ---- choices and distributions
-
-
 # ---- stopping early
 
 
@@ -308,9 +305,6 @@ def test_an_interrupt_keeps_the_best_so_far(number: int, expected: float) -> Non
     assert result.ending is Ending.INTERRUPTED
     assert torch.equal(result.best_u, at(expected))
     assert result.renders == number - 1
-
-
-# ---- bugs and bad input
 
 
 # ---- candidates

@@ -215,9 +215,6 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
     ]
 
 
-# ---- studies, regions and sweeps ----
-
-
 # ---- resume, runs, export ----
 
 

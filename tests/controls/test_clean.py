@@ -71,9 +71,6 @@ def test_a_control_that_agrees_starts_at_what_was_asked_for(
             assert (value["value"] - given[name]) % 360.0 == pytest.approx(0.0, abs=1e-4)
 
 
-# ---- what nobody asked for moves, and that is said ------------------------------------------------------------------
-
-
 # ---- a control says what the setting of the same name says ----------------------------------------------------------
 
 

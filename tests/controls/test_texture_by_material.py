@@ -198,6 +198,3 @@ def test_materials_beside_each_other_on_one_picture_share_no_texel(tmp_path: Pat
     assert np.array_equal(seen(mesh, other, own, 4000), seen(mesh, other, after, 4000))
     changed = (own != after).any(axis=2)
     assert changed[:, 1:159].all() and not changed[:, 159:].any() and not changed[:, 0].any()
-
-
-# ---- what takes part in a search -------------------------------------------------------------------------------------

@@ -38,9 +38,6 @@ def group(name: str, begin: int, size: int, valid: tuple[str, ...], **more: Any)
     return Group(parameter, size, valid, control=control, begin=begin, **more)
 
 
-# ---- the plan as data -----------------------------------------------------------------------------------------------
-
-
 # ---- what estimators compute ----------------------------------------------------------------------------------------
 
 
@@ -202,6 +199,3 @@ def test_a_rotation_vector_is_a_rotation_with_a_derivative_at_zero() -> None:
         assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
     turned = make_euler_rotation(torch.tensor(30.0), torch.tensor(0.0), torch.tensor(0.0))
     assert torch.allclose(make_vector_rotation(torch.tensor([0.0, 0.0, 30.0])), turned, atol=1e-6)
-
-
-# ---- how fast things move -------------------------------------------------------------------------------------------

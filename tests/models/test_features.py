@@ -78,9 +78,6 @@ def test_an_exported_program_gives_what_its_module_gave(tmp_path: Path, lower: C
     assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
 
 
-# ---- nothing to look into -------------------------------------------------------------------------------------------
-
-
 # ---- all of them ----------------------------------------------------------------------------------------------------
 
 

@@ -103,9 +103,6 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
         check_disjoint(SceneSplit(HELD_OUT, ("ball",), ("noon",), 2), [training])
 
 
-# ---- what is trained ------------------------------------------------------------------------------------------------
-
-
 # ---- lessons and training -------------------------------------------------------------------------------------------
 
 

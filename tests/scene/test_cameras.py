@@ -330,6 +330,3 @@ def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> 
     straight = 48 * (flat[:, :2] / flat[:, 2:] * (fx, fy) + (cx, cy))
     ends = (*straight.min(axis=0), *straight.max(axis=0))
     assert max(abs(a - b) for a, b in zip(seen.box, ends, strict=True)) > 2.5, "a pinhole's box is another one"
-
-
-# ---- as users name it -----------------------------------------------------------------------------------------------

@@ -115,9 +115,6 @@ def area(part: ImportedPart) -> np.ndarray:
     return np.asarray(np.cross(b - a, c - a).sum(axis=0) / 2.0)
 
 
-# --- materials ----------------------------------------
-
-
 # --- geometry ----------------------------------------
 
 

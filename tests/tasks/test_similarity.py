@@ -304,6 +304,3 @@ def test_a_sweep_counts_what_is_not_itself_any_more(
     found = typed(capsys, "sweep", "--object", "mug", *flags, "--run", str(tmp_path / "run"))
     assert (found["configurations"], found["correct"]) == (2, 1)
     assert found["worst"]["claimed"]["label"] == SOMETHING_ELSE and found["worst"]["claimed"]["payload"]["cosine"] < 0.9
-
-
-# ---- wrong uses -----------------------------------------------------------------------------------------------------

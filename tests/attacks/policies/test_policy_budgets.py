@@ -52,6 +52,3 @@ def stated() -> list[Any]:
 def test_a_policy_reaches_the_optimum_within_its_stated_budget(name: str, objective: str, d: int, renders: int) -> None:
     """`reached` also fails a policy that leaves the domain, or a wrong optimum."""
     assert all(closed_form.reached(make_policy(name), objective, d, renders, seed) for seed in range(3))
-
-
-# ---- the page

@@ -11,9 +11,6 @@ from torch import Tensor
 
 from advsearch.attacks import NES, PGD, Block, Domain, Evaluation, Query, Restarts, search, seeded
 
-# ---- races
-
-
 # ---- restarts
 
 
@@ -37,9 +34,6 @@ def test_restarts_find_the_higher_of_two_hills() -> None:
     assert value(several.best_u) > 1.9
 
 
-# ---- portfolio
-
-
 # ---- choices
 
 
@@ -60,6 +54,3 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
     assert (float(spread.mean[1]), float(spread.deviation[1])) == (0.5, 0.0)
     drawn = spread.sample(seeded(0, 0), 5, domain)
     assert all(domain.contains(u) and float(u[1]) == 0.5 for u in drawn)
-
-
-# ---- names
