@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import yaml
-from check_docs import PAGES, ROOT, blocks, name_of, script
+from check_docs import DOCS, PAGES, ROOT, blocks, name_of, script
 
 import advsearch
 import advsearch.config
@@ -21,6 +22,7 @@ from advsearch.attacks.objectives import check_objective
 from advsearch.cli.flags import make_config
 from advsearch.cli.main import _parse
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
+from advsearch.engine.acceptance import compare_views, compare_with_traced
 from advsearch.engine.loading import make_controls
 from advsearch.engine.naming import check_run_settings, make_configured_controls
 from advsearch.files import MESHES
@@ -221,3 +223,46 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
     for block in blocks(PAGES[0], "python"):
         exec(compile(block, "README.md", "exec"), names)
     assert names["result"].search.renders == count_planned_renders(40)
+
+
+def code_with(page: str, word: str) -> dict[str, Any]:
+    """Run the only Python block of a page that has a word, and return its names."""
+    (block,) = [one for one in blocks(DOCS / page, "python") if word in one]
+    names: dict[str, Any] = {"__name__": "of_the_page"}
+    exec(compile(block, page, "exec"), names)
+    return names
+
+
+@pytest.mark.medium
+@pytest.mark.docs
+def test_the_page_about_losses_of_ones_own_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every block, after those before it, with smaller pictures and fewer steps than on the page."""
+    page = DOCS / "own-loss.md"
+    small: dict[str, Any] = {"steps": 2, "trials": 6, "spp": 2, "verify_spp": 4, "denoise": "none", "measure": "no"}
+    small |= {"baseline": False}
+    names: dict[str, Any] = {}
+    endings: list[str] = []
+    attacked = advsearch.attack
+    monkeypatch.setattr(advsearch, "attack", lambda *asked, **given: attacked(*asked, **{**given, **small}))
+    for block in blocks(page, "python"):
+        names.pop("result", None)
+        exec(compile(block.replace("resolution=48", "resolution=16"), page.name, "exec"), names)
+        names.setdefault("quick", {})["resolution"] = 24
+        endings += [names["result"].summary.ending] if "result" in names else []
+    assert len(endings) == 7 and not {"already wrong"} & {*endings}
+    assert names["wrong"] and float(names["u"].grad.abs().max()) > 0.0 and float(names["derivative"].abs().max()) > 0.0
+
+
+@pytest.mark.docs
+def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
+    renderer = advsearch.load_scene("mug").renderer({"environment": {"exposure": [-2, 0]}}, resolution=32)
+    predictor = code_with("development.md", "Predictor")["Dimmed"](renderer, renderer.start, seed=1)
+    u = torch.tensor([0.2], requires_grad=True)
+    picture = predictor(u)
+    picture.mean().backward()
+    assert u.grad is not None and float(u.grad) > 0.0
+    still = u.detach()
+    deviation = compare_views(
+        lambda view: compare_with_traced(renderer, picture.detach(), still, view, 16, lambda *_: 0.0)
+    )
+    assert deviation.is_accepted, deviation.reason

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from advsearch.attacks import make_policy
+from advsearch.attacks import Evaluation, Query, make_policy
 from advsearch.cli.flags import format_as_flags
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import RunState
@@ -23,7 +23,7 @@ from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import Config
-from stand_ins import StandInProblem, attack_on, configuration
+from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
 """Words of our own, which nobody who waits should have to know."""
@@ -167,3 +167,29 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
     with RunDirectory.resume(tmp_path / "run") as run, RunDirectory.resume(tmp_path / "whole") as other:
         counts = run.store.count_by_kind()
         assert counts == other.store.count_by_kind() and counts["sample count worst"] + 14 == rendered + 4
+
+
+def test_a_resumed_run_takes_its_probes_from_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = configuration().model_copy(update={"verify_spp": None})
+    whole = carry_out(tmp_path / "whole", config)
+    rendered: list[tuple[int, bool]] = []
+    once = StandInProblem.evaluate
+
+    def evaluate(self: Any, query: Query) -> Evaluation:
+        if query.phase is None:
+            rendered.append((query.spp, query.draws_conditions))
+            if len(rendered) == stop:
+                raise KeyboardInterrupt
+        return once(self, query)
+
+    monkeypatch.setattr(StandInProblem, "evaluate", evaluate)
+    stop = 4 + 10  # the first look, then in the middle of the probes
+    assert carry_out(tmp_path / "run", config).interrupted
+    stop, before = 0, len([one for one in rendered if not one[1]])
+    rendered.clear()
+    resumed = carry_out(tmp_path / "run", config, resume=True)
+    again = len([one for one in rendered if not one[1]])
+    assert resumed.sample_count == whole.sample_count and whole.sample_count is not None
+    assert before - 1 + again == whole.sample_count.renders  # the one that was interrupted is rendered again
+    assert resumed.verification_renders == whole.verification_renders
+    assert rows(tmp_path / "run") == rows(tmp_path / "whole")

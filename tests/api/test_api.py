@@ -13,8 +13,10 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.cli.output import format_result as text_of
+from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.runs.listing import can_resume
+from advsearch.runs.listing import can_resume, list_runs
 from advsearch.runs.store import Row, Store
 from stand_ins import interrupted
 
@@ -158,3 +160,56 @@ def test_nan_logits_during_the_search_end_it_and_are_counted(scene: advsearch.Sc
     summary = advsearch.attack(scene, victim, baseline=False, **FAST).summary
     assert summary.ending == "non-finite objective"
     assert summary.non_finite.objectives == 3
+
+
+@pytest.mark.medium
+def test_conditions_are_other_ones_in_every_trial_and_the_same_for_both_groups(
+    scene: advsearch.Scene, level: float, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    summary = advsearch.attack(scene, model(level + 0.1), over=["camera"], draws=2, run=run, **FAST).summary
+    assert summary.over == ["camera"] and summary.controls == ["texture"]
+    with Store(run / "results.sqlite", read_only=True) as store:
+        clean, adversarial = (
+            [row.values["camera.azimuth"]["value"] for row in store.rows(kind)] for kind in ("control", "verification")
+        )
+    assert len(set(clean)) == 6
+    assert adversarial in ([], clean)  # nothing, if the clean scene is wrong in half of them
+
+
+def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    victim = model(level)
+    with pytest.raises(InputError, match="label"):
+        advsearch.attack(scene, victim, label="teapot", run=run, **FAST)
+    with pytest.raises(UnknownNameError, match=r"unknown policy 'pgdd'. Did you mean 'pgd'"):
+        advsearch.attack(scene, victim, policy="pgdd", run=run, **FAST)
+    with pytest.raises(InputError, match="step"):
+        advsearch.attack(scene, victim, run=run, **{**FAST, "steps": 0})
+    assert not run.exists()
+    run.mkdir()
+    (run / "mine.txt").write_text("keep", encoding="utf-8")
+    with pytest.raises(RunExistsError, match="not empty and not a run"):
+        advsearch.attack(scene, victim, run=run, **FAST)
+    assert (run / "mine.txt").read_text("utf-8") == "keep"
+
+
+@pytest.mark.medium
+def test_a_configuration_whose_check_is_interrupted_is_told_and_verified_later(
+    scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, wrong = tmp_path / "run", model(level + 0.02)
+    asked: dict[str, Any] = {**FAST, "controls": {"light": {"power": [0, 40]}}, "baseline": False, "run": run}
+
+    def stopped(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("advsearch.engine.verifier.choose_spp", stopped)
+        first = advsearch.attack(scene, wrong, **asked)
+    said = "What was found so far is not verified: the model calls this mug a vase."
+    assert first.summary.ending == "interrupted" and first.summary.verified is None and first.search is not None
+    assert said in text_of(first.summary) and said in (run / "report.html").read_text()
+    assert list_runs(tmp_path)[0].answer == "vase, unverified"
+    done = advsearch.attack(scene, wrong, **asked, resume=True)
+    assert done.found and torch.equal(done.u, first.u) and list_runs(tmp_path)[0].answer == "6/6"

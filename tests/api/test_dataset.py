@@ -166,3 +166,65 @@ def test_pycocotools_reads_it(driven: tuple[Path, Path]) -> None:
     assert len(found.getImgIds()) == 3 and found.getCatIds(catNms=["car"]) == [1]
     for one in found.loadAnns(found.getAnnIds()):
         assert (found.annToMask(one) == decoded(one["segmentation"])).all()
+
+
+def seen_by_rays(parts: dict[str, npt.NDArray[np.float64]], size: tuple[int, int], focal: float) -> Any:
+    """The name of the part that is nearest at each pixel's middle, of triangles (F, 3, 3) in a camera's space: x left,
+    y up, z forward."""
+    height, width = size
+    nearest, names = np.full(size, np.inf), np.full(size, "", dtype=object)
+    for name, triangles in parts.items():
+        triangles = triangles[(triangles[:, :, 2] > 0.01).all(axis=1)]
+        inverse_depth = 1.0 / triangles[:, :, 2]
+        across = width / 2 - focal * triangles[:, :, 0] * inverse_depth
+        down = height / 2 - focal * triangles[:, :, 1] * inverse_depth
+        for x, y, inverse in zip(across, down, inverse_depth, strict=True):
+            doubled = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
+            left, right = max(0, int(x.min()) - 1), min(width, int(x.max()) + 2)
+            top, bottom = max(0, int(y.min()) - 1), min(height, int(y.max()) + 2)
+            if doubled == 0.0 or left >= right or top >= bottom:
+                continue
+            rows, columns = np.mgrid[top:bottom, left:right] + 0.5
+            first = ((x[1] - columns) * (y[2] - rows) - (x[2] - columns) * (y[1] - rows)) / doubled
+            second = ((x[2] - columns) * (y[0] - rows) - (x[0] - columns) * (y[2] - rows)) / doubled
+            shares = np.stack([first, second, 1.0 - first - second])
+            with np.errstate(divide="ignore"):
+                depth = np.where((shares >= 0.0).all(axis=0), 1.0 / np.tensordot(inverse, shares, 1), np.inf)
+            region = np.s_[top:bottom, left:right]
+            names[region] = np.where(depth < nearest[region], name, names[region])
+            nearest[region] = np.minimum(depth, nearest[region])
+    return names
+
+
+@pytest.mark.medium
+def test_a_drive_has_every_thing_where_rays_meet_it(driven: tuple[Path, Path]) -> None:
+    written = json.loads((driven[1] / "annotations.json").read_text())
+    scene = advsearch.load_scene("car", "street", things=BESIDE).description
+    triangles = {
+        name: (part.mesh.vertices @ part.to_world[:3, :3].T + part.to_world[:3, 3])[part.mesh.faces]
+        for name, part in scene.meshes.items()
+        if name in ("object", "oncoming", "person")
+    }
+    corners = triangles["object"].reshape(-1, 3)
+    middle, metres = (corners.min(axis=0) + corners.max(axis=0)) / 2.0, scene.size_in_metres
+    focal = 60.0 / np.tan(np.radians(scene.get_number("camera.fov")) / 2.0)
+    seen = set()
+    for image, place in zip(written["images"], CAMERAS, strict=True):
+        x, y, z = np.array(place) / metres
+        eye = middle + np.array([x, y, z])
+        forward = (middle - eye) / np.linalg.norm(middle - eye)
+        left = np.cross([0.0, 0.0, 1.0], forward)
+        left /= np.linalg.norm(left)
+        axes = np.stack([left, np.cross(forward, left), forward], axis=1)
+        names = seen_by_rays({name: (part - eye) @ axes for name, part in triangles.items()}, (90, 120), focal)
+        here = [one for one in written["annotations"] if one["image_id"] == image["id"]]
+        assert {one["name"] for one in here} == set(names.ravel()) - {""}
+        for one in here:
+            mask, true = decoded(one["segmentation"]), names == one["name"]
+            rows, columns = np.nonzero(true)
+            box = [columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1]
+            assert (mask & true).sum() / (mask | true).sum() > 0.98
+            assert one["bbox"] == pytest.approx(box, abs=1.0)
+            assert one["category_id"] == (0 if one["name"] == "person" else 1)
+            seen |= {(one["name"], one["truncated"])}
+    assert seen == {("object", False), ("oncoming", False), ("oncoming", True), ("person", False)}

@@ -359,3 +359,19 @@ def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> Non
     assert right[20] > right[0] + 3 and right[20] >= 45
     found = search(noisy(3), DOMAIN, script, steps=2, seed=0, max_extra_repeats=20)
     assert found.renders <= count_planned_renders(2, max_extra_repeats=20) and len({r.seed for r in found.ranking}) >= 2
+
+
+def test_three_in_a_row_end_the_search() -> None:
+    bad = {1, 3, 4, 5}
+    evaluate = objective_is(lambda u, index: math.nan if index in bad else -1.0)
+    result = search(evaluate, DOMAIN, Script((at(0.0),) * 9), steps=9, seed=0)
+    assert result.ending is Ending.NON_FINITE
+    assert len(result.history) == 6
+    assert result.non_finite_objectives == 4
+
+
+def test_a_candidate_that_turns_nan_when_ranked_is_not_the_result() -> None:
+    evaluate = objective_is(lambda u, index: math.nan if index >= 2 and float(u[0]) > 0.55 else float(u[0] - 0.5))
+    result = search(evaluate, DOMAIN, Script((at(0.1), at(0.02))), steps=2, seed=0)
+    assert torch.equal(result.best_u, at(0.02))
+    assert result.non_finite_objectives == 2

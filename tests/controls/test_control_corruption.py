@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy import stats
 from torch import Tensor
 
 from advsearch.controls import corruption
 from advsearch.controls.corruption import CORRUPTION_NAMES, STEPPED_CORRUPTIONS, apply_corruption, filters
+from advsearch.controls.corruption.filters import sample_poisson
 from advsearch.scene.description import SceneDescription, load_description
 
 every_corruption = pytest.mark.parametrize("which", CORRUPTION_NAMES)
@@ -158,3 +160,20 @@ def test_stepped_corruptions_round_the_severity_and_slope_between_the_steps(whic
     seen.sum().backward()
     step = apply_corruption(image, which, number(3.0)) - apply_corruption(image, which, number(2.0))
     assert at.grad is not None and float(at.grad) == pytest.approx(float(step.sum()), abs=0.05)
+
+
+def test_poisson_numbers_are_those_of_the_distribution() -> None:
+    generator = torch.Generator().manual_seed(3)
+    mean, share = torch.rand(500, generator=generator) * 60.0, torch.rand(500, generator=generator)
+    expected = stats.poisson.ppf(share.double().numpy(), mean.double().numpy())
+    assert np.array_equal(sample_poisson(mean, share).numpy(), expected.astype(np.float32))
+    assert float(sample_poisson(torch.zeros(9), torch.linspace(0.0, 0.9999, 9)).max()) == 0.0
+
+
+def test_impulse_noise_has_the_slope_of_its_average() -> None:
+    image, weights = scenery(), scenery().flip(0) - 0.5
+    at = torch.tensor(3.5, requires_grad=True)
+    (apply_corruption(image, "impulse_noise", at) * weights).sum().backward()
+    gain = filters.IMPULSE[3][0] - filters.IMPULSE[2][0]
+    assert at.grad is not None
+    assert float(at.grad) == pytest.approx(float((gain * (0.5 - image) * weights).sum()), abs=4.0)

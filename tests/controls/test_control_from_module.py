@@ -86,3 +86,28 @@ def test_how_to_go_on_names_the_code_that_is_needed(
     if named:
         assert main([*line.split()[4:], "--quiet"]) == 2
         assert Path("imported").exists() and "RuntimeError: planted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"model": "planted:make"}, "planted:make"),
+        ({"model": "planted:make@weights.safetensors"}, "planted:make"),
+        ({"controls": {"planted:Fade": {}}}, "planted:Fade"),
+        ({"controls": {"mine": {"kind": "planted:Fade"}}}, "planted:Fade"),
+        ({"over": {"planted:Fade": {}}}, "planted:Fade"),
+    ],
+)
+@pytest.mark.parametrize("command", ["resume theirs", "run runs/theirs/run.yaml", "region --around theirs"])
+def test_code_that_somebody_elses_file_names_is_not_run(
+    command: str, settings: dict[str, object], name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "over" in settings and command.startswith("region"):
+        settings = {"controls": settings["over"]}  # nothing varies by chance there
+    stopped_run(**settings)
+    assert main([*command.split(), "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert f"a file names {name}, Python code from {Path('planted.py').resolve()} that would be imported" in error
+    assert error.endswith(f"--code {name}\n") and not Path("imported").exists()
+    assert main([*command.split(), "--quiet", "--code", name]) == 2
+    assert Path("imported").exists() and "RuntimeError: planted" in capsys.readouterr().err

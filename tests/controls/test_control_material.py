@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,13 @@ from advsearch.controls.material import (
     make_covering,
     make_tile,
 )
+from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.mitsuba_backend.meshes import make_principled, to_loadable
+from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, translate_mesh, translate_part
+from advsearch.scene.mitsuba_backend.variant import mi
+from advsearch.scene.parts import PluginNumber, PluginNumbers
 from advsearch.scene.raster import rasterize_charts
 
 BASE_COLOR = "object.base_color"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from trimesh.visual.material import PBRMaterial
 
 import advsearch
 from advsearch.controls import make_control, make_space
+from advsearch.engine.judging import mean_variation, printable_distance
+from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.raster import find_exclusive_texels, find_read_texels, look_up_texture
@@ -198,3 +201,30 @@ def test_materials_beside_each_other_on_one_picture_share_no_texel(tmp_path: Pat
     assert np.array_equal(seen(mesh, other, own, 4000), seen(mesh, other, after, 4000))
     changed = (own != after).any(axis=2)
     assert changed[:, 1:159].all() and not changed[:, 159:].any() and not changed[:, 0].any()
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        ({"texture": {"materials": ["Bodypaint"]}}, "'Bodypaint'"),
+        ({"texture": {"materials": []}}, "texture.materials"),
+        ({"texture:roof": {}, "texture:plate": {}}, "two controls set object.base_color.*takes several materials"),
+        ({"texture": {"materials": "plate", "resolution": 4}}, "% of the texels of plate too.*a higher resolution"),
+    ],
+)
+def test_what_cannot_be_painted_is_refused(scene: advsearch.Scene, controls: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        scene.renderer(controls, resolution=16)
+
+
+def test_print_terms_count_what_is_painted() -> None:
+    """A fourth channel leaves pixels out, and the steps to and from them."""
+    colors = torch.full((4, 5, 3), 0.5)
+    colors[:2, 2] = 0.9
+    colors[3] = torch.rand(5, 3)
+    where = torch.zeros(4, 5, 1)
+    where[:2, :3] = 1.0
+    masked = torch.cat([colors, where], dim=-1)
+    assert float(printable_distance(masked)) == pytest.approx(float(printable_distance(colors[:2, :3]))) == 0.0
+    assert float(mean_variation(masked)) == pytest.approx(2 * 0.4 / 6)
+    assert float(mean_variation(torch.cat([colors, torch.ones(4, 5, 1)], dim=-1))) == float(mean_variation(colors))

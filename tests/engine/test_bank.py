@@ -132,3 +132,22 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
     assert float(weights.mean()) == pytest.approx(1.0) and int(weights.argmax()) == int(values.argmin())
     mean = sum(weight * one for weight, one in zip(weights, gradients, strict=True) if one is not None) / len(each)
     torch.testing.assert_close(made._evaluate_under(made._conditions, u, True).gradient, mean, rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.medium
+@pytest.mark.usefixtures("growing")
+def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is memory for two or three, the newest are kept and nothing fails."""
+    monkeypatch.setattr(bank, "MAX_BYTES", 150_000)
+    kept: list[list[int]] = []
+    drawn = Bank._choose_conditions
+
+    def watched(self: Bank, kind: str, index: int) -> Any:
+        kept.append([one.index for one in self._conditions])
+        return drawn(self, kind, index)
+
+    monkeypatch.setattr(Bank, "_choose_conditions", watched)
+    told = advsearch.attack("mug", **SMALL).summary.transport
+    assert told is not None and told.conditions is not None and told.bytes is not None
+    assert told.conditions.dropped == 10 - len(kept[-1]) and told.bytes <= 150_000
+    assert kept[-1] == list(range(10 - len(kept[-1]), 10))

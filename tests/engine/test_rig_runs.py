@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.cli.main import main
+from advsearch.models import load_model
 from advsearch.runs.store import NAME, Store
 from advsearch.scene.geometry import camera_to_world, compute_center, object_to_world
+from advsearch.tasks import make_task
 from conftest import ROOT
 
 PAIR = "cameras: [{name: left}, {name: right, place: [0.6, 0, 0], turn: [-10, 2, 15], fov: 50}]"
@@ -135,3 +138,47 @@ def test_every_picture_has_the_box_of_an_independent_projection(tmp_path: Path, 
                 pose[:3] = np.stack([-right, -down, ahead, place], axis=1)
             box = projected(points, pose, seen_fov, side)
             assert np.abs(np.array(picture["payload"]["box"]) - box).max() <= 1.0, (number, box, picture)
+
+
+class Finds(nn.Module):
+    """A detector with a convolution, a batch norm and boxes that depend on the picture; it counts them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.see = nn.Sequential(nn.Conv2d(3, 8, 3, padding=1), nn.BatchNorm2d(8), nn.ReLU(), nn.Conv2d(8, 5, 1))
+        self.most = 0
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        self.most = max(self.most, len(images))
+        found = self.see(images).mean(dim=(2, 3))
+        return found[:, None, :4].sigmoid(), torch.stack([found[:, 4], -found[:, 4]], dim=1)[:, None].sigmoid()
+
+
+def test_a_gradient_keeps_no_more_of_sixteen_cameras_than_of_four() -> None:
+    """But for their pictures; and it is the same."""
+    torch.manual_seed(0)
+    side = 24
+    model = load_model(Finds(), labels=("mug", "dog"), input_size=side, task=make_task("detection"))
+    network: Any = model.module
+    picture = torch.rand(side, 16 * side, 3, dtype=torch.float32, requires_grad=True)
+    kept = [0]
+
+    def pack(one: Tensor) -> Tensor:
+        kept[0] += one.nelement() * 4
+        return one
+
+    def slope(cameras: int) -> tuple[Tensor, int, int]:
+        seen, kept[0], network.most = picture[:, : cameras * side], 0, 0
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda one: one):
+            (found,) = replace(model, cameras=cameras)(seen)
+            value = sum(
+                ((one[0]["boxes"].sum() + one[0]["scores"][:, 0].sum()) * (1 + k) for k, one in enumerate(found))
+            )
+        (gradient,) = torch.autograd.grad(value, picture)
+        return gradient, kept[0], network.most
+
+    few, less, _ = slope(4)
+    many, more, most = slope(16)
+    torch.testing.assert_close(many[:, : 4 * side], few[:, : 4 * side], atol=1e-9, rtol=1e-4)
+    assert bool((many.abs().amax(dim=(0, 2)) > 0).all()) and most == 4
+    assert more <= 16 * side * side * 3 * 4 < less, (less, more)

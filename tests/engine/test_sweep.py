@@ -27,7 +27,7 @@ from advsearch.attacks.domain import NET, ProductIndex, SampleSequence
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.judging import make_domain
-from advsearch.errors import InputError
+from advsearch.errors import InputError, RunExistsError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.axes import Points, add_grid_axes, choose_n_parts, parse_axes, parse_axis_values
@@ -574,3 +574,29 @@ def test_a_model_that_looks_is_told_from_one_that_does_not_really_rendered(tmp_p
     assert sum("may not be looking" in text for text in swept.summary.warnings) == 3
     row = next(iter(swept.rows()))
     assert set(row.metrics) == {f"{claim} {when}" for claim, names in CHANGES.items() for when in names.split(",")}
+
+
+def test_what_a_row_says_is_true_of_the_picture_that_its_model_was_shown() -> None:
+    wide = advsearch.load_model(Brightness(), labels=LABELS, input_size=(SIZE, 2 * SIZE), name="wide")
+    drawn: dict[str, Any] = {"camera": {}}
+    both = advsearch.sweep("mug", [model(), wide], controls=drawn, samples=2, trials=0)
+    alone = [
+        row.values["camera.distance"]
+        for one in (model(), wide)
+        for row in advsearch.sweep("mug", one, controls=drawn, samples=2, trials=0).rows()
+    ]
+    found = [row.values["camera.distance"] for row in both.rows()]
+    assert [found[0], found[2], found[1], found[3]] == alone and found[0] != found[1]
+
+
+@pytest.mark.medium
+def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    FakeRenderer.stops_at = 10
+    advsearch.sweep("mug", model(), run=path, **SURVIVES)
+    FakeRenderer.stops_at = None
+    with pytest.raises(RunExistsError, match="the run exists already"):
+        advsearch.sweep("mug", model(), run=path, **{**SURVIVES, "seed": 1})
+    advsearch.sweep("mug", model(), run=path, **SURVIVES)
+    with pytest.raises(RunExistsError, match="the run exists already"):
+        advsearch.sweep("mug", model(), run=path, **SURVIVES)

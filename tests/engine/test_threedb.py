@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from advsearch.cli.main import main
+from advsearch.errors import FileFormatError
 from advsearch.questions.sweep.result import import_threedb
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.thumbnails import find_thumbnails
@@ -96,3 +97,14 @@ def test_an_id_leads_nowhere_else(tmp_path: Path) -> None:
     secret.write_bytes(b"no picture")
     run = import_threedb(write(tmp_path / "in", {**LINE, "id": "../../secret"}), tmp_path / "run")
     assert find_thumbnails(run) is None
+
+
+@pytest.mark.medium
+def test_a_large_picture_is_refused(tmp_path: Path) -> None:
+    from PIL import Image
+
+    folder = write(tmp_path / "in", LINE)
+    (folder / "images").mkdir()
+    Image.new("1", (20_000, 20_000)).save(folder / "images" / "a-1_rgb.png")
+    with pytest.raises(FileFormatError, match="pixels"):
+        import_threedb(folder, tmp_path / "run")

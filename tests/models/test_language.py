@@ -13,7 +13,9 @@ import torch
 from torch import Tensor
 
 import advsearch
+from advsearch.errors import ModelError
 from advsearch.models import Model, load_model
+from advsearch.models.zoo import transformers as own
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -222,3 +224,12 @@ def test_a_free_answer_is_the_librarys(tmp_path: Path, family: str) -> None:
     (said,) = model(torch.from_numpy(levels(model)).float() / 255.0)
     assert said["text"] == spoken(tmp_path, levels(model), 6) != ""
     assert said["logits"].shape[1:] == (READS["vocab_size"],) and said["begins"]("mug") == [KNOWN["mug"]]
+
+
+def test_weights_larger_than_the_memory_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = published(tmp_path / "net", llava())
+    told = tmp_path / "meminfo"
+    told.write_text("MemTotal: 99 kB\nMemAvailable: 10 kB\nSwapFree: 2 kB\n")
+    monkeypatch.setattr(own, "MEMORY_FILE", told)
+    with pytest.raises(ModelError, match=r"its weights take 5.*e-05 GB, and 1.23e-05 GB of memory are free"):
+        load_model(spec, labels=NAMES)

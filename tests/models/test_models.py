@@ -487,3 +487,21 @@ def test_reference_is_stored_and_loaded(tmp_path: Path) -> None:
     with torch.no_grad():
         expected = net.eval()(batch.permute(0, 3, 1, 2)) / 2.0
     torch.testing.assert_close(model(batch), expected, rtol=1e-3, atol=1e-5)
+
+
+def test_a_model_that_mixes_its_batch_is_named_as_such() -> None:
+    with pytest.warns(ModelWarning, match=r"sees an image differently in a batch: was it exported in training mode"):
+        load_model(Answering(lambda z: z - 0.5 * z.mean(0)), input_size=8)
+
+
+@pytest.mark.parametrize(
+    "answer, why",
+    [
+        (lambda z: torch.from_numpy(z.detach().numpy()), "does not require grad"),
+        (lambda z: 0.0 * z + torch.arange(3.0), "it is zero everywhere"),
+    ],
+)
+def test_a_model_without_gradient_is_named_as_such(answer: Any, why: str) -> None:
+    with pytest.warns(ModelWarning, match=f"no gradient of model Answering reaches .*{why}"):
+        model = load_model(Answering(answer), input_size=8)
+    assert not model.differentiable and model(images()).shape == (2, 3)

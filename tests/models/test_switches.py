@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.models import load_model
+from advsearch.trust.code import allow_code
 from advsearch.trust.foreign_code import PLAIN, Switches, use_plain_switches
 
 TURNED = {
@@ -78,3 +80,16 @@ def test_a_scene_is_rendered_and_searched_whatever_is_turned() -> None:
     result = advsearch.attack("mug", named, steps=2, spp=1, trials=6, verify_spp=1, baseline=False)
     assert Switches.read_current() == TURNED["all"]
     assert result.summary.ending == "budget spent" and result.summary.renders["gradient"] > 0
+
+
+def test_what_the_code_of_a_network_turns_stays_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "turning_nets.py").write_text(
+        "import torch\ntorch.set_default_dtype(torch.float64)\ntorch.set_grad_enabled(False)\n"
+        f"import sys; sys.path.append({str(Path(__file__).parent)!r})\nfrom test_switches import OfItsType\n"
+        "def make():\n    return OfItsType()\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    allow_code("turning_nets:make")
+    model = load_model("turning_nets:make", input_size=16)
+    assert Switches.read_current() == PLAIN and model.dtype == torch.float64 and model.differentiable
+    assert model(torch.zeros(16, 16, 3)).dtype == torch.float32 and Switches.read_current() == PLAIN

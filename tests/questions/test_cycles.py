@@ -8,7 +8,9 @@ import os
 import stat
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +18,10 @@ import torch
 import trimesh
 
 import advsearch
-from advsearch.questions.replay.cycles import Cycles
+from advsearch.questions.replay import cycles
+from advsearch.questions.replay.cycles import BlenderError, Cycles
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.parts import HazePart
 from advsearch.scene.renderer import Renderer
 from advsearch.trust.programs import BLENDER
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import tarfile
+import weakref
 from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,14 +18,18 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain
+from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.models import load_model
+from advsearch.questions.attack.carry_out import make_problem_on
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.carry_out import make_share
 from advsearch.questions.harden.lessons import (
     IMAGE_DIRECTORY,
     Lesson,
     RenderedLesson,
     TextureLesson,
+    make_lessons,
     negative_log_likelihood,
     save_lesson_images,
     search_worse_images,
@@ -210,3 +216,20 @@ def test_the_interval_of_plain_pictures_is_over_scenes_whose_views_are_alike() -
     assert covered >= 0.94 * runs
     alone = make_share([True] * 9 + [False])
     assert alone is not None and alone.interval == clopper_pearson(9, 10)
+
+
+def test_lessons_of_textures_let_go_of_their_scene() -> None:
+    """There are hundreds of them; what is left says the pictures, and takes no renderer."""
+    settings = {"resolution": (16, 16), "controls": {"texture": {"resolution": 4}}}
+    config = AttackConfig(object="mug", **settings, over={"camera": {}, "environment": {}}, measure="no")
+    model = load_model("reference")
+    problem = make_problem_on(config, load_scene("mug"), model)
+    (lesson,), plain = make_lessons(problem, 1, 0), [Lesson((0,), torch.zeros((16, 16, 3), dtype=torch.uint8))]
+    scene = weakref.ref(problem.renderer.scene)
+    del problem
+    gc.collect()
+    assert scene() is None and isinstance(lesson, TextureLesson)
+    search_worse_images([lesson], model, 2)
+    assert lesson.worst_image.shape == (16, 16, 3) and not torch.equal(lesson.worst_image, lesson.plain_image)
+    for views, steps in ((6, 2), (2, 2), (1, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and 6 / views of this
+        assert course_of(student(), epochs=2, views=views).count_steps([lesson, *plain * 20]) == steps

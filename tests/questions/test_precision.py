@@ -19,8 +19,10 @@ from advsearch.questions.precision import precision
 from advsearch.questions.precision.benches import GradientBench, TimeBudget, list_gradient_parts
 from advsearch.questions.precision.result import PrecisionConfig, PrecisionPoint, PrecisionResult, Recommended
 from advsearch.questions.precision.rule import (
+    MAX_EXTRAPOLATION,
     ReferenceValue,
     SampleSetting,
+    confirm_recommendation,
     describe_disagreement,
     estimate_reference,
     fit_line,
@@ -242,3 +244,30 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
     pictures = [one.to_dict() for one in report.points if one.quantity != "gradient"]
     assert pictures == [one.to_dict() for one in stopped.points]
     assert {one.quantity for one in report.points} == {"picture", "margin", "gradient"}
+
+
+def point_at(spp: int, error: float, interval: tuple[float, float] | None = None, repeats: int = 6) -> PrecisionPoint:
+    """A known point, of 1 millisecond a sample."""
+    return PrecisionPoint(
+        quantity="picture", estimator="independent", family="none", spp=spp, error=error, interval=interval,
+        status="ok", seconds=1e-3 * spp, repeats=repeats,
+    )  # fmt: skip
+
+
+def test_the_error_of_a_reference_is_what_its_parts_scatter_by() -> None:
+    found = rough(1000)
+    true = float(np.linalg.norm(found.value - TRUTH) / np.linalg.norm(TRUTH))
+    assert found.parts == 4
+    assert found.error == pytest.approx(true, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("error", "times", "promised"), [(0.08, 1, 0.08), (0.2, 4, 0.1), (10.0, MAX_EXTRAPOLATION, 2.5)]
+)
+def test_new_measurements_of_a_recommended_setting_are_what_is_promised(
+    error: float, times: int, promised: float
+) -> None:
+    one, spp, _ = reached(recommend_count(measured(exact()), 0.1))
+    found = confirm_recommendation(one, point_at(spp, error, repeats=12).model_copy(update={"seconds": 0.5}))
+    assert (found.basis, found.repeats, found.spp) == ("confirmed", 12, times * spp)
+    assert found.error == pytest.approx(promised) and found.seconds == pytest.approx(0.5 * times)

@@ -282,3 +282,38 @@ PICTURED = [
     ]
 ]
 """Ten renderings, the same ones through a sensor, photographs of eight of them, and one of none."""
+
+
+@pytest.mark.medium
+def test_frames_of_a_drive_count_as_one_draw(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("""
+title: Is the mug seen on the way?
+settings: {object: mug, resolution: 16, spp: 1}
+parts:
+  drives:
+    command: sweep
+    settings: {path: approach, fps: 1, controls: {light: {}}, samples: 3, sampler: random, trials: 0}
+figures: [{figure: rates, by: object}]
+""")
+    result = advsearch.recipe(path, run=tmp_path / "run")
+    rows: Any = result.figures[0].rows
+    ((name, right, of, _, low, high),) = rows
+    assert name == "mug" and of > 3 and of % 3 == 0
+    alone = clopper_pearson(int(right), int(of))
+    assert high - low > alone[1] - alone[0]
+
+
+def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_overlap() -> None:
+    shown = figure(
+        {"figure": "rates", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
+    )
+    assert shown.text[0].startswith(
+        "Lowest is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); highest is studio"
+    )
+    assert shown.text[1].startswith("The difference is shown")
+    assert list(counts(shown)) == ["studio", "loft", "noon"]
+    hidden = figure({"figure": "rates", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))
+    assert hidden.text[1].startswith("No difference between the environments is shown")
+    same = figure({"figure": "rates", "by": "environment"}, rows({"noon": (8, 20), "studio": (8, 20)}))
+    assert same.text == ["All 2 environments have the same share, 40 %: no difference is shown."]

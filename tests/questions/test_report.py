@@ -130,3 +130,13 @@ def test_a_criterion_is_pooled_over_what_was_drawn_only() -> None:
     drawn = samples.sweep(axes=rows, drawn={"camera.distance": {"unit": "m", "low": 5.0, "high": 40.0}}, grid={})
     assert find_selected_axes(drawn) == []
     assert "configurations in which the model is right" in describe_criterion(collect_claims(drawn), [], 0.9)[0]
+
+
+def test_predictions_of_several_models_to_the_same_pictures_are_not_counted_together() -> None:
+    one = {"configurations": 20, "correct": 5, "accuracy": 0.25, "interval": (0.1, 0.5), "axis": "model", "unit": ""}
+    rows = [{**one, "value": name} for name in ("first", "second")]
+    counts = {"configurations": 40, "correct": 10, "accuracy": 0.25}
+    swept = samples.sweep(**counts, model="first,second", axes=rows, ending="finished")
+    said = [claim for claim in collect_claims(swept) if "is right in" in claim.statement]
+    assert [claim.extent and claim.extent.total for claim in said] == [20, 20]
+    assert [claim.statement.split()[2] for claim in said] == ["first", "second"]

@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.runs import files
+from advsearch.runs import directory, files
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.export import write_rows
 from advsearch.runs.listing import is_finished, list_runs
@@ -504,3 +504,49 @@ def test_runs_are_listed_with_their_state(home: Path) -> None:
     assert [one.rows for one in found] == [3, 2, 2, 2, 0]
     assert [one.answer for one in found] == ["", "19/20", "vase, unverified", "right in 7 of 8", ""]
     assert [is_finished(Path(one.path)) for one in found] == [False, True, False, True, False]
+
+
+def test_the_store_is_readable_beside_the_writer(run: RunDirectory) -> None:
+    run.append_rows(Row("search", 0))
+    with Store(run.path / "results.sqlite", read_only=True) as reader:
+        assert reader.count_rows() == 1
+        run.append_rows(Row("search", 1))
+        assert reader.count_rows() == 2
+        with pytest.raises(StorageError, match=r"results\.sqlite: the file system is read-only; choose another place"):
+            reader.append([Row("search", 2)])
+
+
+def test_a_closed_run_is_one_file_and_opens_again(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.append_rows(Row("search", 0))
+    assert not list((tmp_path / "run").glob("results.sqlite-*"))
+    with Store(tmp_path / "run" / "results.sqlite") as store:
+        store.append([Row("search", 1)])
+        assert store.count_rows() == 2
+
+
+def test_a_run_in_work_is_not_overwritten(run: RunDirectory) -> None:
+    run.append_rows(Row("search", 0))
+    with pytest.raises(InputError, match="is working on this run"):
+        RunDirectory.create(run.path, overwrite=True)
+    assert run.store.count_rows() == 1
+
+
+def test_all_that_a_run_writes_is_known_to_overwrite(home: Path) -> None:
+    with RunDirectory.create_for(AttackConfig(object="mug", run="all")) as run:
+        run.append_rows(Row("search", 0))
+        run.save_image("clean", np.zeros((4, 4, 3)))
+        run.save_exr("texture", np.zeros((4, 4, 3)), folder="artifacts")
+        run.write_summary(attack())
+        assert {path.name for path in run.path.iterdir()} - {".lock"} <= set(directory.CONTENTS)
+
+
+def test_text_is_on_the_disk_when_it_is_written_and_pictures_do_not_wait(
+    run: RunDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forced: list[int] = []
+    monkeypatch.setattr("os.fsync", forced.append)
+    run.save_image("clean", np.zeros((4, 4, 3)))
+    assert len(forced) == 0
+    run.write_summary(attack())
+    assert len(forced) == 2  # the file and its folder

@@ -395,3 +395,19 @@ def spread(file: File, order: np.ndarray) -> None:
         step = view["byteLength"] // entry["count"]
         rows = [file.data[view["byteOffset"] + k * step : view["byteOffset"] + (k + 1) * step] for k in order]
         entry |= {"bufferView": file.view(b"".join(rows), byteStride=step), "count": len(order)}
+
+
+@pytest.mark.parametrize("kind", ["f4", "u1", "u2"])
+@pytest.mark.parametrize("width", [3, 4])
+def test_vertex_colors_are_interpolated_in_linear_light(kind: str, width: int, tmp_path: Path) -> None:
+    file = File(pbrMetallicRoughness={"metallicFactor": 0.0}, alphaMode="BLEND")
+    colors = np.repeat([[0.0], [1.0], [1.0], [0.0]], width, axis=1)
+    colors[:, 3:] = 1.0
+    file.primitive(attributes={"COLOR_0": file.values(colors, kind, normalized=kind != "f4")})
+    asset = import_object(file.write(tmp_path))
+    assert len(asset.warnings) == 1 and "baked" in asset.warnings[0]
+    share = np.random.default_rng(0).dirichlet([1.0] * 3, 50)
+    for face in asset.mesh.faces:
+        x = share @ (asset.mesh.vertices[face, 1] + 0.5)
+        got = srgb_to_linear(sample_texture(asset.base_color, share @ asset.mesh.uvs[face].astype(np.float64)))
+        assert got == pytest.approx(np.repeat(x[:, None], 3, axis=1), abs=0.01)

@@ -676,3 +676,28 @@ def test_real_banana_is_yellow_all_over() -> None:
     uvs = asset.mesh.uvs[asset.mesh.faces].mean(axis=1).astype(np.float64)
     red, green, blue = sample_texture(asset.base_color, uvs).T  # an upside-down texture would show its black background
     assert (np.minimum(red, green) > blue + 0.15).mean() > 0.95
+
+
+def test_inside_out_box_is_turned_over(tmp_path: Path) -> None:
+    text = CUBE_V + "".join(f"f {' '.join(reversed(face.split()))}\n" for face in CUBE_F)
+    asset = import_object(written(tmp_path, "box.obj", text))
+    check_sound(asset)
+    assert volume(asset.mesh) == pytest.approx(1.0, abs=1e-5)
+    assert len(asset.warnings) == 1 and "12 faces" in asset.warnings[0]
+
+
+@pytest.mark.parametrize(("target", "got"), [("/dev/zero", "a device"), (None, "a pipe"), (".", "a directory")])
+def test_only_ordinary_files_are_read(tmp_path: Path, target: str | None, got: str) -> None:
+    path = tmp_path / "thing.obj"
+    if target is None:
+        os.mkfifo(path)
+    else:
+        path.symlink_to(target)
+    with pytest.raises(FileFormatError, match=rf"thing\.obj.*{got}"):
+        import_object(path)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"asset": {"version": "2.0"}, "scene": ' + "9" * 6000 + "}"])
+def test_gltf_json_has_limits(tmp_path: Path, text: str) -> None:
+    with pytest.raises(FileFormatError, match=r"thing\.gltf"):
+        import_object(written(tmp_path, "thing.gltf", text))

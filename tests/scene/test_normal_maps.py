@@ -15,6 +15,7 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+import advsearch
 from advsearch.scene.assembly import pose_mesh
 from advsearch.scene.assets import Float32Array, ObjectAsset
 from advsearch.scene.description import OBJECT, SceneDescription, load_description

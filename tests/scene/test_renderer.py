@@ -267,3 +267,11 @@ def test_second_derivatives_are_refused_and_never_incomplete(
             slope.square().sum().backward()
         else:
             torch.autograd.grad(slope.square().sum(), weight)
+
+
+def test_the_transfer_curve_is_flat_where_it_clips_and_finite_at_black() -> None:
+    linear = torch.tensor([-0.5, 0.0, 0.5, 1.5], requires_grad=True)
+    linear_to_srgb(linear).sum().backward()
+    assert linear.grad is not None
+    assert bool(torch.isfinite(linear.grad).all())
+    assert float(linear.grad[0]) == 0.0 and float(linear.grad[3]) == 0.0 and float(linear.grad[2]) > 0.0

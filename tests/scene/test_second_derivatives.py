@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import math
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,7 @@ import torch
 from scipy.sparse import linalg
 from torch import Tensor
 
+import advsearch
 from advsearch.controls.geometry import _Solve
 from advsearch.scene.color import LINEAR_LIMIT, linear_to_srgb
 from advsearch.scene.formation import ImageFormation
@@ -89,3 +93,20 @@ def test_a_shown_picture_is_the_encoded_one() -> None:
         found.append((picture.detach(), at.grad))
     assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
     assert torch.autograd.gradgradcheck(formation.display, torch.linspace(0.02, 0.6, 9).double().requires_grad_())
+
+
+ONCE = {"_Radiance", "_Differences", "_OnceDifferentiable"}
+
+
+CURVES = {"_SrgbDisplay", "_Recomputed"}
+
+
+def test_every_operation_is_one_of_these() -> None:
+    """A new one is exact, and is tested above, or refuses a second derivative."""
+    found = set()
+    for file in Path(advsearch.__file__).parent.rglob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "autograd.Function" in text else ():
+            if isinstance(node, ast.ClassDef) and re.search(r"\bFunction\b", " ".join(map(ast.unparse, node.bases))):
+                found.add(node.name)
+    assert found == ONCE | OPERATIONS.keys() | CURVES

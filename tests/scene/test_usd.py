@@ -472,3 +472,31 @@ def test_damaged_files_and_large_ones_end_in_a_sentence(
     monkeypatch.setenv("ADVSEARCH_LIMITS", "0.0003")
     with pytest.raises(FileFormatError, match=r"at most|usd-core could not read it"):
         import_object(folder / "mug.usda")
+
+
+@pytest.mark.medium
+@needs_usd
+def test_opacity_cuts_out_and_a_transform_moves_the_texture(tmp_path: Path) -> None:
+    skin(tmp_path)
+    levels = np.full((8, 8, 4), 255, np.uint8)
+    levels[:, :4, 3] = 0
+    Image.fromarray(levels).save(tmp_path / "leaf.png")
+    st = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    square = mesh(CUBE[[0, 4, 6, 2]], [[0, 1, 2, 3]], material="paint", st=st)
+    leaf = preview(picture="leaf.png", diffuseColor="rgb", opacity="a", opacityThreshold=0.5)
+    found = import_object(written(tmp_path, square + leaf))
+    assert found.opacity is not None and found.opacity.mean() == pytest.approx(0.5, abs=0.1)
+    moved = preview(diffuseColor="rgb").replace(
+        'def Shader "color" {',
+        """def Shader "moved" {
+            uniform token info:id = "UsdTransform2d"
+            float2 inputs:in.connect = </Root/paint/st.outputs:result>
+            float2 inputs:scale = (1, 0.25)
+            float2 inputs:translation = (0, 0.6)
+            float2 outputs:result
+        }
+        def Shader "color" {""",
+    )
+    moved = moved.replace("inputs:st.connect = </Root/paint/st.", "inputs:st.connect = </Root/paint/moved.")
+    found = import_object(written(tmp_path, square + moved))
+    assert found.mesh.uvs[:, 1].min() == pytest.approx(0.6) and found.mesh.uvs[:, 1].max() == pytest.approx(0.85)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from advsearch.attacks.objectives import get_objective
 from advsearch.errors import InputError
 from advsearch.models import load_model
-from advsearch.options import Outcome, get_outcome
+from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
 from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight
 from advsearch.tasks.boxes import DetectionTruth, compute_fraction_inside, compute_iou, to_corners
 from advsearch.tasks.detection import GOALS
@@ -338,3 +338,12 @@ def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
     assert Detection().on(load_model(replace(model, labels=()), labels=NAMES)).labels == NAMES, "named afterwards"
     with pytest.raises(InputError, match="labels"):
         Detection().on(replace(model, labels=("a", "b")))
+
+
+def judged_anyway(output: list[dict[str, Tensor]]) -> Judgement:
+    return TASK.judge(output, TRUTH)[0]
+
+
+def test_a_score_that_is_no_number_is_neither_right_nor_a_success() -> None:
+    found = judged_anyway(dense((HERE, [math.nan, 0.1, 0.1])))
+    assert not found.right and not found.success and found.prediction == Prediction(NOT_A_NUMBER)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from advsearch.attacks.objectives import get_objective
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
+from advsearch.options import NOT_A_NUMBER
 from advsearch.tasks import Facts, Prediction, Sight
 from advsearch.tasks.segmentation import Segmentation, SegmentationTruth
 
@@ -121,3 +123,18 @@ def test_a_task_learns_names_from_its_model() -> None:
         task.check(Facts("bottle", "chair"))
     with pytest.raises(ModelError, match=r"\(N, classes, height, width\)"):
         load_model(nn.Sequential(nn.Flatten(), nn.Linear(48, 3)), input_size=4, read=Segmentation().reader)
+
+
+def test_pixels_that_are_not_numbers_are_no_output() -> None:
+    broken = ALL.clone()
+    broken[0, 1, 1, 1] = math.nan
+    for output in (broken, torch.full_like(ALL, math.nan), torch.where(broken.isnan(), math.inf, broken)):
+        (found,) = TASK.judge(output, TRUTH)
+        assert (
+            found.prediction == Prediction(NOT_A_NUMBER)
+            and found.is_non_finite
+            and not found.right
+            and not found.success
+        )
+    assert TASK.predictions(torch.full_like(ALL, math.nan)) == [(Prediction(NOT_A_NUMBER),)]
+    assert TASK.predictions(torch.zeros_like(ALL)) == [(Prediction("nothing"),)], "background everywhere"

@@ -15,7 +15,7 @@ import advsearch
 from advsearch.attacks.objective_functions import NEARBY
 from advsearch.attacks.objectives import get_objective
 from advsearch.cli.main import main
-from advsearch.errors import InputError
+from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import Model
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.tasks import Facts
@@ -304,3 +304,10 @@ def test_a_sweep_counts_what_is_not_itself_any_more(
     found = typed(capsys, "sweep", "--object", "mug", *flags, "--run", str(tmp_path / "run"))
     assert (found["configurations"], found["correct"]) == (2, 1)
     assert found["worst"]["claimed"]["label"] == SOMETHING_ELSE and found["worst"]["claimed"]["payload"]["cosine"] < 0.9
+
+
+def test_huge_and_many_references_are_refused(folder: Path, model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ADVSEARCH_LIMITS", "1e-6")  # 67 pixels
+    write(folder / "red" / "0.png", torch.zeros(100, 100, 3))
+    with pytest.raises(AdvsearchError, match="if you trust it"):
+        Similarity(references=str(folder)).on(model)

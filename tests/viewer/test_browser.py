@@ -489,3 +489,16 @@ def test_without_the_pages_policy_the_server_refuses_it_too(browser: Browser, sw
         ].map((one) => one.then(() => "done", () => "refused")))""", f"{server.address}runs/first/")  # fmt: skip
         assert sent == ["refused", "refused"]  # Cross-Origin-Resource-Policy, which is no policy of the page
         context.close()
+
+
+def test_our_own_pages_run_with_an_origin_of_their_own(browser: Browser, attack: Path, sweep: Path) -> None:
+    """Scripts run, pictures show, and links lead back, where the page has no part of the server's origin."""
+    with serving(attack, sweep) as server, opened(browser, f"{server.address}runs/attack/") as page:
+        assert page.evaluate("self.origin") == "null"
+        assert page.locator(".remarks", has_text="Its scripts are of another").count() == 0
+        until(page, lambda: page.locator("#object canvas").count())
+        sizes = page.locator("img").evaluate_all("all => all.map((one) => one.complete && one.naturalWidth)")
+        assert sizes and all(sizes)
+        page.get_by_role("link", name="All runs").click()
+        page.wait_for_url(server.address)
+        assert page.locator("table.runs tbody tr").count() == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from typing import Any
 
@@ -36,3 +37,15 @@ def test_the_notebook_of_the_docs_runs(monkeypatch: pytest.MonkeyPatch) -> None:
             assert names[shown]._repr_png_().startswith(b"\x89PNG")
     finally:
         plt.close("all")
+
+
+def test_the_notebook_about_losses_is_its_page() -> None:
+    """Whose blocks run in tests/test_docs.py; run `python docs/make_notebook.py` after a change."""
+    spec = importlib.util.spec_from_file_location("make_notebook", LOSSES.with_name("make_notebook.py"))
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    made = module.notebook()
+    assert json.loads(LOSSES.read_text("utf-8")) == made
+    code = ["".join(cell["source"]) for cell in made["cells"] if cell["cell_type"] == "code"]
+    assert len(code) > 6 and sum(cell.endswith("\nresult") for cell in code) == 6

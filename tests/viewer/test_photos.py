@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import ssl
 import struct
+import tempfile
 import zlib
 from collections.abc import Iterator
 from contextlib import closing
@@ -22,6 +24,7 @@ from advsearch.questions.photographs.result import find_photo, find_rendering, s
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.statistics.intervals import clopper_pearson
+from advsearch.trust.network import make_https_context
 from advsearch.viewer.clients import MAX_BODY_BYTES
 from advsearch.viewer.server import Dashboard
 from stored_sweeps import make_sweep, serving
@@ -260,3 +263,18 @@ def test_beyond_this_machine_it_is_https_with_a_token(run: Path, taker: Photogra
         with pytest.raises((ConnectionError, OSError, ssl.SSLError)):
             post(server, PATH, picture())  # no HTTP beside it
         assert post(server, f"{PATH}?token={server.token}", picture(), secure=True)[0].status == 200
+
+
+def test_the_key_is_for_this_user_alone_and_does_not_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[int, int]] = []
+    original = ssl.SSLContext.load_cert_chain
+
+    def looked_at(self: ssl.SSLContext, certfile: Path, keyfile: Path) -> None:
+        seen.append((os.stat(keyfile).st_mode & 0o777, os.stat(keyfile.parent).st_mode & 0o777))
+        original(self, certfile, keyfile)
+
+    monkeypatch.setattr(ssl.SSLContext, "load_cert_chain", looked_at)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    make_https_context(["127.0.0.1", "localhost"])
+    assert seen == [(0o600, 0o700)]
+    assert list(tmp_path.iterdir()) == []

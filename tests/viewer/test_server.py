@@ -314,3 +314,63 @@ def test_a_client_that_goes_away_does_no_harm(server: Dashboard) -> None:
 def test_a_port_that_is_taken_is_told(server: Dashboard) -> None:
     with pytest.raises(InputError, match="cannot listen"):
         Dashboard((), "127.0.0.1", server.server_port)
+
+
+@pytest.mark.medium
+def test_a_thousand_at_once_are_answered(server: Dashboard) -> None:
+    """All are connected and have asked before the first answer is read; the server has no more threads than before."""
+    asked = f"GET /runs/first/pictures/0000/1.jpg HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode()
+    assert ask(server, "/")[0].status == 200  # its threads have begun
+    threads, counts = threading.active_count(), []
+    with ExitStack() as stack:
+        talks = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60)) for _ in range(1000)
+        ]
+        for talk in talks:
+            talk.sendall(asked)
+            counts.append(threading.active_count())
+        answers = [talk.makefile("rb").read() for talk in talks]
+    assert all(one.startswith(b"HTTP/1.0 200") for one in answers)
+    assert len(set(map(len, answers))) == 1
+    assert max(counts) <= threads  # fewer where those of another test's server have ended meanwhile
+    assert ask(server, "/")[0].status == 200
+
+
+def test_those_who_say_nothing_do_not_fill_the_server(server: Dashboard, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand connections that never ask hold it up for as long as its patience lasts, no longer."""
+    monkeypatch.setattr("advsearch.viewer.clients.REQUEST_SECONDS", 0.01)
+    with ExitStack() as stack:
+        for _ in range(1000):
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 60))
+        assert ask(server, "/")[0].status == 200
+
+
+def test_who_waits_when_it_closes_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No worker is there to serve one that has asked."""
+    monkeypatch.setattr("advsearch.viewer.clients.N_WORKERS", 0)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        served = clients.ConnectionPool(listening, lambda connection, address: None, None)
+        thread = threading.Thread(target=served.serve)
+        thread.start()
+        with socket.create_connection(listening.getsockname()) as asking:
+            asking.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            while served._ready.empty():
+                time.sleep(0.01)
+            served.close()
+            asking.settimeout(120.0)
+            with suppress(ConnectionResetError):  # what it has said was never read
+                assert asking.recv(1) == b""
+            assert served._ready.empty()
+        thread.join()
+
+
+def test_a_damaged_or_missing_run_is_told(tmp_path: Path) -> None:
+    damaged, gone = make_sweep(tmp_path / "damaged", ended=False), make_sweep(tmp_path / "gone", ended=False)
+    with serving(damaged, gone) as server:
+        (damaged / "results.sqlite").write_bytes(b"no database")
+        (gone / "results.sqlite").unlink()
+        for name in ("damaged", "gone"):
+            answer, data = ask(server, f"/runs/{name}/rows")
+            assert answer.status == 500
+            assert b"expected" in data
+        assert ask(server, "/")[0].status == 200

@@ -372,3 +372,25 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
     after = np.random.get_state(legacy=False)["state"]["key"], torch.random.get_rng_state()  # noqa: NPY002
     assert np.array_equal(before[0], after[0])
     assert torch.equal(before[1], after[1])
+
+
+def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
+    """A peak that only the first steps see; then the gradient leads away from it, downhill."""
+
+    def evaluate(query: Query) -> Evaluation:
+        return Evaluation(5.0 if query.index == 2 else -0.1 * query.index, torch.ones(2), False)
+
+    seen: list[Tensor] = []
+    domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
+    search(
+        partial(map, evaluate),
+        domain,
+        PGD(step_size=0.125, momentum=0.0),
+        steps=40,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: seen.append(u),
+    )
+    returned = [k for k in range(3, 40) if float(seen[k][0]) < float(seen[k - 1][0]) - 1e-6]
+    assert returned, "it never went back"
+    assert float((seen[returned[0]] - seen[2]).abs().max()) <= 0.4 * 0.125 + 1e-6

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
+from functools import partial
 from types import ModuleType
 from typing import Any
 
 import pytest
 
-from advsearch.attacks import make_policy
+from advsearch.attacks import Ending, Policy, make_policy, search
 from conftest import ROOT
 
 CHEAP = {"auto": 200, "cmaes": 500, "portfolio": 200}
@@ -52,3 +54,25 @@ def stated() -> list[Any]:
 def test_a_policy_reaches_the_optimum_within_its_stated_budget(name: str, objective: str, d: int, renders: int) -> None:
     """`reached` also fails a policy that leaves the domain, or a wrong optimum."""
     assert all(closed_form.reached(make_policy(name), objective, d, renders, seed) for seed in range(3))
+
+
+EXTENDING = (ROOT / "docs" / "extending.md").read_text("utf-8")
+
+
+def users_class() -> Any:
+    """The class of the example on the page about extending."""
+    block = next(b for b in re.findall(r"^```python\n(.*?)^```$", EXTENDING, re.M | re.S) if "class Shrinking(" in b)
+    module = ModuleType("policy_of_the_page")
+    sys.modules[module.__name__] = module
+    exec(compile(block, "extending.md", "exec"), module.__dict__)
+    return module.__dict__["Shrinking"]
+
+
+def test_the_policy_of_the_page_works() -> None:
+    own: Policy[Any] = users_class()()
+    problem = closed_form.OBJECTIVES["quadratic, box"](6, 0)
+    result = search(partial(map, problem.evaluate), problem.domain, own, steps=400, seed=0, candidates=0)
+    assert problem.value(result.best_u) > 0.9 * problem.optimum
+    assert result.stopped is Ending.BUDGET_SPENT
+    beside = make_policy("portfolio", policies=[own, "auto"])
+    assert search(partial(map, problem.evaluate), problem.domain, beside, steps=40, seed=0).best_objective > 0.0

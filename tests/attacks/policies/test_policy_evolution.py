@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import CMAES, NES, Block, Domain, Evaluate, Evaluation, Policy, Query, search, seeded
+from advsearch.attacks.policies.evolution import MAX_STEP_SIZE
 from advsearch.errors import InputError
 
 both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: policy.name)
@@ -149,3 +150,12 @@ def test_samples_come_in_mirrored_pairs() -> None:
     assert torch.allclose(seen[0] + seen[1], torch.ones(3), atol=1e-6)
     assert torch.allclose(seen[2] + seen[3], torch.ones(3), atol=1e-6)
     assert not torch.allclose(seen[0], seen[2])
+
+
+def test_nes_narrows_on_a_peak_and_widens_on_a_slope() -> None:
+    domain = Domain(torch.full((3,), 0.5), (Block(3),))
+    narrow = search(evaluator(bowl(0.5)), domain, NES(sigma=0.5), steps=300, seed=0).distribution
+    slope = search(evaluator(lambda u: float(u[0])), domain, NES(sigma=0.02), steps=60, seed=0).distribution
+    assert narrow is not None and slope is not None
+    assert float(narrow.deviation.max()) < 0.05
+    assert 0.01 < float(slope.deviation[0]) <= 0.5 * MAX_STEP_SIZE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -365,3 +366,30 @@ def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(
     assert "again: pytest" in text and "::test_assertions_pass_and_fail" in text
     with pytest.raises(AssertionError, match="undecided"):
         assert_no_worse("mug", easy, always(), points=20.0, pictures=13, controls=FRONT, **small)
+
+
+def test_a_share_of_the_frames_of_a_drive_is_claimed_as_one(tmp_path: Path) -> None:
+    way = {"path": {"path": "approach", "reach": 2.0}}
+    suite = written(tmp_path, {"on-the-way": claim("right", way, at_least=0.5, pictures=20)}, confidence=0.9)
+    (found,) = carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "run"))).claims
+    assert "is right in at least 50 % of the frames that the ranges span: mug, path" in found.statement
+    assert found.pictures and found.rate is not None and (found.rate == 1.0 or "path.time" in found.reason)
+
+
+@pytest.mark.medium
+@pytest.mark.docs
+def test_the_pytest_file_of_the_docs_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test in it, beside the suite of the same page; with fewer steps, and less to show, than on the page."""
+    root = Path(__file__).resolve().parents[3]
+    page = (root / "docs" / "testing.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    (suite,) = re.findall(r"^```yaml\n(# suite\.yaml\n.*?)^```$", page, re.M | re.S)
+    Path("suite.yaml").write_text(suite.replace("at_least: 0.95", "at_least: 0.6").replace("64", "48"))
+    (code,) = re.findall(r"^```python\n(# test_robustness\.py\n.*?)^```$", page, re.M | re.S)
+    names: dict[str, Any] = {}
+    exec(compile(code.replace("steps=20", 'steps=2, policy="random"'), "testing.md", "exec"), names)
+    tests = [one for name, one in names.items() if name.startswith("test_")]
+    assert len(tests) == 3
+    for one in tests:
+        one()
+    assert len(list(Path("runs").iterdir())) == 3, "each keeps its run"

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.scene.mitsuba_backend.denoise import _compute_gain, denoise
+from advsearch.scene.mitsuba_backend.denoise import _compute_gain, _get_buffers, denoise
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 
 SIZE = (72, 88)
@@ -54,3 +54,13 @@ def test_the_brightness_is_what_the_denoiser_finds_itself() -> None:
     assert torch.allclose(denoise(picture, flat, flat), own, rtol=1e-4, atol=1e-5)
     apart = mitsuba_oidn.denoise(picture, flat, flat, hdr=True, input_scale=1.1 * _compute_gain(picture))
     assert not torch.allclose(apart, own, rtol=1e-4, atol=1e-5), "else the brightness decides nothing here"
+
+
+def test_pictures_of_a_size_are_denoised_in_the_same_memory_and_spoil_nothing() -> None:
+    import_mitsuba()
+    flat = torch.full((*SIZE, 3), 0.5)
+    first = denoise(noisy(1), flat, flat)
+    kept, second = first.clone(), denoise(noisy(2), flat, flat)
+    assert torch.equal(first, kept) and not torch.equal(first, second)
+    own, other = _get_buffers(SIZE, 1), _get_buffers(SIZE, 2)
+    assert own is _get_buffers(SIZE, 1) and own[0].data_ptr() != other[0].data_ptr()

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
+from collections.abc import Callable
+from typing import Any
 
 import pytest
+
+from advsearch.scene.mitsuba_backend.variant import import_mitsuba, record_on_first_use
 
 COLLECTED_IN_A_RECORDING = """
 import gc, weakref
@@ -51,3 +56,32 @@ def test_a_scene_in_a_cycle_is_not_collected_while_another_is_recorded() -> None
         [sys.executable, "-c", COLLECTED_IN_A_RECORDING], capture_output=True, text=True, timeout=600, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("on", [gc.enable, gc.disable])
+def test_the_collector_is_as_it_was_after_a_recording_and_an_error_in_one(on: Callable[[], None]) -> None:
+    mi = import_mitsuba()
+    import drjit as dr
+
+    wrong, states = [True], list[bool]()
+
+    def halves(value: Any) -> Any:
+        states.append(gc.isenabled())
+        if wrong.pop():
+            raise KeyboardInterrupt
+        return value / 2
+
+    function = record_on_first_use(halves, [])
+    before = gc.isenabled()
+    try:
+        on()
+        expected = gc.isenabled()
+        with pytest.raises(RuntimeError, match="frozen function"):
+            function(dr.opaque(mi.Float, 1.0, 4))
+        assert gc.isenabled() == expected
+        wrong.append(False)
+        assert function(dr.opaque(mi.Float, 3.0, 4)).torch().tolist() == [1.5] * 4
+        assert gc.isenabled() == expected
+        assert states == [False, False]
+    finally:
+        (gc.enable if before else gc.disable)()

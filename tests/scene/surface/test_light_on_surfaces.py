@@ -256,3 +256,18 @@ def test_exposures_of_one_map_share_its_light(traced: Renderer, light: SurfaceRe
         assert lights[1] is lights[0] and lights[2] is not lights[0]
         assert float((factors[1] - factors[0]).abs().min()) > 0.05
         torch.testing.assert_close(light(brighter), own, rtol=1e-3, atol=1e-4)
+
+
+def test_pictures_of_several_cameras_at_once_are_those_of_each(light: SurfaceRenderer) -> None:
+    """Two of them under one light, one under another."""
+    renderer = light.path_renderer
+    first, second = drawn(renderer, 0), drawn(renderer, 1)
+    third = second.clone()
+    for group in renderer.space.groups:
+        if group.control == "environment":
+            third[group.coordinates] = first[group.coordinates]
+    wholes = [first, second, third]
+    with torch.no_grad():
+        inputs = [light.compute_inputs(one) for one in wholes]
+        together = light.compose_images(light.trace_views(inputs), inputs, light.get_color(inputs[0]), wholes)
+        assert torch.equal(together, torch.stack([light(one) for one in wholes]))
