@@ -9,6 +9,7 @@ import torch
 from advsearch.engine.loading import load_scene
 from advsearch.scene.description import load_description
 from advsearch.scene.grounds import LUMINANCE
+from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from scenes.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
 from scenes.places.paint import FRONTS
 from scenes.places.road import KERBS
@@ -43,6 +44,19 @@ def test_a_gradient_among_houses_is_that_of_differences() -> None:
         with torch.no_grad():
             high, low = (renderer(at + way * step, 1, 4096).mean() for way in (1.0, -1.0))
         assert float(slope[group.coordinates].sum()) == pytest.approx(float(high - low) / 0.1, rel=0.1), group.name
+
+
+@pytest.mark.medium
+def test_roulette_changes_the_noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = []
+    for depth in (mitsuba_scene.ROULETTE_DEPTH, mitsuba_scene.NO_ROULETTE_DEPTH):
+        monkeypatch.setattr(mitsuba_scene, "ROULETTE_DEPTH", depth)
+        scene = load_scene("car", "avenue", settings={"camera.distance": 12.0})
+        renderer = scene.renderer(["texture"], resolution=12, denoise="none")
+        assert renderer.scene.roulette_depth == depth
+        images.append(renderer.radiance(renderer.start, depth, 1024).detach())
+    assert torch.allclose(images[0].mean(dim=(0, 1)), images[1].mean(dim=(0, 1)), rtol=0.01)
+    assert not torch.equal(images[0], images[1])
 
 
 def test_lamps_shine_at_dusk_with_the_light_that_they_are_said_to_have() -> None:
