@@ -43,10 +43,15 @@ _XATLAS_SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for em
 _MIN_FLUSH_COSINE = 1.0 - 1.5e-4
 # how far the normals of what it takes for a plane may stray before it matters
 _MIN_PLANE_COSINE = np.cos(np.radians(10.0))
-# faces that xatlas gets at a time, about; its time grows faster than their number
+# faces of a mesh above which it is always cut where the surface turns
 _FACES_PER_ATLAS = 20_000
-_LARGE_MESH_FACES = 200_000  # faces of a mesh above which that matters
-_MAX_CELL_FACES = 1_500  # largest number of faces that xatlas then gets at a time
+_CELL_FACES = ((200_000, 1_500), (10_000, 500))
+"""Faces of a mesh above which it is cut for the sake of speed, and how many faces
+xatlas then gets at a time at most.
+
+Its time grows with the square of that number: whole, a mesh of 15,000 faces took 3.1
+seconds, and so cut 0.4. Larger meshes are cut less, since each chart needs a border.
+"""
 # more are no surface but a heap of faces, and xatlas would take minutes over them
 _MAX_PATCHES = 10_000
 # rounds of averaging normals, so that noise does not fray the borders of patches
@@ -147,8 +152,9 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     xatlas 0.0.11 takes neighbouring faces that hardly bend for one plane. On a finely
     tessellated smooth surface that goes on from face to face around the full object,
     which is then flattened like a sheet of paper; where a closed surface leaves no
-    border, the process crashes. Such meshes, and large ones for the sake of speed, are
-    cut where the surface turns from one of 14 directions to another.
+    border, the process crashes. Such meshes, and large ones, are cut where the surface
+    turns from one of 14 directions to another. Large ones are cut further by
+    `_CELL_FACES`.
 
     Returns:
         The patch of each face (F,), numbered from 0.
@@ -161,19 +167,22 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     neighbour = right // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
     plane = find_components(count, face[is_flush], neighbour[is_flush])
-    if _are_straight(normals, plane) and count <= _FACES_PER_ATLAS:
-        return np.zeros(count, dtype=np.int64)
-
-    smoothed = _smooth_normals(normals, face, neighbour)
-    # (F,) index of the nearest of the 14 directions
-    direction = (smoothed @ _make_cut_directions().T).argmax(axis=1)
-    is_same = direction[face] == direction[neighbour]
-    patch = find_components(count, face[is_same], neighbour[is_same])
-    if count <= _LARGE_MESH_FACES:
-        return patch
-    cell = _halve_patches(soup.points[soup.faces].mean(axis=1), patch)
-    is_same &= cell[face] == cell[neighbour]
-    return find_components(count, face[is_same], neighbour[is_same])
+    is_whole = _are_straight(normals, plane) and count <= _FACES_PER_ATLAS
+    patch = np.zeros(count, dtype=np.int64)
+    is_same = np.ones(len(face), np.bool_)
+    if not is_whole:
+        smoothed = _smooth_normals(normals, face, neighbour)
+        # (F,) index of the nearest of the 14 directions
+        direction = (smoothed @ _make_cut_directions().T).argmax(axis=1)
+        is_same = direction[face] == direction[neighbour]
+        patch = find_components(count, face[is_same], neighbour[is_same])
+    for min_faces, max_faces in _CELL_FACES:
+        if count > min_faces:
+            centers = soup.points[soup.faces].mean(axis=1)
+            cell = _halve_patches(centers, patch, max_faces)
+            is_same &= cell[face] == cell[neighbour]
+            return find_components(count, face[is_same], neighbour[is_same])
+    return patch
 
 
 def _smooth_normals(
@@ -206,14 +215,17 @@ def _make_cut_directions() -> Float64Array:
     return np.concatenate([faces, corners / np.sqrt(3.0)])
 
 
-def _halve_patches(centers: Float64Array, patch: IntArray) -> IntArray:
-    """Halve patches until each has at most `_MAX_CELL_FACES` faces.
+def _halve_patches(
+    centers: Float64Array, patch: IntArray, max_faces: int
+) -> IntArray:
+    """Halve patches until each has at most `max_faces` faces.
 
     A patch is cut across its longest axis, at the median of its faces' centers.
 
     Args:
         centers: (F, 3) of the faces.
         patch: (F,) the patch of each face.
+        max_faces: how many a piece may have.
 
     Returns:
         (F,) the piece of each face, numbered from 0.
@@ -223,7 +235,7 @@ def _halve_patches(centers: Float64Array, patch: IntArray) -> IntArray:
     remaining = group_indices(patch)
     while remaining:
         group = remaining.pop()
-        if len(group) > _MAX_CELL_FACES:
+        if len(group) > max_faces:
             axis = np.ptp(centers[group], axis=0).argmax()
             order = group[np.argsort(centers[group, axis], kind="stable")]
             middle = len(order) // 2

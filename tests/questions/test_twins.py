@@ -311,6 +311,9 @@ def test_a_wrong_row_of_a_list_is_refused(tmp_path: Path, message: str) -> None:
 
 def test_a_list_in_yaml_with_a_camera_file(tmp_path: Path) -> None:
     Image.new("RGB", (32, 16)).save(tmp_path / "a.png")
+    photograph = (tmp_path / "a.png").read_bytes()
+    # its header has its size, which is all that is needed of it
+    (tmp_path / "a.png").write_bytes(photograph[:-20])
     (tmp_path / "a.ply").write_bytes((PHOTOGRAPHS / "models" / "obj_000002.ply").read_bytes())
     camera = (
         "image_width: 32\nimage_height: 16\ncamera_matrix: {rows: 3, cols: 3, data: [40, 0, 15, 0, 41, 7, 0, 0, 1]}"

@@ -320,7 +320,7 @@ def test_unwrap_of_a_curved_object_does_not_overlap(
     piece: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if piece < 1500:  # it is taken for a large mesh, which is unwrapped in pieces
-        for name, value in {"_MAX_CELL_FACES": piece, "_FACES_PER_ATLAS": 1, "_LARGE_MESH_FACES": 1}.items():
+        for name, value in {"_CELL_FACES": ((1, piece),), "_FACES_PER_ATLAS": 1}.items():
             monkeypatch.setattr(surface_parts, name, value)
     torus = trimesh.creation.torus(1.0, 0.4, major_sections=24, minor_sections=12)
     asset = import_object(exported(tmp_path, "ring.stl", torus))

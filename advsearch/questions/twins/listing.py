@@ -14,7 +14,6 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -394,17 +393,10 @@ def _read_row_camera(
             f"{where}: camera: expected a pinhole, got a lens with distortion; "
             "undistort the photographs first"
         )
-    height, width = _measure(photograph)
+    height, width = reading.pictures.read_image_size(photograph)
     return Pinhole(
         lens["fx"] * width, lens["fy"] * height, lens["cx"] * width, lens["cy"] * height
     )
-
-
-@lru_cache(maxsize=1)
-def _measure(photograph: Path) -> tuple[int, int]:
-    """Return height and width of a photograph in pixels."""
-    height, width = reading.pictures.read_image(photograph, None).shape[:2]
-    return height, width
 
 
 # ---- numbers

@@ -47,6 +47,16 @@ def read_image(
         return load_display_image(image, limit, path, is_raw=is_raw)
 
 
+def read_image_size(path: Path) -> tuple[int, int]:
+    """Return the height and width of an image file in pixels, without decoding it.
+
+    Raises FileFormatError: as for `read_image`, but for what only decoding shows.
+    """
+    with open_image(path, LARGEST_FILE) as image:
+        check_decodable(image, path)
+        return image.height, image.width
+
+
 def load_display_image(
     image: Image.Image,
     limit: int | None = TEXTURE_LIMIT,
