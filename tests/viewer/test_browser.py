@@ -178,6 +178,12 @@ def explored(page: Page) -> None:
     page.wait_for_selector("[data-cell]")
     assert page.locator("output").inner_text() == "studio"
     assert page.get_by_label("Show", exact=True).input_value() == "wrong"
+    page.locator("#parameter-0").select_option("all values")
+    page.get_by_label("Side by side").select_option("environment")
+    assert page.locator("figure.map").count() == 2
+    page.locator("#parameter-0").select_option("up")
+    assert page.locator("figure.map").count() == 1
+    assert page.locator("table.map th[scope=row]").all_inner_texts() == ["studio", "noon"]
 
 
 def test_a_sweep_is_explored_from_its_file(browser: Browser, sweep: Path) -> None:
