@@ -432,9 +432,7 @@ def refers_to(name: str) -> str:
         (refers_to("link.usda"), "names the layer 'link.usda'"),
         (refers_to("https://example.org/a.usda"), "names the layer 'https:.*which is no USD file"),
         (refers_to("a.usdz[b.usda]"), r"needs 'a.usdz\[b.usda\]', which is missing"),
-        (refers_to("a.usda[b.usda]"), r"names the layer 'a.usda\[b.usda\]'"),
         (refers_to("gone.usda"), "needs 'gone.usda', which is missing"),
-        (refers_to("picture.png"), "names the layer 'picture.png'"),
         (refers_to("broken.usda"), r"broken.usda: expected a USD layer, got 2:1: "),
         ('    def Xform "a" (clips = { dictionary default = { asset[] assetPaths = [@x.usda@] } }) {}', "value clips"),
         (mesh(CUBE, [[0, 1, 99]]), "expected faces of the points of /Root/thing"),
@@ -460,7 +458,6 @@ def test_what_is_refused(tmp_path: Path, body: str, expected: str) -> None:
     ("name", "compression", "expected"),
     [
         ("../out.usda", zipfile.ZIP_STORED, "lies elsewhere"),
-        ("/tmp/out.usda", zipfile.ZIP_STORED, "lies elsewhere"),
         ("C:out.usda", zipfile.ZIP_STORED, "lies elsewhere"),
         ("a.usda", zipfile.ZIP_DEFLATED, "is packed"),
         ("a.png", zipfile.ZIP_STORED, "expected a USD layer first in it, got 'a.png'"),
