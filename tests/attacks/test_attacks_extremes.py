@@ -387,6 +387,7 @@ def evaluations(name: str, curvatures: Sequence[float], scale: float) -> float:
     return statistics.fmean(counts)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["pgd", "adam"])
 @pytest.mark.parametrize(
     ("curvatures", "scale"),
