@@ -7,7 +7,7 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import pytest
@@ -209,6 +209,7 @@ def noise(kind: str, number: int, size: int, generator: torch.Generator) -> Tens
     return normal * float(heavy(1).abs()) if kind == "lengths" else normal
 
 
+@cache
 def share_of_optimum(name: str, kind: str) -> float:
     """Median over seeds of what a search in 60 numbers reaches of the largest value of a linear objective, with noise
     that is in the median twice as large as the gradient."""
@@ -387,6 +388,7 @@ def evaluations(name: str, curvatures: Sequence[float], scale: float) -> float:
     return statistics.fmean(counts)
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ["pgd", "adam"])
 @pytest.mark.parametrize(
     ("curvatures", "scale"),

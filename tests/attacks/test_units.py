@@ -140,6 +140,7 @@ def unequal(
     return rng.binomial(of, np.where(is_large, large, small)), of
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize(("rare", "small", "large"), [(0.1, 1.0, 0.0), (0.1, 0.9, 0.2), (0.5, 0.3, 0.9)])
 @pytest.mark.parametrize("count", [3, 5, 10, 30])
 def test_the_interval_over_units_of_unequal_size_covers_their_mean(
@@ -165,6 +166,7 @@ def test_all_units_weigh_the_same() -> None:
     assert compare_paired(first, second, np.zeros(13, np.int64))[2] == 1.0, "one unit shows nothing"
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("count", [5, 12, 30])
 def test_two_models_as_good_over_units_of_unequal_size_are_told_apart_in_5_of_100_at_most(count: int) -> None:
     """One gains where much is seen, which is rare, and loses as much over all units where little is."""
@@ -180,6 +182,7 @@ def test_two_models_as_good_over_units_of_unequal_size_are_told_apart_in_5_of_10
     assert told <= 0.06 * runs and missed <= 0.06 * runs
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("is_cut", [False, True])
 @pytest.mark.parametrize("count", [6, 12, 40])
 def test_a_rule_of_no_effect_on_the_mean_of_unequal_units_is_told_in_2_of_100_at_most(count: int, is_cut: bool) -> None:

@@ -36,7 +36,7 @@ def finding(trial: Callable[[str, int, Tensor], Any]) -> Any:
 
     problem = SimpleNamespace(domain=DOMAIN, seed=0, rule=WORST_CASE, steps=1)
     findings = SimpleNamespace(predictor=None, bracket=None, search=None)
-    searches: Any = SimpleNamespace(problem=problem, findings=findings, policy=None, begin=said, search=search)
+    searches: Any = SimpleNamespace(problem=problem, findings=findings, policy=None, start=said, search=search)
     verifier: Any = SimpleNamespace(begin_stage=said, try_configurations=trials, n_trials=20)
     with suppress(KeyboardInterrupt):
         find_smallest(searches, searches.policy, verifier)

@@ -186,6 +186,16 @@ def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pyt
     assert sum(len(owners) for owners, _ in searched) == 9 and searched == trained
 
 
+def test_lessons_that_judge_are_left_as_they_are() -> None:
+    """Worse textures and pictures are searched in copies of them."""
+    textured = [tinted(number) for number in range(3)]
+    pictures = torch.stack([coloured(0, level, 7) for level in (0.0, 0.3)])
+    rendered = RenderedLesson.create((1,), pictures[0], pictures)
+    course_of(student()).score([*textured, rendered])
+    assert all(torch.equal(one.texture, torch.full((3,), 0.5)) for one in textured)
+    assert rendered.losses.isinf().all()
+
+
 # ---- the data set ---------------------------------------------------------------------------------------------------
 
 
