@@ -215,9 +215,7 @@ def _make_cut_directions() -> Float64Array:
     return np.concatenate([faces, corners / np.sqrt(3.0)])
 
 
-def _halve_patches(
-    centers: Float64Array, patch: IntArray, max_faces: int
-) -> IntArray:
+def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> IntArray:
     """Halve patches until each has at most `max_faces` faces.
 
     A patch is cut across its longest axis, at the median of its faces' centers.

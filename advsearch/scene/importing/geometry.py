@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import (
@@ -76,7 +78,7 @@ class TriangleSoup:
         rows = np.arange(len(order))[:, None]
         names = ["faces", "normals", "uvs", "colors"]
         if self.stored_vertices is not None:
-            names.append("stored")
+            names.append("stored_vertices")
         return replace(
             self, **{name: getattr(self, name)[rows, order] for name in names}
         )
@@ -125,7 +127,7 @@ def join_parts(
             for part, start in zip(parts, vertex_starts[:-1], strict=True)
         ]
     )
-    lower_corner = vertices[np.unique(faces)].min(axis=0)
+    lower_corner = vertices[find_used(faces, len(vertices))].min(axis=0)
     extent = compute_extent(parts)
     if not 0.0 < extent < np.inf:
         problem = "its extent is too large to compute with"
@@ -184,8 +186,8 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
 
     # Equal vertices first, then near ones: chains of near points become one cluster,
     # and its first point stands for all.
-    points, point_of_vertex = np.unique(vertices, axis=0, return_inverse=True)
-    point_of_vertex = point_of_vertex.reshape(-1)
+    first_vertex, point_of_vertex = find_unique_rows(vertices)
+    points = vertices[first_vertex]
     pairs = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
     if len(pairs):
         cluster = find_components(len(points), pairs[:, 0], pairs[:, 1])
@@ -197,13 +199,42 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
     return points, point_of_vertex
 
 
+def find_unique_rows(rows: npt.NDArray[Any]) -> tuple[IntArray, IntArray]:
+    """Find the distinct rows of an array (N, k), in rising order.
+
+    As `numpy.unique(rows, axis=0)`, but in a third of the time. Rows must have no NaN.
+
+    Returns:
+        The index of the first row of each distinct one (U,), and which of these each
+        row is (N,).
+    """
+    order = np.lexsort(rows.T[::-1])
+    is_new = np.ones(len(rows), np.bool_)
+    is_new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    unique_of_row = np.empty(len(rows), np.int64)
+    unique_of_row[order] = np.cumsum(is_new) - 1
+    return order[is_new], unique_of_row
+
+
+def find_used(faces: IntArray, count: int) -> IntArray:
+    """Return the rising indices (U,) of those of `count` vertices that faces have."""
+    is_used = np.zeros(count, np.bool_)
+    is_used[faces] = True
+    return np.flatnonzero(is_used)
+
+
+def list_used_vertices(parts: Sequence[ImportedPart]) -> list[Float64Array]:
+    """Return for each part those of its vertices (U, 3) that it has in a face."""
+    return [part.vertices[find_used(part.faces, len(part.vertices))] for part in parts]
+
+
 def compute_extent(parts: Sequence[ImportedPart]) -> float:
     """Return the largest extent of all faces along an axis, in the file's unit.
 
     It is infinite beyond float64. Halves are subtracted, so that the difference itself
     does not overflow.
     """
-    used_vertices = [part.vertices[np.unique(part.faces)] for part in parts]
+    used_vertices = list_used_vertices(parts)
     lower = np.min([points.min(axis=0) for points in used_vertices], axis=0)
     upper = np.max([points.max(axis=0) for points in used_vertices], axis=0)
     return float((upper / 2 - lower / 2).max()) * 2
@@ -245,9 +276,7 @@ def assemble(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
     if soup.stored_vertices is not None:
         keys = np.column_stack([keys, soup.stored_vertices.reshape(-1)])
-    _, first_corner, vertex_of_corner = np.unique(
-        keys, axis=0, return_index=True, return_inverse=True
-    )
+    first_corner, vertex_of_corner = find_unique_rows(keys)
     mesh = Mesh(
         vertices=soup.points[corners[first_corner]].astype(np.float32),
         faces=vertex_of_corner.reshape(-1, 3).astype(np.uint32),

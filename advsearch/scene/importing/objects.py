@@ -42,7 +42,9 @@ from advsearch.scene.importing.geometry import (
     assemble,
     compute_extent,
     compute_rotation,
+    find_used,
     join_parts,
+    list_used_vertices,
     repair,
 )
 from advsearch.scene.importing.gltf_entries import Header
@@ -300,7 +302,9 @@ def _find_up(
     if front.axis[1] in UP_OF_FRONT:
         return FileAxis(UP_OF_FRONT[front.axis[1]])
     as_stored = join_parts(parts, str(file), np.eye(3))
-    return guess_up(as_stored.points[np.unique(as_stored.faces)], file.name)
+    return guess_up(
+        as_stored.points[find_used(as_stored.faces, len(as_stored.points))], file.name
+    )
 
 
 def _compute_mean_material(
@@ -388,9 +392,9 @@ def _compute_file_to_mesh(
     `normalise_mesh` that point p to (p - origin) / size; this is the one after the
     other. `turn` (3, 3) leads from the file's axes to ours.
     """
-    used_points = [part.vertices[np.unique(part.faces)] for part in parts]
+    used_points = list_used_vertices(parts)
     lowest_corner = np.min([points.min(axis=0) for points in used_points], axis=0)
-    origin, size = find_footing(soup.points[np.unique(soup.faces)])
+    origin, size = find_footing(soup.points[find_used(soup.faces, len(soup.points))])
     linear = turn / (compute_extent(parts) * size)
     return make_pose(linear, -linear @ lowest_corner - origin / size)
 
