@@ -466,6 +466,7 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
         ]
         if exact or len(similar) == 1:
             match = (exact or similar)[0]
+            # taken out, so that no tensor is two components
             components[component] = tensors.pop(match)
     return components
 
@@ -780,7 +781,12 @@ def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
 
 
 def _order_of_grids(grids: Sequence[Detections], classes: int, head: str) -> str:
-    """Return the only head with layout that fits the grids of all images."""
+    """Return the only head with layout (such as "boxes scores channels first") that
+    fits the YOLO grids of all images.
+
+    Raises:
+        ValueError: none fits all of them, or several do.
+    """
     heads_of_images = [
         set(find_head_orders(x["raw"], x["map_channels"].tolist(), classes, head))
         for x in grids

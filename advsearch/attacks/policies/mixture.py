@@ -138,6 +138,7 @@ class Components:
         n_points = len(x)
         n_components, _, max_options = self.option_probs.shape
         option = ranges.find_option(x, max_options)  # (n, d)
+        # `gather` needs an index of as many axes: (n, k, d, 1) into (n, k, d, m)
         index = option[:, None, :, None].expand(-1, n_components, -1, 1)
         probs = self.option_probs.expand(n_points, *self.option_probs.shape)
         prob = probs.gather(3, index)[..., 0]  # (n, k, d)
