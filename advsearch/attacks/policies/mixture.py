@@ -533,19 +533,12 @@ class Mixture(Policy[MixtureState]):
         """
         number = state.generation + 1
         rng = policies.seeded(state.seed, number)
-        n_options = state.ranges.n_options
-        points = torch.rand(
-            self.population, len(n_options), generator=rng, dtype=torch.float64
-        )
-        points = torch.where(
-            n_options > 0,
-            policies.option_center(points, n_options.clamp(min=1)),
-            points,
-        )
-        # the uniform points that remain are those of the fraction `even`
-        for row in range(self.population):
-            if mixture is not None and float(torch.rand(1, generator=rng)) >= self.even:
-                points[row] = mixture.sample(rng, state.ranges)
+        points = self._sample_uniform(state.ranges, rng)
+        if mixture is not None:
+            for row in range(self.population):
+                stays_uniform = float(torch.rand(1, generator=rng)) < self.even
+                if not stays_uniform:
+                    points[row] = mixture.sample(rng, state.ranges)
         # whole generations, at least one; and the one that begins here
         n_past_generations = max(1, WINDOW // self.population)
         window = n_past_generations * self.population
@@ -558,6 +551,18 @@ class Mixture(Policy[MixtureState]):
             evaluated_points=state.evaluated_points[-window:],
             n_evaluated=0,
         )
+
+    def _sample_uniform(self, ranges: Ranges, rng: torch.Generator) -> Tensor:
+        """Return uniform points (n, d) of a generation, in fractions of each range.
+
+        A discrete choice is at the center of an option's part of the range.
+        """
+        n_options = ranges.n_options
+        points = torch.rand(
+            self.population, len(n_options), generator=rng, dtype=torch.float64
+        )
+        centers = policies.option_center(points, n_options.clamp(min=1))
+        return torch.where(n_options > 0, centers, points)
 
     def _density(self, mixture: Components | None, x: Tensor, ranges: Ranges) -> Tensor:
         """Return the density (n,) of a generation at x (n, d), relative to uniform.
