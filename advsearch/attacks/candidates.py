@@ -333,9 +333,8 @@ def select_diverse(
         farthest = int(nearest_distance.argmax())
         selected.append(farthest)
         difference = (points - points[farthest]).abs()  # (n, k)
-        difference = torch.where(
-            is_periodic, torch.minimum(difference, 1.0 - difference), difference
-        )
+        wrapped_difference = torch.minimum(difference, 1.0 - difference)  # the shorter
+        difference = torch.where(is_periodic, wrapped_difference, difference)
         difference = torch.where(is_discrete, (difference > 0.0).double(), difference)
         nearest_distance = torch.minimum(nearest_distance, difference.norm(dim=1))
         nearest_distance[selected] = -1.0  # never again
@@ -516,6 +515,7 @@ def confirm_bracket(
     shortest_scale = bracket.high
     growth = 1.0  # of the change, since the shortest that passed
     for _ in range(MAX_CONFIRMATIONS):
+        # the seeds of trials follow from the index of the check
         if all(passes(bracket.u, bracket.checks + repeat) for repeat in range(times)):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
         growth *= math.sqrt(RATIO)

@@ -157,23 +157,31 @@ class Evaluation:
         - an objective that is NaN or infinite becomes -inf ("the worst there is"), its
           gradient zero and its success false.
         """
-        evaluation = self
-        gradient = self.gradient
-        if gradient is not None and not math.isfinite(
-            float(gradient.sum(dtype=torch.float64))
-        ):
-            if n_bad := int((~torch.isfinite(gradient)).sum()):
-                gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
-                evaluation = replace(
-                    evaluation,
-                    gradient=gradient,
-                    non_finite=evaluation.non_finite + n_bad,
-                )
+        evaluation = self._sanitize_gradient()
         if evaluation.is_finite:
             return evaluation
-        zero_gradient = None if gradient is None else torch.zeros_like(gradient)
+        zero_gradient = None
+        if evaluation.gradient is not None:
+            zero_gradient = torch.zeros_like(evaluation.gradient)
         return replace(
             evaluation, objective=-math.inf, gradient=zero_gradient, success=False
+        )
+
+    def _sanitize_gradient(self) -> Evaluation:
+        """Return the evaluation with zeros for gradient elements that are NaN or
+        infinite, which are added to `non_finite`.
+        """
+        gradient = self.gradient
+        if gradient is None:
+            return self
+        # The sum is not finite if an element isn't; it is faster than a test of each.
+        if math.isfinite(float(gradient.sum(dtype=torch.float64))):
+            return self
+        n_non_finite = int((~torch.isfinite(gradient)).sum())
+        return replace(
+            self,
+            gradient=torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0),
+            non_finite=self.non_finite + n_non_finite,
         )
 
 
@@ -323,9 +331,9 @@ class Policy(ABC, Generic[State]):
 
     @abstractmethod
     def update(self, state: State, evaluated: Evaluated) -> State:
-        """Return the state after what was proposed last was evaluated, all of it, or
-        the first of it where the budget ends.
+        """Return the state after the latest proposals were evaluated.
 
+        They are all of these, in their order; where the budget ends, the first of them.
         Every evaluation is as `Evaluation.sanitize` leaves it: its gradient (None where
         it was not asked for or could not be paid) is finite, and its objective is
         finite or -inf, which stands for "could not be evaluated". The objective is

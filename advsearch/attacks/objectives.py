@@ -188,6 +188,7 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
     def objective(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
+        """Call the function with what it asks for, and check what it returns, (N,)."""
         inputs = {
             input_name: more(input_name) for input_name in signature.requested_inputs
         }
@@ -199,11 +200,7 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         try:
             result = function(*argument_copies, **input_copies)
         except TypeError as error:
-            # what a loss of torch says that got a label set in place of a tensor
-            is_label_set_rejected = isinstance(labels, tuple) and "not tuple" in str(
-                error
-            )
-            if not is_label_set_rejected:
+            if not _is_label_set_rejected(labels, error):
                 raise
             raise InputError(
                 f"objective {name!r}: expected one right label for a loss of torch, "
@@ -228,6 +225,13 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         return values
 
     return objective
+
+
+def _is_label_set_rejected(labels: Any, error: TypeError) -> bool:
+    """Return whether an error is what a loss of torch raises that got a label set, a
+    tuple, in place of a tensor.
+    """
+    return isinstance(labels, tuple) and "not tuple" in str(error)
 
 
 def _evaluate_each_image(
@@ -678,19 +682,16 @@ def _orient_objective(
     def oriented_objective(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
+        """Return the values (N,) of the function, negated if the task minimises."""
         nonlocal must_check_direction
         labels = task.target if targeted else truth
         function_output = output
         if takes_logits_of_task:
             function_output = task.as_logits(output, labels)
         value = function(function_output, images, labels, more)
-        if (
-            must_check_direction
-            and value.requires_grad
-            and isinstance(output, Tensor)
-            and output.ndim == 2
-            and output.requires_grad
-        ):
+        is_of_logits = isinstance(output, Tensor) and output.ndim == 2
+        has_gradient = value.requires_grad and is_of_logits and output.requires_grad
+        if must_check_direction and has_gradient:
             must_check_direction = False
             name = get_name(user_function)  # type: ignore[arg-type]
             _warn_of_direction(name, value, output, labels)

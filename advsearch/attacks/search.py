@@ -320,19 +320,20 @@ class _Log:
 
         Args:
             proposals: to evaluate.
-            indices: number of the seed of each in the stream of the search.
+            indices: of the seed of each in the stream of the search; candidates that
+                are ranked share them.
             phase: of the search.
         """
         queries = list[Query]()
         started = time.perf_counter()
-        for number, (proposal, index) in enumerate(
-            zip(proposals, indices, strict=True), len(self.records)
+        for record_index, (proposal, seed_index) in enumerate(
+            zip(proposals, indices, strict=True), start=len(self.records)
         ):
             query = Query(
                 proposal.u.clone(),
-                seed=stream(self.render_seed, self.kind, index),
+                seed=stream(self.render_seed, self.kind, seed_index),
                 kind=self.kind,
-                index=number,
+                index=record_index,
                 phase=phase,
                 gradient=proposal.gradient,
                 samples=proposal.samples,

@@ -95,20 +95,20 @@ def make_margin_function(
         The first `n_images` renders of each sample count are those whose images are
         requested.
         """
-        numbers = range(n_rendered[spp], n_rendered[spp] + len(seeds))
-        rows = enumerate(zip(seeds, numbers, strict=True), n_rendered.total())
+        first_render = n_rendered[spp]  # at this sample count
+        first_query = n_rendered.total()  # at all sample counts
         n_rendered[spp] += len(seeds)
         queries = [
             Query(
                 u,
                 seed,
                 kind,
-                row,
+                index=first_query + offset,
                 spp=spp,
                 draws_conditions=draws_conditions,
-                with_image=number < n_images,
+                with_image=first_render + offset < n_images,
             )
-            for row, (seed, number) in rows
+            for offset, seed in enumerate(seeds)
         ]
         return [
             -evaluation.required_judgement.score for evaluation in evaluate(queries)

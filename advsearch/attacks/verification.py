@@ -393,6 +393,7 @@ def verify(
     run_clean = partial(run, domain.start, kind=control_kind)
     is_decided = has_failed if curtailed or has_several_looks else None
     for look in looks:
+        # trials of each group at this look, so that `look` of them count
         count = _extend_clean_trials(clean_trials, run_clean, rule, look, looks[-1])
         done += run(
             u,
@@ -418,14 +419,21 @@ def verify(
         clean_trials,
         done,
         spp=spp,
-        confidence=(
-            OVER_CONFIDENCE if rule.is_conditional and has_several_looks else CONFIDENCE
-        ),
-        renders=len(done) + len(clean_trials) - len(clean),
+        confidence=_choose_confidence(rule, has_several_looks=has_several_looks),
+        renders=len(done) + len(clean_trials) - len(clean),  # those that were made here
         stopped="asked for" if is_complete else "decided",
         is_early=is_success and is_early,
         begin=first_index,
     )
+
+
+def _choose_confidence(rule: Rule, *, has_several_looks: bool) -> float:
+    """Return the confidence of the Clopper-Pearson interval of the success rate.
+
+    It is larger where trials over conditions may have ended at several looks, so that
+    the interval covers the rate in 95 % of all cases nevertheless.
+    """
+    return OVER_CONFIDENCE if rule.is_conditional and has_several_looks else CONFIDENCE
 
 
 def _extend_clean_trials(
@@ -543,11 +551,11 @@ def _summarize_trials(
         reason,
         u,
         clean_counts,
-        counts,
-        tuple(clean_trials),
-        tuple(trials),
-        renders,
-        stopped,
-        outcomes,
-        begin,
+        adversarial_counts=counts,
+        clean_trials=tuple(clean_trials),
+        adversarial_trials=tuple(trials),
+        renders=renders,
+        stopped=stopped,
+        outcomes=outcomes,
+        first_index=begin,
     )

@@ -298,6 +298,9 @@ def _cut_evenly(length: int, max_length: float) -> list[tuple[int, int]]:
 
 
 def make_blank_page(paper: tuple[float, float]) -> tuple[Figure, Axes]:
+    """Return an empty figure of a size (width, height) in millimetres, and axes over all
+    of it, whose coordinates are millimetres from the upper left corner.
+    """
     figure = Figure(figsize=(paper[0] / INCH, paper[1] / INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()

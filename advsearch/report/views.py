@@ -293,6 +293,7 @@ def _find_plain_facts(
     """Return, as texts by name, those fields of a result that no table and no other
     part of the page shows.
     """
+    # facts are called as a page shows them, fields as Python does
     fact_names = [name.replace(" ", "_") for name in result.facts()]
     elsewhere = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
     return {
@@ -680,6 +681,7 @@ def join_images(pictures: Sequence[ArrayLike]) -> bytes:
 
 
 def _make_image(png: bytes, width: int, alt: str) -> Html:
+    """Return a PNG as an image element that holds its bytes; `width` is in pixels."""
     return make_element(
         "img",
         src=f"data:image/png;base64,{base64.b64encode(png).decode()}",
@@ -746,6 +748,7 @@ def make_chart_svg(
     """
 
     def on_figure(figure: Figure) -> None:
+        """Draw the chart, with a single legend above it and without a title."""
         axes = figure.subplots()
         draw(axes)
         axes.set_title("")
@@ -783,11 +786,13 @@ def _make_inline_svg(svg: str, prefix: str) -> Html:
     common. Fixed colours become variables of the page's style.
     """
     shapes = svg[svg.index("<g ") : svg.rindex("</svg>")]
-    unneeded = (
-        r"<clipPath.*?</clipPath>|<!--.*?-->| "
-        r'clip-path="[^"]*"|(?<=\d\.\d)\d+(?=[^<>]*>)'
+    unneeded_patterns = (
+        r"<clipPath.*?</clipPath>",
+        r"<!--.*?-->",
+        r' clip-path="[^"]*"',
+        r"(?<=\d\.\d)\d+(?=[^<>]*>)",  # digits after the first decimal, in a tag
     )
-    shapes = re.sub(unneeded, "", shapes, flags=re.DOTALL)
+    shapes = re.sub("|".join(unneeded_patterns), "", shapes, flags=re.DOTALL)
     referenced_ids = set(re.findall(r'href="#([^"]+)"', shapes))
     shapes = re.sub(
         r' id="([^"]*)"',

@@ -207,7 +207,8 @@ def one_sided_p_value(
 ) -> float:
     """Return the one-sided p-value of fewer right predictions inside a rule.
 
-    The hypothesis is that as large a part of the predictions is right outside. Where
+    Predictions come in units, such as the frames of a drive, which are independent of
+    each other. The hypothesis is that as large a part of the predictions is right outside. Where
     each unit has a single prediction, this is Fisher's exact test. Where all units have
     equally many and lie inside or outside, units are permuted. Elsewhere, where the
     rule cuts through units or some have more predictions than others, it is a bound by

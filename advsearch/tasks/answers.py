@@ -147,10 +147,15 @@ class FreeAnswer(Task):
     def loss(
         self, output: Sequence[AnswerWithLogits | AnswersWithoutLogits], truth: Words
     ) -> Tensor:
-        """Compute the loss of each answer, (N,), see the class."""
+        """Compute the loss of each answer, (N,).
+
+        Without logits it is 1 - 2 s, where s is the fraction of right texts about the
+        image. With logits and the probability p that the lead of right tokens stands
+        for, it is log(1 - p) for a right answer and -log(p) for a wrong one.
+        """
         losses = []
         for answer in output:
-            if "texts" in answer:
+            if "texts" in answer:  # without logits
                 is_right = [float(has_word(text, truth)) for text in _texts(answer)]
                 losses.append(1.0 - 2.0 * torch.tensor(is_right).mean())
                 continue

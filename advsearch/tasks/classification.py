@@ -93,13 +93,14 @@ class ClassTask(Task):
         gray_image = torch.full((1, *model.input_size, 3), 0.5)
         with torch.no_grad():
             n_classes = self.count_classes(model(gray_image))
-        if n_classes is None:
+        if n_classes is None:  # the output does not show it
             if not model.labels:
                 raise InputError(
                     "labels: expected a file with the names of the classes "
                     f"of model {model.name}, got none"
                 )
             return model.labels, True
+        # placeholders if the model has no labels
         labels = fit_labels(n_classes, model.labels or None, LabelsOrigin(), model.name)
         return labels, bool(model.labels)
 

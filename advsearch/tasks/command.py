@@ -96,14 +96,16 @@ class Command(Task):
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
         """See `Task.wrap_network`: a policy gets the state next to images.
 
-        A network that takes the images of all cameras at once, or that is wrapped
-        already, is wrapped inside. One that only takes images stays as it is, unless
-        there is a state or it has the method of LeRobot's policies, `select_action`.
+        A network stays as it is if there is no state, unless it has the method of
+        LeRobot's policies, `select_action`, which `WithState` calls.
         """
         if isinstance(network, models.AllAtOnce):
+            # of all cameras' images at once: what it holds is wrapped
             inner: Any = self.wrap_network(network.network)
             return models.AllAtOnce(inner, network.cameras, network.layout)
-        policy = network.network if isinstance(network, models.WithState) else network
+        policy = network
+        if isinstance(network, models.WithState):  # the state of another task
+            policy = network.network
         if self.state or hasattr(policy, "select_action"):
             return models.WithState(policy, self.state)
         return network
@@ -330,6 +332,7 @@ class Command(Task):
             payload: tasks.JsonValue = {
                 "action": action,
                 "clean": clean_action,
+                # the margin is 1 less the largest deviation in envelopes
                 "envelopes": 1.0 - margin,
                 "text": f"{self._format_action(action)}, clean {clean_text}",
             }

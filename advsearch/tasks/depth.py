@@ -424,7 +424,7 @@ class Depth(Task):
         the truth by least squares, unless it is in metres. A map of another size is
         resized as transformers does it in `post_process_depth_estimation`.
         """
-        ((stated_kind, values),) = depth_map.items()
+        ((stated_kind, values),) = depth_map.items()  # the only entry
         kind = self.kind or stated_kind
         size = (truth.mask.shape[0], truth.mask.shape[1])
         if values.shape != size:
@@ -474,7 +474,7 @@ class Depth(Task):
         """Return the range of the values of each map."""
         predictions_of_images: list[tuple[tasks.Prediction, ...]] = []
         for depth_map in output:
-            ((stated_kind, values),) = depth_map.items()
+            ((stated_kind, values),) = depth_map.items()  # the only entry
             lowest, highest = (float(limit) for limit in values.detach().aminmax())
             kind = self.kind or stated_kind or "numbers"
             label = f"{kind} from {lowest:.3g} to {highest:.3g}"

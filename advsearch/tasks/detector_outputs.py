@@ -438,24 +438,13 @@ def _squeeze_last(tensor: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 def _find_named(returned: Any) -> dict[str, Tensor] | None:
-    """Find the components of a mapping or an object by their names.
+    """Find the components of a mapping or an object by their names: those of `NAMES`,
+    or else the only one with one of `WORDS` in it.
 
     None if it is neither a mapping nor an object with boxes.
     """
-    if isinstance(returned, Mapping):
-        tensors = {
-            str(name): value
-            for name, value in returned.items()
-            if isinstance(value, Tensor)
-        }
-    elif any(hasattr(returned, name) for name in NAMES["boxes"]):
-        known_names = [name for names in NAMES.values() for name in names]
-        tensors = {
-            name: getattr(returned, name)
-            for name in known_names
-            if isinstance(getattr(returned, name, None), Tensor)
-        }
-    else:
+    tensors = _list_named_tensors(returned)
+    if tensors is None:
         return None
     components = dict[str, Tensor]()
     for component, names in NAMES.items():
@@ -466,8 +455,31 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
         ]
         if exact or len(similar) == 1:
             match = (exact or similar)[0]
+            # taken out, so that no tensor is two components
             components[component] = tensors.pop(match)
     return components
+
+
+def _list_named_tensors(returned: Any) -> dict[str, Tensor] | None:
+    """Return the tensors of a mapping by name, or of an object those among its
+    attributes that have one of `NAMES`.
+
+    None if it is neither a mapping nor an object with boxes.
+    """
+    if isinstance(returned, Mapping):
+        return {
+            str(name): value
+            for name, value in returned.items()
+            if isinstance(value, Tensor)
+        }
+    if not any(hasattr(returned, name) for name in NAMES["boxes"]):
+        return None
+    known_names = [name for names in NAMES.values() for name in names]
+    return {
+        name: getattr(returned, name)
+        for name in known_names
+        if isinstance(getattr(returned, name, None), Tensor)
+    }
 
 
 def _components_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
@@ -780,7 +792,12 @@ def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
 
 
 def _order_of_grids(grids: Sequence[Detections], classes: int, head: str) -> str:
-    """Return the only head with layout that fits the grids of all images."""
+    """Return the only head with layout (such as "boxes scores channels first") that
+    fits the YOLO grids of all images.
+
+    Raises:
+        ValueError: none fits all of them, or several do.
+    """
     heads_of_images = [
         set(find_head_orders(x["raw"], x["map_channels"].tolist(), classes, head))
         for x in grids

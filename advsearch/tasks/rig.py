@@ -233,7 +233,7 @@ class Rig(tasks.JointTask):
                 [
                     replace(mark, mask=self._pad_to_rig(mark.mask))
                     for mark in marks
-                    if mark.map is None
+                    if mark.map is None  # a map is of one image, and drawn beside it
                 ]
             )
         return marks_of_rigs

@@ -208,8 +208,8 @@ class ConnectionPool:
         for client in clients:
             makes_room = n_waiting > 0 and now - client.since > SLOW_CLIENT_SECONDS
             if client.due < now or makes_room:
-                n_waiting -= 1
-                client.since = math.inf
+                n_waiting -= 1  # its worker is free then
+                client.since = math.inf  # so that it is not ended twice
                 client.due = math.inf
                 # The worker's next read or write ends then. (The plain method: that of
                 # an SSL socket would forget that it is one.)

@@ -111,6 +111,7 @@ def read_columns(
     boxes = Boxes()
 
     def read_corners(row: Row) -> Mapping[str, float]:
+        """Return the corners of a row; what is stored may be anything."""
         try:
             return _read_corners(row, boxes)
         except (LookupError, TypeError, ValueError, OverflowError, AttributeError):

@@ -230,6 +230,8 @@ def make_progress_page(name: str, run: Path) -> str:
         make_element("p", ", ".join(filter(None, facts)), class_="eyebrow"),
         make_element("h1", f"{name} has not ended"),
     )
+    # the script asks this address, relative to the page, for what comes after a row
+    request = {"progress": "progress", "start": FIRST_ROW_ID}
     state_text = f"{state} Evaluations so far: {', '.join(counts) or 'none'}."
     main = make_element(
         "main",
@@ -241,7 +243,7 @@ def make_progress_page(name: str, run: Path) -> str:
         name,
         header,
         main,
-        data=[make_data_script({"progress": "progress", "start": FIRST_ROW_ID}, "run")],
+        data=[make_data_script(request, "run")],
         scripts=["make.js", "follow.js"],
         connects=True,
         footer=f"run {name}",
@@ -549,7 +551,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing."""
 
     def do_GET(self) -> None:
-        """Respond to a request of any method; any error becomes a response."""
+        """Respond to a GET, HEAD or POST request; any error becomes a response."""
         headers: dict[str, str] = {}
         status = HTTPStatus.OK
         # from here until the response is sent the worker computes

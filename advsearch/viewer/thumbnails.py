@@ -83,7 +83,8 @@ def thumbnail_path(run: Path, number: int) -> Path:
 def find_thumbnail(run: Path, number: int) -> Path | None:
     """Return the file of a thumbnail, None if there is none.
 
-    A link counts as none (`check_links` leaves these to this function).
+    A link, which could lead out of the run, counts as none; `check_links`, which
+    rejects links elsewhere in a run, does not look at thumbnails.
     """
     file = thumbnail_path(run, number)
     if not file.is_file() or file.is_symlink() or file.parent.is_symlink():

@@ -330,12 +330,11 @@ class Auto(Policy[AutoState]):
         return replace(state, observations=state.observations.extend(evaluated))
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
+        """See `Policy.takes_differences`: only an ascent with full gradients does."""
         plan = make_plan(domain, find_box_coordinates(domain), steps)
-        return (
-            domain.gradient_cost > 0
-            and plan.ascent_start < steps
-            and plan.gradient is True
-        )
+        has_ascent = plan.ascent_start < steps
+        has_full_gradient = plan.gradient is True
+        return domain.gradient_cost > 0 and has_ascent and has_full_gradient
 
     def counts(self, state: AutoState) -> Counts:
         return NO_COUNTS if state.ascent is None else state.ascent.counts
@@ -357,10 +356,11 @@ class Auto(Policy[AutoState]):
         return best_candidate, replace(state, observations=observations)
 
     def _begin_ascent(self, state: AutoState) -> AutoState:
-        """Let PGD go on from the best observed point, with small steps in the box.
+        """Let PGD go on from the best point that was observed.
 
-        The best is by the mean of the surrogate; the initial point if no objective is
-        finite. Norm balls begin at their start.
+        The best is by the mean of the surrogate; it is the initial point if no
+        objective is finite. Norm balls begin at their start. In box coordinates steps
+        are smaller than usual (`ASCENT_REACH`), as the screen has been everywhere else.
         """
         x = state.box.from_configuration(state.domain.initial_point)
         if state.observations.has_finite:
@@ -410,7 +410,7 @@ class WithoutAscent(Auto):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
-        # no plan has an ascent then
+        """Start as `Auto` does where no gradient can be paid: no plan has an ascent."""
         return super().start(
             replace(domain, gradient_cost=UNAFFORDABLE_COST), generator, steps
         )

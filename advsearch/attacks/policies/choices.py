@@ -482,7 +482,8 @@ def _drop_choices(domain: Domain, numbers: Tensor) -> Domain:
 def _count_runners(domain: Domain, policy: Policy[Any], steps: int) -> int:
     """Return how many combinations of options can be searched in `steps` renders."""
     n_combinations = math.prod(domain.options[domain.options > 0].tolist())
-    limit = min(MAX_COMBINATIONS, n_combinations, max(2, MAX_NUMBERS // domain.dim))
+    max_in_memory = max(2, MAX_NUMBERS // domain.dim)
+    limit = min(MAX_COMBINATIONS, n_combinations, max_in_memory)
     renders_per_evaluation = 1
     if policy.uses_gradient:
         renders_per_evaluation += domain.gradient_cost

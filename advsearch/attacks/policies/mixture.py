@@ -138,6 +138,7 @@ class Components:
         n_points = len(x)
         n_components, _, max_options = self.option_probs.shape
         option = ranges.find_option(x, max_options)  # (n, d)
+        # `gather` needs an index of as many axes: (n, k, d, 1) into (n, k, d, m)
         index = option[:, None, :, None].expand(-1, n_components, -1, 1)
         probs = self.option_probs.expand(n_points, *self.option_probs.shape)
         prob = probs.gather(3, index)[..., 0]  # (n, k, d)
@@ -532,19 +533,12 @@ class Mixture(Policy[MixtureState]):
         """
         number = state.generation + 1
         rng = policies.seeded(state.seed, number)
-        n_options = state.ranges.n_options
-        points = torch.rand(
-            self.population, len(n_options), generator=rng, dtype=torch.float64
-        )
-        points = torch.where(
-            n_options > 0,
-            policies.option_center(points, n_options.clamp(min=1)),
-            points,
-        )
-        # the uniform points that remain are those of the fraction `even`
-        for row in range(self.population):
-            if mixture is not None and float(torch.rand(1, generator=rng)) >= self.even:
-                points[row] = mixture.sample(rng, state.ranges)
+        points = self._sample_uniform(state.ranges, rng)
+        if mixture is not None:
+            for row in range(self.population):
+                stays_uniform = float(torch.rand(1, generator=rng)) < self.even
+                if not stays_uniform:
+                    points[row] = mixture.sample(rng, state.ranges)
         # whole generations, at least one; and the one that begins here
         n_past_generations = max(1, WINDOW // self.population)
         window = n_past_generations * self.population
@@ -557,6 +551,18 @@ class Mixture(Policy[MixtureState]):
             evaluated_points=state.evaluated_points[-window:],
             n_evaluated=0,
         )
+
+    def _sample_uniform(self, ranges: Ranges, rng: torch.Generator) -> Tensor:
+        """Return uniform points (n, d) of a generation, in fractions of each range.
+
+        A discrete choice is at the center of an option's part of the range.
+        """
+        n_options = ranges.n_options
+        points = torch.rand(
+            self.population, len(n_options), generator=rng, dtype=torch.float64
+        )
+        centers = policies.option_center(points, n_options.clamp(min=1))
+        return torch.where(n_options > 0, centers, points)
 
     def _density(self, mixture: Components | None, x: Tensor, ranges: Ranges) -> Tensor:
         """Return the density (n,) of a generation at x (n, d), relative to uniform.

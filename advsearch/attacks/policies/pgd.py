@@ -390,6 +390,7 @@ class PGD(AscentPolicy):
     name: ClassVar[str] = "pgd"
 
     def __post_init__(self) -> None:
+        """Check that all settings are within their limits."""
         if not 0.0 < self.step_size <= 2.0:
             raise self.make_range_error(
                 "step_size", "(0, 2], a fraction of epsilon", 0.5
@@ -578,6 +579,9 @@ class Adam(AscentPolicy):
         return state.decay_step_size(state.count)
 
     def retreat(self, state: Ascent) -> Ascent:
+        """Go back to the best configuration, or else to the start, and forget all
+        gradients.
+        """
         u = state.domain.initial_point if state.peak is None else state.peak.u
         return replace(
             state,
@@ -597,6 +601,7 @@ class Adam(AscentPolicy):
         for block, part in state.domain.list_block_slices():
             if block.norm == "l2":
                 squares[part] = squares[part].mean()
+        # beta m + (1 - beta) g
         mean = torch.lerp(gradient, state.direction, self.beta1)
         return replace(
             state,

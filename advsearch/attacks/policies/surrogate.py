@@ -73,7 +73,9 @@ class BoxCoordinates:
         )
 
     def sample_screen(self, seed: int, n: int) -> Tensor:
-        """Return points (n, k) spread evenly: a scrambled Sobol sequence."""
+        """Return points (n, k) spread evenly: a scrambled Sobol sequence, or, of very
+        many coordinates, independent points.
+        """
         if n == 0:
             return torch.empty(0, self.count)
         if self.count > MAX_SOBOL_DIM:

@@ -207,7 +207,7 @@ def _confirm_rules(renders: Any, found_rules: Any) -> list[RuleRow]:
 def read_table(
     sweeps: Sequence[workbench.StoredSweep],
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the rows of sweeps that have the object in view, twice.
+    """Return the rows of sweeps that have the object in view, as two frames.
 
     Returns:
         All columns of the rows; and a table of the parameters that vary in all of them,

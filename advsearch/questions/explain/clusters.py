@@ -41,8 +41,9 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     """Cluster failures by k-means over the directions of their features (n, F).
 
     The number of clusters is chosen by the mean silhouette (Rousseeuw 1987). They are
-    apart if it is larger than that of each reference, clustered likewise (after
-    Tibshirani, Walther and Hastie 2001).
+    apart if it is larger than that of each of `N_REFERENCES` clouds of points without
+    clusters, which are clustered in the same way (after Tibshirani, Walther and Hastie
+    2001). Few failures are a single cluster.
 
     Raises:
         InputError: scikit-learn is missing.

@@ -146,6 +146,9 @@ class ClusteredPredictions:
     """
 
     def __init__(self, table: pd.DataFrame) -> None:
+        """Take the predictions of a table: its columns `correct`, and `unit`, the
+        cluster of each row.
+        """
         self.correct: BoolArray = table["correct"].to_numpy()
         clusters, self.cluster = np.unique(table["unit"], return_inverse=True)
         self.n_clusters = len(clusters)
@@ -361,6 +364,7 @@ def within_group_variance(
         clusters_per_group: (k,) at least 2 each.
         group_weight: (k,) sum of the weights.
     """
+    # n / (n - 1), as in an unbiased variance
     variance_of_group = (
         squared_residual * clusters_per_group / (clusters_per_group - 1) / group_weight
     )

@@ -270,13 +270,15 @@ def is_sampled(config: SweepConfig, factor: str) -> bool:
 
 
 def is_settable(config: SweepConfig, name: str) -> bool:
-    """Return whether a value of a row can be set.
+    """Return whether a value of a row, by its name, can be set.
 
-    Others follow from what is set, as `path.distance` does.
+    Settings can ("object"), and parameters that their control declares. Others follow
+    from what is set, as "path.distance" does.
     """
     instance, dot, parameter = name.partition(".")
-    declared = config.declared_parameters(instance)
-    return not dot or declared is None or parameter in declared
+    is_setting = not dot
+    declared = config.declared_parameters(instance)  # None: any, in the scene
+    return is_setting or declared is None or parameter in declared
 
 
 def find_names(config: SweepConfig, setting: str, value: str) -> list[str]:
