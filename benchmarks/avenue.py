@@ -282,9 +282,8 @@ def _compare_roulette(args: argparse.Namespace) -> None:
     scene = load_scene("car", "avenue", settings=_camera(args.distance))
     renderer = scene.renderer(["texture"], resolution=args.size)
     backend = renderer.scene
-    first_bounce = backend.roulette_depth
     true_image = torch.zeros(())
-    for depth in (NO_ROULETTE_DEPTH, first_bounce + 2, first_bounce + 1, first_bounce):
+    for depth in (NO_ROULETTE_DEPTH, 3, 2, 1):
         backend.roulette_depth = depth
         backend._integrators.clear()
         population.changes += 1

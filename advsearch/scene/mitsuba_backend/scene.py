@@ -56,16 +56,17 @@ from advsearch.scene.window import Window
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE_DEPTH = 1000
-ROULETTE_DEPTH = 1
-"""Bounces after which Russian roulette may end a path of a primal render.
+ROULETTE_DEPTH = 2
+"""Bounces from which on Russian roulette may end a path of a primal render.
 
-It never does where paths soon leave the scene by themselves. Among houses it halves the
-time of images, and squared error times time once they are denoised
-(`benchmarks/avenue.py --roulette`).
+It never does where paths soon leave the scene by themselves. Among houses, 2 takes a
+fifth less time than 3, at a tenth less squared error times time of denoised images
+(`benchmarks/avenue.py --roulette`). From 1 on it is less still, but there the denoiser
+loses more: the model's margin falls by .4 at 16 samples, and verification needs more.
 """
 GRADIENT_ROULETTE_DEPTH = 2
-"""Likewise, after the first, of an adjoint: from 1 on, single gradients were a fifth
-off.
+"""Likewise of an adjoint, which counts one bounce less: from 1 on, single gradients
+were a fifth off.
 """
 # samples per pixel of the shadow term; without it the gradient of an object on the
 # ground has a cosine of 0.66 to the true one
@@ -86,7 +87,7 @@ class MitsubaScene:
         plane_radiance: (3,) of the plane that takes the shadow in a photograph, without
             the object; None if there is none.
         integrator: Mitsuba's name of the path integrator of primal renders.
-        roulette_depth: bounces after which Russian roulette may end a path there.
+        roulette_depth: bounces from which on Russian roulette may end a path there.
         declared_inputs: for each input its key in `parameters`, and its definition.
         interior_inputs: the inputs that the interior adjoint differentiates correctly.
         window: the window of the image that is rendered; None for all of it.
@@ -101,8 +102,8 @@ class MitsubaScene:
         sampler: Mitsuba's name of the sampler; some round sample counts up, see
             `round_sample_count`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there
-            is no medium. None takes `path` where there is roulette, which can begin
-            with the first bounce there, and `prb` elsewhere.
+            is no medium. None takes `path` where there is roulette, and `prb`
+            elsewhere.
     """
 
     def __init__(
