@@ -295,6 +295,12 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
             )
     if scene.backdrop_photograph is not None:
         _check_controls_in_photograph(controls, scene.backdrop_photograph.spec)
+    folder = scene.photographs
+    if folder is not None and not any(one.kind == "backdrop" for one in controls):
+        raise InputError(
+            f"backdrop: {folder.path} is a folder of {len(folder.scenes)} photographs; "
+            "name one of them, or let the control backdrop choose, as in `over=backdrop`"
+        )
     described = scene
     adjusted = list[AdjustedDefault]()
     for control in controls:

@@ -359,7 +359,9 @@ def _check_printable(
 ) -> None:
     """Raise an error if colors are to be printed and nothing can be."""
     if config.printable:
-        searched_space = make_space(parts.controls, description)
+        # without the photographs, among which only another control chooses
+        scene = replace(description, photographs=None)
+        searched_space = make_space(parts.controls, scene)
         # raises where nothing can be printed
         judging.measure_print_terms(searched_space, searched_space.start)
 
