@@ -57,6 +57,7 @@ from advsearch.scene.formation import (
 from advsearch.scene.grounds import with_requested_ground
 from advsearch.scene.headlamps import add_lamps
 from advsearch.scene.importing.pictures import read_image
+from advsearch.scene.library import import_environment
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.photograph_files import (
     PhotographFolder,
@@ -65,7 +66,6 @@ from advsearch.scene.photograph_files import (
     read_photograph_folder,
     read_photograph_view,
 )
-from advsearch.scene.library import import_environment
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA, SettingValues
 from advsearch.settings import parse_controls, to_python

@@ -84,9 +84,9 @@ from advsearch.scene.parts import (
     iterate_plugins,
     make_mesh_part,
 )
+from advsearch.scene.photograph_files import PhotographFolder
 from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
-from advsearch.scene.photograph_files import PhotographFolder
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import (
