@@ -57,11 +57,16 @@ from advsearch.questions.attack.settings import (
     AttackConfig,
 )
 from advsearch.runs.directory import CONFIG, read_python_only
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import (
     ALL_OMISSIONS,
     NO_OMISSIONS,
     parse_aovs,
     round_sample_count,
+)
+from advsearch.scene.photograph_files import (
+    is_photograph_folder,
+    read_photograph_folder,
 )
 from advsearch.scene.things import ALL_THINGS
 from advsearch.settings import FILES
@@ -167,6 +172,82 @@ def load_parts_of_run(run: Path) -> AttackParts:
             "asked has what judges its result"
         )
     return load_parts(with_evaluation_only(AttackConfig.from_yaml(run / CONFIG)))
+
+
+def move_to_photographs(parts: AttackParts, folder: str) -> dict[str, AttackParts]:
+    """Return the parts of an attack with its scene in each photograph of a folder.
+
+    What the camera files state takes the place of what the attack states of camera,
+    pose and ground. Controls that vary by chance what a photograph fixes are left out.
+
+    Args:
+        parts: of the attack.
+        folder: of photographs.
+
+    Returns:
+        The parts by the name of the photograph's file. Photographs that the attack
+        itself used are left out.
+
+    Raises:
+        FileFormatError: the folder cannot be used.
+        InputError: the scene cannot be rendered into it, or no photograph is left.
+    """
+    config = parts.config
+    if not is_photograph_folder(folder):
+        raise InputError(
+            f"backdrop: expected a folder of photographs with their camera files, got "
+            f"{folder}"
+        )
+    view = next(iter(read_photograph_folder(folder).values()))
+    kept_settings = {
+        name: value
+        for name, value in config.set_.items()
+        if not name.startswith(view.replaced_settings)
+    }
+    changes = {"backdrop": folder, "occluder": None, "set_": kept_settings}
+    if view.camera is not None:
+        changes["camera"] = None
+    config = config.model_copy(update=changes)
+    scene = naming.load_configured_scene(config)
+    photographs = scene.description.photographs
+    if photographs is None:
+        raise InputError(
+            f"{parts.config.object}: only the Python session that asked has the scene"
+        )
+    used = list_used_photographs(parts.scene.description)
+    random_controls = tuple(
+        control
+        for control in parts.random_controls
+        if not control.photograph_refusal and control.kind != "backdrop"
+    )
+    moved = {
+        name: replace(
+            parts,
+            config=config,
+            scene=replace(scene, description=description),
+            random_controls=random_controls,
+            clean_matrix=CleanMatrix(),
+        )
+        for name, description in photographs.scenes.items()
+        if not used & list_used_photographs(description)
+    }
+    if not moved:
+        raise InputError(
+            f"backdrop: expected other photographs than the run used, got {folder}"
+        )
+    return moved
+
+
+def list_used_photographs(description: SceneDescription) -> set[str]:
+    """Return the digests of the photographs that a scene is rendered into."""
+    scenes = [description]
+    if description.photographs is not None:
+        scenes += description.photographs.scenes.values()
+    return {
+        scene.backdrop_photograph.digest
+        for scene in scenes
+        if scene.backdrop_photograph is not None
+    }
 
 
 def make_attack_controls(

@@ -32,9 +32,11 @@ from advsearch.extend import (
 from advsearch.questions.replay.cycles import BlenderError, Cycles
 from advsearch.questions.replay.result import (
     NOT_DONE,
+    PHOTOGRAPH,
     ReplayConfig,
     ReplayResult,
     ReplayRow,
+    count_transfer,
 )
 
 AttackResult = workbench.AttackResult
@@ -312,6 +314,32 @@ def model_condition(
     )
 
 
+def photograph_conditions(
+    parts: workbench.AttackParts, folder: str, spp: int, threads: Mapping[str, int]
+) -> Iterator[ReplayCondition]:
+    """Yield a condition for each photograph of a folder that the run did not use.
+
+    Args:
+        parts: of the attack.
+        folder: of photographs.
+        spp: samples per pixel.
+        threads: other settings of the problems.
+    """
+    for name, moved in workbench.move_to_photographs(parts, folder).items():
+        yield ReplayCondition(
+            PHOTOGRAPH,
+            name,
+            make_problem=partial(_make_photograph_problem, moved, threads),
+            spp=spp,
+        )
+
+
+def _make_photograph_problem(
+    parts: workbench.AttackParts, threads: Mapping[str, int]
+) -> Problem:
+    return workbench.make_problem_with_warnings(parts, **threads)[0]
+
+
 # ---- the experiment
 # ----------------------------------------------------------------------------------
 
@@ -392,6 +420,8 @@ def run_replay(
 
     spp = verification_spp(attack)
     conditions = select_conditions(config, problem, spp, load_problem)
+    if config.backdrop is not None:
+        conditions += photograph_conditions(parts, config.backdrop, spp, threads)
     table = _Table(
         u=workbench.read_stored_configuration(attack_directory, problem),
         trials=config.trials,
@@ -402,6 +432,9 @@ def run_replay(
     with context.until_interrupted():
         for batch in batch_by_light(conditions, spp):
             table.fill(batch)
+    rows = [
+        table.rows[condition] for condition in conditions if condition in table.rows
+    ]
     return context.result(
         ReplayResult,
         answer=str(attack_directory),
@@ -411,9 +444,8 @@ def run_replay(
         task=attack.task,
         environment=attack.environment,
         controls=attack.controls,
-        table=[
-            table.rows[condition] for condition in conditions if condition in table.rows
-        ],
+        table=rows,
+        transfer=count_transfer(rows),
         renders=table.renders,
         warnings=warnings,
         seed=parts.config.seed,
