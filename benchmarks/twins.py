@@ -2,17 +2,24 @@
 
     python benchmarks/twins.py DATA --model MODEL --labels LABELS --out FOLDER
     python benchmarks/twins.py DATA --train BACKBONE.pt2 --folds 5 --out FOLDER
+    python benchmarks/twins.py DATA --train BACKBONE.pt2 --transfer obj_000005 --out FOLDER
 
 DATA is a folder in BOP's form, or a list. With --train a linear layer is fitted on what
 a backbone (an exported program: images in, numbers out) says of the crops of other
 frames. Frames are cut into blocks of neighbours, and each block is judged by a
 classifier that was fitted on the others. No data is in this repository.
+
+With --transfer, a classifier is fitted on the first third of the frames. The texture of
+an object is attacked in the first of the other photographs, in a bundled room, and over
+all photographs of the first third at once. Each result is then tried in all the others.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +43,11 @@ N_CELLS = 3  # along each side of the grid that features are averaged over
 RIDGE = 1.0
 SHARPNESS = 5.0  # logits of a unit of the fitted targets, which are -1 and 1
 MIN_VISIBLE = 0.1
+# of --transfer: the object that is rendered lies before all that hides it
+MIN_VISIBLE_IN_TRANSFER = 0.5
+EPSILON = 0.3  # of a texture, sRGB
+STEPS = 20
+RESOLUTION = 128  # of renders, which are enlarged to `SIZE`
 
 
 class Features(nn.Module):
@@ -158,6 +170,139 @@ def run_folds(options: argparse.Namespace) -> list[str]:
     return run_twins(options, network=model_of_frame)
 
 
+# ---- transfer
+
+
+def run_transfer(options: argparse.Namespace) -> list[str]:
+    """Attack a texture in a photograph, a room and many photographs; try it in others.
+
+    Returns:
+        The lines of a table: in how many of the other photographs each attack holds.
+    """
+    objects = read_photographs(options.data).objects
+    names = sorted({item.object for item in objects})
+    training_frames, *_ = cut_frames(objects, 3)
+    backbone = Features(torch.export.load(options.train))
+    features = []
+    labels = []
+    training = [item for item in objects if item.frame in training_frames]
+    for item, images in list_crops(training, np.random.default_rng(0)):
+        with torch.no_grad():
+            features.append(backbone(images.permute(0, 3, 1, 2).contiguous()))
+        labels += [names.index(item.object)] * len(images)
+    head = fit_head(backbone, torch.cat(features), torch.tensor(labels), len(names))
+    model = advsearch.load_model(head, labels=names, input_size=SIZE, name="fitted")
+    folders = write_folders(objects, options.transfer, training_frames, options.out)
+    mesh = next(item.mesh for item in objects if item.object == options.transfer)
+    first = min((folders["others"]).glob("*.png"))
+    scenes = {
+        f"photograph {first.stem}": {"backdrop": str(first)},
+        options.environment: {"environment": options.environment},
+        "photographs of the first third": {"backdrop": str(folders["searched"])},
+    }
+    lines = ["searched in | ends with | clean right | holds in | interval"]
+    for number, (name, where) in enumerate(scenes.items()):
+        over = "backdrop" if where.get("backdrop") == str(folders["searched"]) else ()
+        attack = advsearch.attack(
+            str(mesh),
+            model,
+            controls={"texture": {"epsilon": EPSILON}},
+            label=options.transfer,
+            over=over,
+            unit="mm",
+            steps=STEPS,
+            resolution=RESOLUTION,
+            spp=options.spp // 2,
+            verify_spp=options.spp,
+            baseline=False,
+            measure="no",
+            run=str(options.out / f"attack-{number}"),
+            overwrite=True,
+            **where,
+        )
+        lines.append(f"{name} | {attack.ending} | {try_in_others(attack, folders)}")
+        print(lines[-1], flush=True)
+    return lines
+
+
+def try_in_others(attack: Any, folders: dict[str, Path]) -> str:
+    """Return the cells of a table about the photographs that an attack did not use."""
+    if attack.ending != "found":
+        return "| |"
+    replayed = advsearch.replay(
+        attack,
+        backdrop=str(folders["others"]),
+        trials=6,
+        run=f"{attack.run}-replay",
+        overwrite=True,
+    )
+    transfer = replayed.transfer
+    clean = f"{transfer.clean_right} of {transfer.photographs}"
+    if transfer.rate is None:
+        return f"{clean} | |"
+    low, high = transfer.rate.interval
+    return (
+        f"{clean} | {transfer.holding} of {transfer.clean_right} | "
+        f"{low:.2f} to {high:.2f}"
+    )
+
+
+def write_folders(
+    objects: Sequence[PhotographedObject],
+    name: str,
+    training_frames: Sequence[str],
+    out: Path,
+) -> dict[str, Path]:
+    """Write the photographs of an object as folders, each with its camera file.
+
+    Args:
+        objects: in photographs.
+        name: of the object.
+        training_frames: whose photographs go to the folder "searched"; the rest to
+            "others".
+        out: where the folders are written.
+    """
+    folders = {key: out / key for key in ("searched", "others")}
+    for folder in folders.values():
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    for item in objects:
+        is_hidden = item.visible is not None and item.visible < MIN_VISIBLE_IN_TRANSFER
+        if item.object != name or is_hidden:
+            continue
+        photograph = rendering.load_photograph(item.photograph)
+        height, width = photograph.shape[:2]
+        positions = rendering.project_object(
+            item, rendering.load_object(item.mesh, item.unit)
+        )
+        window = rendering.choose_window(
+            positions, (height, width), SIZE, CLASSIFIER_MARGIN
+        )
+        if window is None:
+            continue
+        key = "searched" if item.frame in training_frames else "others"
+        camera = item.camera
+        file = folders[key] / item.photograph.name
+        shutil.copyfile(item.photograph, file)
+        # pixel centers are whole numbers in OpenCV's form
+        matrix = [
+            [camera.fx, 0.0, camera.cx - 0.5],
+            [0.0, camera.fy, camera.cy - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+        entries = {
+            "image_width": width,
+            "image_height": height,
+            "camera_matrix": matrix,
+            "object_to_camera": item.pose.tolist(),
+            "part": list(window),
+            # its shadow is in the photograph, which shows the object itself
+            "set": {"ground.size": 0.0},
+        }
+        file.with_suffix(".json").write_text(json.dumps(entries), "utf-8")
+    return folders
+
+
 def run_twins(options: argparse.Namespace, **model: Any) -> list[str]:
     """Run the command, and return the lines of its table."""
     result = twins(
@@ -178,12 +323,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--train", type=Path)
     parser.add_argument("--folds", type=int, default=5)
+    parser.add_argument("--transfer", metavar="OBJECT")
     parser.add_argument("--model", default="reference")
     parser.add_argument("--labels")
     parser.add_argument("--environment", default="room")
     parser.add_argument("--spp", type=int, default=32)
     options = parser.parse_args()
-    if options.train:
+    if options.transfer:
+        lines = run_transfer(options)
+    elif options.train:
         lines = run_folds(options)
     else:
         lines = run_twins(options, model=options.model, labels=options.labels)
