@@ -43,8 +43,6 @@ N_CELLS = 3  # along each side of the grid that features are averaged over
 RIDGE = 1.0
 SHARPNESS = 5.0  # logits of a unit of the fitted targets, which are -1 and 1
 MIN_VISIBLE = 0.1
-# of --transfer: the object that is rendered lies before all that hides it
-MIN_VISIBLE_IN_TRANSFER = 0.5
 EPSILON = 0.3  # of a texture, sRGB
 STEPS = 20
 RESOLUTION = 128  # of renders, which are enlarged to `SIZE`
@@ -180,39 +178,32 @@ def run_transfer(options: argparse.Namespace) -> list[str]:
         The lines of a table: in how many of the other photographs each attack holds.
     """
     objects = read_photographs(options.data).objects
+    training_frames = cut_frames(objects, 3)[0]
+    head = fit_on_frames(options.train, objects, training_frames)
     names = sorted({item.object for item in objects})
-    training_frames, *_ = cut_frames(objects, 3)
-    backbone = Features(torch.export.load(options.train))
-    features = []
-    labels = []
-    training = [item for item in objects if item.frame in training_frames]
-    for item, images in list_crops(training, np.random.default_rng(0)):
-        with torch.no_grad():
-            features.append(backbone(images.permute(0, 3, 1, 2).contiguous()))
-        labels += [names.index(item.object)] * len(images)
-    head = fit_head(backbone, torch.cat(features), torch.tensor(labels), len(names))
     model = advsearch.load_model(head, labels=names, input_size=SIZE, name="fitted")
     folders = write_folders(objects, options.transfer, training_frames, options.out)
     mesh = next(item.mesh for item in objects if item.object == options.transfer)
-    first = min((folders["others"]).glob("*.png"))
-    scenes = {
-        f"photograph {first.stem}": {"backdrop": str(first)},
+    first = min(folders["others"].glob("*.png"))
+    searches: dict[str, dict[str, Any]] = {
+        f"photograph {first.stem}": {"backdrop": first},
         options.environment: {"environment": options.environment},
-        "photographs of the first third": {"backdrop": str(folders["searched"])},
+        "photographs of the first third": {
+            "backdrop": folders["searched"],
+            "over": "backdrop",
+        },
     }
     lines = ["searched in | ends with | clean right | holds in | interval"]
-    for number, (name, where) in enumerate(scenes.items()):
-        over = "backdrop" if where.get("backdrop") == str(folders["searched"]) else ()
+    for number, (name, where) in enumerate(searches.items()):
         attack = advsearch.attack(
             str(mesh),
             model,
             controls={"texture": {"epsilon": EPSILON}},
             label=options.transfer,
-            over=over,
             unit="mm",
             steps=STEPS,
             resolution=RESOLUTION,
-            spp=options.spp // 2,
+            spp=options.spp,
             verify_spp=options.spp,
             baseline=False,
             measure="no",
@@ -220,31 +211,42 @@ def run_transfer(options: argparse.Namespace) -> list[str]:
             overwrite=True,
             **where,
         )
-        lines.append(f"{name} | {attack.ending} | {try_in_others(attack, folders)}")
+        cells = [name, attack.summary.ending]
+        if attack.found:
+            cells += try_in_others(attack, folders["others"])
+        lines.append(" | ".join(cells))
         print(lines[-1], flush=True)
     return lines
 
 
-def try_in_others(attack: Any, folders: dict[str, Path]) -> str:
+def fit_on_frames(
+    backbone_file: Path, objects: Sequence[PhotographedObject], frames: Sequence[str]
+) -> Head:
+    """Fit a linear layer on the crops of all objects in some frames."""
+    names = sorted({item.object for item in objects})
+    backbone = Features(torch.export.load(backbone_file))
+    features = []
+    labels = []
+    chosen = [item for item in objects if item.frame in frames]
+    for item, images in list_crops(chosen, np.random.default_rng(0)):
+        with torch.no_grad():
+            features.append(backbone(images.permute(0, 3, 1, 2).contiguous()))
+        labels += [names.index(item.object)] * len(images)
+    return fit_head(backbone, torch.cat(features), torch.tensor(labels), len(names))
+
+
+def try_in_others(attack: Any, folder: Path) -> list[str]:
     """Return the cells of a table about the photographs that an attack did not use."""
-    if attack.ending != "found":
-        return "| |"
     replayed = advsearch.replay(
-        attack,
-        backdrop=str(folders["others"]),
-        trials=6,
-        run=f"{attack.run}-replay",
-        overwrite=True,
+        attack, backdrop=folder, trials=6, run=f"{attack.run}-replay", overwrite=True
     )
     transfer = replayed.transfer
-    clean = f"{transfer.clean_right} of {transfer.photographs}"
-    if transfer.rate is None:
-        return f"{clean} | |"
-    low, high = transfer.rate.interval
-    return (
-        f"{clean} | {transfer.holding} of {transfer.clean_right} | "
-        f"{low:.2f} to {high:.2f}"
-    )
+    cells = [f"{transfer.clean_right} of {transfer.photographs}"]
+    if transfer.rate is not None:
+        low, high = transfer.rate.interval
+        cells.append(f"{transfer.holding} of {transfer.clean_right}")
+        cells.append(f"{low:.2f} to {high:.2f}")
+    return cells
 
 
 def write_folders(
@@ -267,7 +269,7 @@ def write_folders(
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
     for item in objects:
-        is_hidden = item.visible is not None and item.visible < MIN_VISIBLE_IN_TRANSFER
+        is_hidden = item.visible is not None and item.visible < MIN_VISIBLE
         if item.object != name or is_hidden:
             continue
         photograph = rendering.load_photograph(item.photograph)

@@ -18,7 +18,6 @@ from advsearch.runs.store import Row
 from advsearch.runs.summary import write_configuration
 from advsearch.viewer.pages import write_page
 
-
 PHOTOGRAPHS = Path(__file__).resolve().parent.parent / "scenes" / "photographs"
 """Two objects in twelve photographs of 128 x 96 pixels."""
 

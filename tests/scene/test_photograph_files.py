@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import samples
 import torch
 
 import advsearch
+import samples
 from advsearch.controls import make_space
 from advsearch.controls.backdrop import BackdropControl
 from advsearch.engine.loading import fit_camera, make_controls

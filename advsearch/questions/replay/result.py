@@ -91,7 +91,7 @@ class ReplayConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = settings.text_validator("attack", "run", several=["ways", "model"])
+    _named = settings.text_validator("attack", "backdrop", "run", several=["ways", "model"])
     _different = settings.unique_names_validator("ways")
 
     @field_validator("ways")
