@@ -212,16 +212,13 @@ def _check_same_statements(view: PhotographView, first: PhotographView) -> None:
 
     What only some of the files state would be unknown for the other photographs.
     """
-    differing = sorted(view.stated_names ^ first.stated_names)
-    if differing:
-        name = differing[0]
-        has_name, lacks_name = view, first
-        if name in first.stated_names:
-            has_name, lacks_name = first, view
-        raise FileFormatError(
-            f"{lacks_name.file}: expected {name}, which "
-            f"{Path(has_name.file).name} states; add it"
-        )
+    for file, other in ((view, first), (first, view)):
+        missing = sorted(other.stated_names - file.stated_names)
+        if missing:
+            raise FileFormatError(
+                f"{file.file}: expected {missing[0]}, which "
+                f"{Path(other.file).name} states; add it"
+            )
 
 
 # ---- what a camera file states beside its lens

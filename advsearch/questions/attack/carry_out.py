@@ -174,7 +174,9 @@ def load_parts_of_run(run: Path) -> AttackParts:
     return load_parts(with_evaluation_only(AttackConfig.from_yaml(run / CONFIG)))
 
 
-def move_to_photographs(parts: AttackParts, folder: str) -> dict[str, AttackParts]:
+def move_to_photographs(
+    parts: AttackParts, folder: str
+) -> tuple[dict[str, AttackParts], dict[str, AttackParts]]:
     """Return the parts of an attack with its scene in each photograph of a folder.
 
     What the camera files state takes the place of what the attack states of camera,
@@ -185,12 +187,12 @@ def move_to_photographs(parts: AttackParts, folder: str) -> dict[str, AttackPart
         folder: of photographs.
 
     Returns:
-        The parts by the name of the photograph's file. Photographs that the attack
-        itself used are left out.
+        The parts by the name of the photograph's file: in photographs that the attack
+        did not use, and in those that it used.
 
     Raises:
         FileFormatError: the folder cannot be used.
-        InputError: the scene cannot be rendered into it, or no photograph is left.
+        InputError: the scene cannot be rendered into it.
     """
     config = parts.config
     if not is_photograph_folder(folder):
@@ -199,12 +201,12 @@ def move_to_photographs(parts: AttackParts, folder: str) -> dict[str, AttackPart
             f"{folder}"
         )
     view = next(iter(read_photograph_folder(folder).values()))
-    kept_settings = {
+    other_settings = {
         name: value
         for name, value in config.set_.items()
         if not name.startswith(view.replaced_settings)
     }
-    changes = {"backdrop": folder, "occluder": None, "set_": kept_settings}
+    changes = {"backdrop": folder, "occluder": None, "set_": other_settings}
     if view.camera is not None:
         changes["camera"] = None
     config = config.model_copy(update=changes)
@@ -229,13 +231,13 @@ def move_to_photographs(parts: AttackParts, folder: str) -> dict[str, AttackPart
             clean_matrix=CleanMatrix(),
         )
         for name, description in photographs.scenes.items()
-        if not used & list_used_photographs(description)
     }
-    if not moved:
-        raise InputError(
-            f"backdrop: expected other photographs than the run used, got {folder}"
-        )
-    return moved
+    is_used = {
+        name: bool(used & list_used_photographs(description))
+        for name, description in photographs.scenes.items()
+    }
+    others = {name: part for name, part in moved.items() if not is_used[name]}
+    return others, {name: part for name, part in moved.items() if is_used[name]}
 
 
 def list_used_photographs(description: SceneDescription) -> set[str]:

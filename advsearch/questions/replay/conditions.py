@@ -33,6 +33,7 @@ from advsearch.questions.replay.cycles import BlenderError, Cycles
 from advsearch.questions.replay.result import (
     NOT_DONE,
     PHOTOGRAPH,
+    SEARCHED_PHOTOGRAPH,
     ReplayConfig,
     ReplayResult,
     ReplayRow,
@@ -317,7 +318,9 @@ def model_condition(
 def photograph_conditions(
     parts: workbench.AttackParts, folder: str, spp: int, threads: Mapping[str, int]
 ) -> Iterator[ReplayCondition]:
-    """Yield a condition for each photograph of a folder that the run did not use.
+    """Yield a condition for each photograph of a folder.
+
+    If the run used a single one of them, that is left out: it is tried as verified.
 
     Args:
         parts: of the attack.
@@ -325,13 +328,17 @@ def photograph_conditions(
         spp: samples per pixel.
         threads: other settings of the problems.
     """
-    for name, moved in workbench.move_to_photographs(parts, folder).items():
-        yield ReplayCondition(
-            PHOTOGRAPH,
-            name,
-            make_problem=partial(_make_photograph_problem, moved, threads),
-            spp=spp,
-        )
+    others, used = workbench.move_to_photographs(parts, folder)
+    if len(used) == 1:
+        used = {}
+    for method, parts_by_name in ((PHOTOGRAPH, others), (SEARCHED_PHOTOGRAPH, used)):
+        for name, moved in parts_by_name.items():
+            yield ReplayCondition(
+                method,
+                name,
+                make_problem=partial(_make_photograph_problem, moved, threads),
+                spp=spp,
+            )
 
 
 def _make_photograph_problem(
@@ -445,7 +452,8 @@ def run_replay(
         environment=attack.environment,
         controls=attack.controls,
         table=rows,
-        transfer=count_transfer(rows),
+        transfer=count_transfer(rows, PHOTOGRAPH),
+        searched=count_transfer(rows, SEARCHED_PHOTOGRAPH),
         renders=table.renders,
         warnings=warnings,
         seed=parts.config.seed,

@@ -91,7 +91,9 @@ class ReplayConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = settings.text_validator("attack", "backdrop", "run", several=["ways", "model"])
+    _named = settings.text_validator(
+        "attack", "backdrop", "run", several=["ways", "model"]
+    )
     _different = settings.unique_names_validator("ways")
 
     @field_validator("ways")
@@ -151,10 +153,12 @@ class ReplayRow(results.Fields):
 
 PHOTOGRAPH = "photograph"
 """Name of the conditions under which the scene is rendered into another photograph."""
+SEARCHED_PHOTOGRAPH = "searched photograph"
+"""The same for the photographs that the run itself was searched over."""
 
 
 class PhotographTransfer(results.Fields):
-    """In how many other photographs an adversarial scene holds."""
+    """In how many photographs an adversarial scene holds."""
 
     photographs: int = Field(description="that it was tried in")
     clean_right: int = Field(description="in which the model is right without it")
@@ -175,7 +179,14 @@ class ReplayResult(views.InNotebook, results.SceneResult):
     answered: str = Field(description="how that run ended")
     table: list[ReplayRow]
     transfer: PhotographTransfer | None = Field(
-        None, description="over the photographs of `backdrop`; absent without"
+        None,
+        description="over the photographs of `backdrop` that the run did not use; "
+        "absent without",
+    )
+    searched: PhotographTransfer | None = Field(
+        None,
+        description="over those that it was searched over, as `transfer`; absent "
+        "without",
     )
     renders: int = Field(description="pictures that were rendered in this sitting")
     warnings: list[str] = Field(description="sentences that a reader has to know")
@@ -214,12 +225,18 @@ VERDICTS = {HOLDS: "holds", CLEAN_IS_WRONG: "clean is wrong too"}
 """By status; all others do not hold."""
 
 
-def count_transfer(table: Sequence[ReplayRow]) -> PhotographTransfer | None:
+def count_transfer(
+    table: Sequence[ReplayRow], method: str = PHOTOGRAPH
+) -> PhotographTransfer | None:
     """Count in how many photographs an adversarial scene holds; None without any.
 
     Each photograph counts once, however many renders it was tried with.
+
+    Args:
+        table: all rows.
+        method: the `way` of the rows that count.
     """
-    rows = [row for row in table if row.way == PHOTOGRAPH and row.ending != NOT_DONE]
+    rows = [row for row in table if row.way == method and row.ending != NOT_DONE]
     if not rows:
         return None
     n_clean_right = sum(row.ending != CLEAN_IS_WRONG for row in rows)
@@ -238,15 +255,20 @@ def count_transfer(table: Sequence[ReplayRow]) -> PhotographTransfer | None:
     )
 
 
-def describe_transfer(transfer: PhotographTransfer) -> str:
-    """Return a sentence on the photographs in which an adversarial scene holds."""
+def describe_transfer(transfer: PhotographTransfer, kind: str = "other") -> str:
+    """Return a sentence on the photographs in which an adversarial scene holds.
+
+    Args:
+        transfer: the counts.
+        kind: of the photographs, an adjective.
+    """
     clean = f"the clean scene is right in {transfer.clean_right} of them"
-    others = wording.format_count(transfer.photographs, "other photograph")
+    photographs = wording.format_count(transfer.photographs, f"{kind} photograph")
     if transfer.rate is None or transfer.rate.interval is None:
-        return f"Of {others}, {clean}, so that they say nothing."
+        return f"It was tried in {photographs}: {clean}, so that they say nothing."
     interval = wording.format_interval(transfer.rate.interval)
     return (
-        f"It was tried in {others}: {clean}, and of these it holds in "
+        f"It was tried in {photographs}: {clean}, and of these it holds in "
         f"{transfer.holding} ({transfer.rate.value:.0%}, 95 % interval {interval})."
     )
 
@@ -309,7 +331,7 @@ def summarize_replay(result: ReplayResult) -> str:
     changed = [
         row
         for row in result.table[1:]
-        if row.ending != NOT_DONE and row.way != PHOTOGRAPH
+        if row.ending != NOT_DONE and row.way not in (PHOTOGRAPH, SEARCHED_PHOTOGRAPH)
     ]
     unchanged_status = result.table[0].ending  # the first row changes nothing
     unchanged_text = "does not hold"
@@ -324,11 +346,13 @@ def summarize_replay(result: ReplayResult) -> str:
             f"changed, it holds under {n_holding} of {len(changed)} conditions"
         )
     text = f"As verified, the adversarial scene {unchanged_text}"
-    if changed or result.transfer is None:
+    if changed or (result.transfer is None and result.searched is None):
         text += f"; {changed_text}"
     text += "."
     if result.transfer is not None:
         text += f" {describe_transfer(result.transfer)}"
+    if result.searched is not None:
+        text += f" {describe_transfer(result.searched, 'searched')}"
     clean_wrong = [row for row in changed if row.ending == CLEAN_IS_WRONG]
     if clean_wrong:
         names = ", ".join(f"{row.way}: {row.condition}" for row in clean_wrong)
