@@ -105,7 +105,7 @@ class BackdropControl(Control):
                     f"{allowed[0]} a {lenses[0].kind} one; choose among photographs "
                     f"of one kind, with {self.name}.which"
                 )
-            _check_beside(name, scenes[name], first)
+            _check_compatible(name, scenes[name], first)
         has_model = any(scenes[name].camera_model is not None for name in allowed)
         if first.backdrop_photograph is not scene.backdrop_photograph:
             scene = replace(
@@ -191,7 +191,9 @@ def _get_lens(view: SceneDescription) -> CameraModel:
     return make_pinhole(view.number("camera.fov"), view.aspect)
 
 
-def _check_beside(name: str, view: SceneDescription, first: SceneDescription) -> None:
+def _check_compatible(
+    name: str, view: SceneDescription, first: SceneDescription
+) -> None:
     """Raise InputError if a photograph can not be shown in the scene of the first one.
 
     Args:

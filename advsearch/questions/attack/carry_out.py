@@ -194,7 +194,43 @@ def move_to_photographs(
         FileFormatError: the folder cannot be used.
         InputError: the scene cannot be rendered into it.
     """
-    config = parts.config
+    config = _put_config_into_folder(parts.config, folder)
+    scene = naming.load_configured_scene(config)
+    photographs = scene.description.photographs
+    if photographs is None:
+        raise InputError(
+            f"{parts.config.object}: only the Python session that asked has the scene"
+        )
+    used = list_used_photographs(parts.scene.description)
+    random_controls = tuple(
+        control
+        for control in parts.random_controls
+        if not control.photograph_refusal and control.kind != "backdrop"
+    )
+    others: dict[str, AttackParts] = {}
+    used_parts: dict[str, AttackParts] = {}
+    for name, description in photographs.scenes.items():
+        is_used = bool(used & list_used_photographs(description))
+        moved = used_parts if is_used else others
+        moved[name] = replace(
+            parts,
+            config=config,
+            scene=replace(scene, description=description),
+            random_controls=random_controls,
+            clean_matrix=CleanMatrix(),
+        )
+    return others, used_parts
+
+
+def _put_config_into_folder(config: AttackConfig, folder: str) -> AttackConfig:
+    """Return settings whose scene is rendered into the photographs of a folder.
+
+    What the camera files state is left out of the settings.
+
+    Raises:
+        FileFormatError: the folder cannot be used.
+        InputError: it is none.
+    """
     if not is_photograph_folder(folder):
         raise InputError(
             f"backdrop: expected a folder of photographs with their camera files, got "
@@ -209,35 +245,7 @@ def move_to_photographs(
     changes = {"backdrop": folder, "occluder": None, "set_": other_settings}
     if view.camera is not None:
         changes["camera"] = None
-    config = config.model_copy(update=changes)
-    scene = naming.load_configured_scene(config)
-    photographs = scene.description.photographs
-    if photographs is None:
-        raise InputError(
-            f"{parts.config.object}: only the Python session that asked has the scene"
-        )
-    used = list_used_photographs(parts.scene.description)
-    random_controls = tuple(
-        control
-        for control in parts.random_controls
-        if not control.photograph_refusal and control.kind != "backdrop"
-    )
-    moved = {
-        name: replace(
-            parts,
-            config=config,
-            scene=replace(scene, description=description),
-            random_controls=random_controls,
-            clean_matrix=CleanMatrix(),
-        )
-        for name, description in photographs.scenes.items()
-    }
-    is_used = {
-        name: bool(used & list_used_photographs(description))
-        for name, description in photographs.scenes.items()
-    }
-    others = {name: part for name, part in moved.items() if not is_used[name]}
-    return others, {name: part for name, part in moved.items() if is_used[name]}
+    return config.model_copy(update=changes)
 
 
 def list_used_photographs(description: SceneDescription) -> set[str]:
