@@ -142,7 +142,7 @@ class BackdropControl(Control):
         )
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the photograph, its camera, its exposure and its light."""
         index = int(values["which"])
@@ -170,7 +170,7 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     if scene.camera_model is not None:
         inputs["camera.lens"] = torch.tensor(_get_lens(view).numbers)
     else:
-        inputs["camera.fov"] = torch.tensor([view.number("camera.fov")])
+        inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
     if scene.environment is not None:
         radiance = torch.from_numpy(scene.environment.radiance.copy())
         degrees = math.degrees(math.atan2(carry[1, 0], carry[0, 0]))
@@ -188,7 +188,7 @@ def _get_lens(view: SceneDescription) -> CameraModel:
     """Return the camera model of a view, for a pinhole without one that of its angle."""
     if view.camera_model is not None:
         return view.camera_model
-    return make_pinhole(view.number("camera.fov"), view.aspect)
+    return make_pinhole(view.get_number("camera.fov"), view.aspect)
 
 
 def _check_compatible(
@@ -208,7 +208,7 @@ def _check_compatible(
         )
     carry = _compute_carry(view, first)
     up = carry[2, :3] - [0.0, 0.0, 1.0]
-    level = carry[2, 3] + view.number("ground.level") - first.number("ground.level")
+    level = carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
     is_level = np.abs(up).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
     same_plane = has_plane(view) == has_plane(first) and (
         not has_plane(first) or abs(level) <= PLANE_TOLERANCE

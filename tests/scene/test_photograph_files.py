@@ -55,9 +55,9 @@ def test_a_camera_file_states_lens_pose_part_and_settings(tmp_path: Path) -> Non
     other = advsearch.load_scene(
         BOX, backdrop=f"{photograph}#0,0,64,64", unit="mm", camera="fisheye", settings={"pose.yaw": 7.0}
     ).description
-    assert other.camera_model and other.camera_model.name == "fisheye" and other.number("pose.yaw") == 7.0
+    assert other.camera_model and other.camera_model.name == "fisheye" and other.get_number("pose.yaw") == 7.0
     assert other.backdrop_photograph and other.backdrop_photograph.crop == (0, 0, 64, 64)
-    assert other.number("pose.x") == scene.number("pose.x")
+    assert other.get_number("pose.x") == scene.get_number("pose.x")
 
 
 def test_the_first_photograph_is_the_clean_scene_and_one_is_chosen(folder: Path) -> None:
