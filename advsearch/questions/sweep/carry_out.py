@@ -394,7 +394,7 @@ def _run_config(
         # a check before the work: raises an error if it cannot be read
         read_twins(config.twins)
     with context as directory:
-        named_scenes = scenes or load_scenes(config)
+        named_scenes = expand_photographs(config, scenes) or load_scenes(config)
         job = _make_job(
             config, named_scenes, naming.list_models(models), task, controls
         )
