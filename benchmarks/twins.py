@@ -241,8 +241,10 @@ def try_in_others(attack: Any, folder: Path) -> list[str]:
         attack, backdrop=folder, trials=6, run=f"{attack.run}-replay", overwrite=True
     )
     transfer = replayed.transfer
+    if transfer is None:
+        return []
     cells = [f"{transfer.clean_right} of {transfer.photographs}"]
-    if transfer.rate is not None:
+    if transfer.rate is not None and transfer.rate.interval is not None:
         low, high = transfer.rate.interval
         cells.append(f"{transfer.holding} of {transfer.clean_right}")
         cells.append(f"{low:.2f} to {high:.2f}")

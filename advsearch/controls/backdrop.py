@@ -83,17 +83,18 @@ class BackdropControl(Control):
             InputError: the scene is rendered into no folder, a name is none of its
                 photographs, or one of them can not be shown beside the others.
         """
-        if scene.photographs is None:
+        folder = scene.photographs
+        if folder is None:
             raise InputError(
                 f"`controls` {self.name}: chooses among the photographs of a folder, "
                 "and there is none; give `backdrop=FOLDER`"
             )
-        scenes = scene.photographs.scenes
+        scenes = folder.scenes
         allowed = [str(name) for name in self._list_names(scene)]
         for name in allowed:
             if name not in scenes:
                 raise InputError(
-                    f"{self.name}.which: {scene.photographs.path} has no photograph "
+                    f"{self.name}.which: {folder.path} has no photograph "
                     f"{name}; it has {', '.join(scenes)[:200]}"
                 )
         first = scenes[allowed[0]]
@@ -114,11 +115,13 @@ class BackdropControl(Control):
                 camera=first.camera,
                 values=first.values,
             )
-        folder = replace(
-            scene.photographs, scenes={name: scenes[name] for name in allowed}
-        )
+        allowed_scenes = {name: scenes[name] for name in allowed}
         model = lenses[0] if has_model else None
-        return replace(scene, camera_model=model, photographs=folder)
+        return replace(
+            scene,
+            camera_model=model,
+            photographs=replace(folder, scenes=allowed_scenes),
+        )
 
     def _list_names(self, scene: SceneDescription) -> tuple[ParameterValue, ...]:
         """Return the names of the photographs that may be chosen."""
@@ -208,7 +211,9 @@ def _check_compatible(
         )
     carry = _compute_carry(view, first)
     up = carry[2, :3] - [0.0, 0.0, 1.0]
-    level = carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
+    level = (
+        carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
+    )
     is_level = np.abs(up).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
     same_plane = has_plane(view) == has_plane(first) and (
         not has_plane(first) or abs(level) <= PLANE_TOLERANCE

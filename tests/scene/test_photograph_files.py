@@ -33,7 +33,9 @@ def change_json(file: Path, **entries: Any) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return samples.write_photograph_folder(tmp_path_factory.mktemp("folders") / "desk")
+    folder = tmp_path_factory.mktemp("folders") / "desk"
+    samples.write_photograph_folder(folder)
+    return folder
 
 
 def test_a_camera_file_states_lens_pose_part_and_settings(tmp_path: Path) -> None:
@@ -120,7 +122,10 @@ def test_photographs_that_can_not_be_chosen_among_are_named(tmp_path: Path) -> N
 
 
 def write_text(name: str, text: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).write_text(text, "utf-8") and None
+    def change(folder: Path) -> None:
+        (folder / name).write_text(text, "utf-8")
+
+    return change
 
 
 def state(**entries: Any) -> Callable[[Path], None]:

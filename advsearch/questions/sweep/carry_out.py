@@ -683,8 +683,10 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
     """
     passed: Scene | None = config.python_object(naming.SCENE, config.object)
     if passed is not None:
-        scene = NamedScene(config.object, passed.description.environment_name, passed)
-        return expand_photographs(config, (scene,))
+        environment = passed.description.environment_name
+        return expand_photographs(
+            config, [NamedScene(config.object, environment, passed)]
+        )
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
     first_environment = environments[0] if config.environment else None
