@@ -345,7 +345,9 @@ def photograph_conditions(
 def _make_photograph_problem(
     parts: workbench.AttackParts, threads: Mapping[str, int]
 ) -> Problem:
-    return workbench.make_problem_with_warnings(parts, **threads)[0]
+    """Make the problem of an attack in a photograph, of which no derivative is needed."""
+    config = parts.config.model_copy(update=dict(threads))
+    return workbench.make_problem(replace(parts, config=config), differentiated=False)
 
 
 # ---- the experiment
