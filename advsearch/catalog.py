@@ -247,6 +247,12 @@ BUILT_INS = (
     ),
     BuiltIn(
         "control",
+        "backdrop",
+        f"{_CONTROLS}.backdrop:BackdropControl",
+        "which photograph of a folder the scene is rendered into, seen by its camera",
+    ),
+    BuiltIn(
+        "control",
         "haze",
         f"{_CONTROLS}.haze:HazeControl",
         "a uniform haze around camera and object: how dense it is, and its colour",

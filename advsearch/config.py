@@ -241,7 +241,8 @@ class SceneConfig(Config):
         "scene",
         "a photograph that the object is rendered into, taken by the camera of the "
         "scene",
-        "a picture file, or a part of it, photo.jpg#X,Y,WIDTH,HEIGHT in pixels",
+        "a picture file, a part of it, photo.jpg#X,Y,WIDTH,HEIGHT in pixels, or a folder "
+        "of photographs with their camera files",
         metavar="FILE",
         otherwise="the environment is behind the object",
         min_length=1,

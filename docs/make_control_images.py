@@ -26,6 +26,7 @@ from advsearch.scene.color import round_to_8_bit
 
 FOLDER = Path(__file__).resolve().parent / "images" / "controls"
 SPP = 128
+WITHOUT_PICTURE = ("backdrop",)  # it needs photographs
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,7 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     args = parser.parse_args(argv)
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in args.names or list_built_ins("control"):
+    drawn = [name for name in list_built_ins("control") if name not in WITHOUT_PICTURE]
+    for name in args.names or drawn:
         path = FOLDER / f"{name}.png"
         row(name, args.size).save(path, optimize=True)
         print(

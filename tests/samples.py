@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.runs.summary import write_configuration
 from advsearch.viewer.pages import write_page
+
+PHOTOGRAPHS = Path(__file__).resolve().parent.parent / "scenes" / "photographs"
+"""Two objects in twelve photographs of 128 x 96 pixels."""
 
 
 def exr(path: Path) -> np.ndarray:
@@ -246,3 +250,26 @@ def keep_object(run: Path) -> None:
 def written_page(run: Path) -> Path:
     """Write the page of an attack and return its path."""
     return write_page(run, load_attack_summary(run))
+
+
+def write_photograph_folder(folder: Path, name: str = "obj_000002", **entries: Any) -> Path:
+    """Write the photographs of an object in scenes/photographs, each with its camera file; return the folder.
+
+    Args:
+        folder: that is made.
+        name: of the object.
+        **entries: further ones of the camera files.
+    """
+    from advsearch.questions.twins.listing import read_photographs
+
+    folder.mkdir()
+    for item in read_photographs(PHOTOGRAPHS / "photographs.csv").objects:
+        if item.object == name:
+            photograph = folder / item.photograph.name
+            photograph.write_bytes(item.photograph.read_bytes())
+            camera = item.camera
+            matrix = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
+            stated = {"image_width": 128, "image_height": 96, "camera_matrix": matrix, "part": [16, 0, 96, 96],
+                      "object_to_camera": item.pose.tolist(), **entries}  # fmt: skip
+            photograph.with_suffix(".json").write_text(json.dumps(stated), "utf-8")
+    return folder

@@ -82,6 +82,9 @@ from advsearch.questions.attack.carry_out import make_problem_on as make_problem
 from advsearch.questions.attack.carry_out import (
     make_problem_with_warnings as make_problem_with_warnings,
 )
+from advsearch.questions.attack.carry_out import (
+    move_to_photographs as move_to_photographs,
+)
 from advsearch.questions.attack.carry_out import open_executor as open_executor
 from advsearch.questions.attack.carry_out import (
     problem_from_config as problem_from_config,

@@ -295,6 +295,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
             )
     if scene.backdrop_photograph is not None:
         _check_controls_in_photograph(controls, scene.backdrop_photograph.spec)
+    _check_photograph_is_chosen(controls, scene)
     described = scene
     adjusted = list[AdjustedDefault]()
     for control in controls:
@@ -315,6 +316,18 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         environments.append(scene.environment_spec)
     environment = environments[0] if environments else None
     return Space(bound, scene, tuple(adjusted), environment)
+
+
+def _check_photograph_is_chosen(
+    controls: Sequence[Control], scene: SceneDescription
+) -> None:
+    """Raise InputError if no control chooses among the photographs of a folder."""
+    folder = scene.photographs
+    if folder is not None and "backdrop" not in {control.kind for control in controls}:
+        raise InputError(
+            f"backdrop: {folder.path} is a folder of {len(folder.scenes)} photographs; "
+            "name one of them, or let the control backdrop choose, as in `over=backdrop`"
+        )
 
 
 def _check_controls_in_photograph(controls: Sequence[Control], spec: str) -> None:

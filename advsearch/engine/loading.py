@@ -57,12 +57,21 @@ from advsearch.scene.formation import (
 from advsearch.scene.grounds import with_requested_ground
 from advsearch.scene.headlamps import add_lamps
 from advsearch.scene.importing.pictures import read_image
+from advsearch.scene.library import import_environment
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.photograph_files import (
+    PhotographFolder,
+    is_photograph_folder,
+    put_into_photograph,
+    read_photograph_folder,
+    read_photograph_view,
+)
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA, SettingValues
 from advsearch.settings import parse_controls, to_python
 from advsearch.trust.code import allow_code_of_call
 from advsearch.trust.foreign_code import use_plain_switches
+from advsearch.trust.stored_files import track_opened_files
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 """One control or several, by name or instance; a mapping gives each name its settings
@@ -157,6 +166,13 @@ class Scene:
             environment_spec=name,
             requested=description.requested | {ENVIRONMENT},
         )
+        if description.photographs is not None:
+            relit_scenes = {
+                photograph: Scene(scene).with_environment(environment).description
+                for photograph, scene in description.photographs.scenes.items()
+            }
+            folder = replace(description.photographs, scenes=relit_scenes)
+            relit = replace(relit, photographs=folder)
         return Scene(add_lamps(with_requested_ground(relit)), self.is_session_only)
 
     def __getattr__(self, name: str) -> Any:
@@ -275,8 +291,10 @@ def load_scene(
             180}; `size` (metres), `name` and `label` are optional.
         backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
             picture file, taken by `camera`; of a part of it,
-            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels. By default it is lit by the .hdr
-            or .exr file of its name beside it, if there is one.
+            ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels; or a folder of photographs, of
+            which the control `backdrop` chooses one. By default it is lit by the .hdr
+            or .exr file of its name beside it, and seen by the camera of the .yaml or
+            .json file of its name, if there is one.
         occluder: a mask of the photograph's size, white where it shows what is before
             the object.
 
@@ -293,7 +311,8 @@ def load_scene(
     if scene is not None and mitsuba_dict is None:
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
-    if environment is None:
+    has_environment = environment is not None
+    if environment is None and not is_photograph_folder(backdrop):
         environment = find_photographed_light(backdrop)
     description = load_description(
         object_spec,
@@ -306,11 +325,15 @@ def load_scene(
         plugins=mitsuba_dict,
         things=format_things(things),
     )
-    if camera is not None:
+    if isinstance(backdrop, (str, Path)):
+        description = _put_into_photographs(
+            description, backdrop, camera, occluder, has_environment=has_environment
+        )
+    elif camera is not None:
         description = description.with_camera(camera)
-    if backdrop is not None:
+    if isinstance(backdrop, BackdropPhotograph):
         description = description.with_backdrop(backdrop, occluder)
-    else:
+    elif backdrop is None:
         _check_no_photograph(fixed_values or {}, occluder)
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
@@ -318,6 +341,46 @@ def load_scene(
     )
     loaded = Scene(description, is_session_only=mitsuba_dict is not None or has_asset)
     return loaded if texture is None else loaded.with_texture(texture)
+
+
+def _put_into_photographs(
+    description: SceneDescription,
+    spec: str | Path,
+    camera: str | None,
+    occluder: str | Path | None,
+    *,
+    has_environment: bool,
+) -> SceneDescription:
+    """Return a scene in a photograph, or in the photographs of a folder.
+
+    Args:
+        description: the scene.
+        spec: the photograph, or the folder.
+        camera: as for `load_scene`.
+        occluder: likewise.
+        has_environment: whether the user chose the light. If not, a photograph of a
+            folder is lit by the map beside it.
+    """
+    if not is_photograph_folder(spec):
+        return put_into_photograph(
+            description, read_photograph_view(spec), camera, occluder
+        )
+    if occluder is not None:
+        raise InputError(
+            f"`backdrop={spec}` and `occluder` contradict each other: a mask belongs to "
+            "one photograph; state it as `occluder` in the camera file beside that"
+        )
+    scenes: dict[str, SceneDescription] = {}
+    with track_opened_files(spec):
+        for name, view in read_photograph_folder(spec).items():
+            light = None if has_environment else find_photographed_light(view.spec)
+            lit_scene = description
+            if light is not None:
+                environment = import_environment(light)
+                lit_scene = Scene(description).with_environment(environment).description
+            scenes[name] = put_into_photograph(lit_scene, view, camera)
+    folder = PhotographFolder(str(spec), camera, scenes)
+    return replace(next(iter(scenes.values())), photographs=folder)
 
 
 def _check_no_photograph(
@@ -369,6 +432,11 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
     """
     description = scene.description
     photograph = description.backdrop_photograph
+    backdrop = photograph.spec if photograph is not None else None
+    camera = _camera_setting(description)
+    if description.photographs is not None:
+        backdrop = description.photographs.path
+        camera = description.photographs.camera
     return {
         "object": description.object_name,
         "environment": description.environment_name,
@@ -376,9 +444,9 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         "facing": description.facing,
         "size": description.size,
         "unit": description.unit,
-        "camera": _camera_setting(description),
+        "camera": camera,
         "things": description.things_spec or None,
-        "backdrop": photograph.spec if photograph is not None else None,
+        "backdrop": backdrop,
         "occluder": (photograph.front_spec or None) if photograph is not None else None,
         "set": description.requested_values,
     }
@@ -419,8 +487,14 @@ def fit_camera(
     height, width = _height_and_width(resolution)
     aspect = width / height
     if description.backdrop_photograph is not None:
-        return fit_to_photograph(
-            description, description.backdrop_photograph, (height, width)
+        size = (height, width)
+        folder = description.photographs
+        if folder is not None:
+            fitted = {name: fit_camera(s, size) for name, s in folder.scenes.items()}
+            folder = replace(folder, scenes=fitted)
+        return replace(
+            fit_to_photograph(description, description.backdrop_photograph, size),
+            photographs=folder,
         )
     camera_model = description.camera_model
     remarks = description.remarks

@@ -29,12 +29,13 @@ from advsearch.runs.store import NAME, Row, Store
 # unit is a drive with all its frames, or a picture, with the predictions of all models
 # and, where one was swept, without and with the adversarial scene of a run. Where
 # nothing is drawn, samples of a point of the grid differ in noise alone: they are one
-# unit.
+# unit. In a folder of photographs, all pictures in one photograph are one unit.
 
 UNITS_NOTE = "units"  # the note of a run that says it
 PICTURE = "picture"
 CONFIGURATION = "configuration"
 DRIVE = "drive"
+PHOTOGRAPH = "photograph"
 
 Number = TypeVar("Number", int, npt.NDArray[np.int64])
 
@@ -56,22 +57,39 @@ class Units:
     # pictures after which the draws come again; 0 for never
     again: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS)] = 0
     noise: Count = 1  # pictures of each draw that differ in noise alone
+    # of a folder, in which the scenes are in turn; 1 where there is no folder
+    photographs: Count = 1
+    scene: Count = 1  # pictures of a scene, where there is a folder
 
     @property
     def size(self) -> int:
+        if self.photographs > 1:
+            return self.models * (2 if self.again else 1) * self.scene
         frames = 1 if self.frames is None else self.sizes[self.frames]
         return self.models * (2 if self.again else 1) * frames * self.noise
 
     @property
     def name(self) -> str:
         """What a unit is called."""
+        if self.photographs > 1:
+            return PHOTOGRAPH
         if self.frames is not None and self.sizes[self.frames] > 1:
             return DRIVE
         return CONFIGURATION if self.noise > 1 else PICTURE
 
     def find_unit(self, step: Number) -> Number:
         """Return the number of the unit of a row, or of rows (n,), by their steps."""
-        return self.find_draw(step // self.models)
+        return self.find_cluster(step // self.models)
+
+    def find_cluster(self, image_index: Number) -> Number:
+        """Return the number of the unit of a picture: its photograph, or its draw.
+
+        Args:
+            image_index: number of the picture in the whole sweep, or an array of them.
+        """
+        if self.photographs > 1:
+            return image_index // self.scene % self.photographs
+        return self.find_draw(image_index)
 
     def find_draw(self, image_index: Number) -> Number:
         """Return the number of the draw that a picture comes from.
@@ -121,6 +139,7 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
             is_frame_axis_valid
             and prod(units.sizes) * units.samples * units.noise * units.models
             <= MAX_ROWS
+            and units.photographs * units.scene <= MAX_ROWS
         ):
             return units
     raise FileFormatError(

@@ -35,6 +35,8 @@ from advsearch.scene.geometry import (
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
 
+PHOTOGRAPH_INPUT = "backdrop.which"  # () index of the photograph of a folder
+PLANE_INPUT = "backdrop.plane"
 # inputs that the renderer applies to radiance
 IMAGE_INPUTS = frozenset(
     {
@@ -196,9 +198,19 @@ class Assembly:
             if isinstance(part, (BeamLamp, LampGlass))
         ]
         self._photograph = description.photograph
-        self._image_inputs: dict[str, Tensor] = {}
+        # what the photograph that is chosen adds to the image, by its index; the light
+        # of the plane is always that of the scene itself
+        self._views = [description]
+        if description.photographs is not None:
+            self._views = list(description.photographs.scenes.values())
+        self._resolution = resolution
+        self._image_inputs_of: dict[int, dict[str, Tensor]] = {}
+        self._plane: dict[str, Tensor] = {}
         if resolution is not None:
-            self._image_inputs = make_image_inputs(description, resolution)
+            image_inputs = make_image_inputs(description, resolution)
+            self._image_inputs_of[0] = image_inputs
+            plane = image_inputs.get(PLANE_INPUT)
+            self._plane = {} if plane is None else {PLANE_INPUT: plane}
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
@@ -213,7 +225,9 @@ class Assembly:
             pose = inputs.get(name, self.meshes[OBJECT].to_world).clone()
             pose[1, 3] += HIDDEN_OFFSET
             inputs = {**inputs, name: pose}
-        parameters = {**inputs, **self._image_inputs}
+        parameters = dict(inputs)
+        photograph = int(parameters.pop(PHOTOGRAPH_INPUT, torch.zeros(())))
+        parameters |= self._get_image_inputs(photograph)
         for part in self._carried:  # what carries it may be moved or deformed
             parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():
@@ -238,6 +252,21 @@ class Assembly:
                 [data[:, -1:], data, data[:, :1]], dim=1
             )
         return parameters
+
+    def _get_image_inputs(self, photograph: int) -> dict[str, Tensor]:
+        """Return what a photograph adds to the image; it is read once.
+
+        Args:
+            photograph: its index among those of the scene's folder; 0 without one.
+        """
+        if self._resolution is None:
+            return {}
+        if photograph not in self._image_inputs_of:
+            view = self._views[photograph]
+            image_inputs = make_image_inputs(view, self._resolution)
+            image_inputs.pop(PLANE_INPUT, None)
+            self._image_inputs_of[photograph] = image_inputs | self._plane
+        return self._image_inputs_of[photograph]
 
     def get_vertices(self, name: str, assembled: Mapping[str, Tensor]) -> Tensor:
         """Return the vertices (V, 3) of a mesh in world space.

@@ -150,6 +150,10 @@ SCENE_KEYS = frozenset(
 """Entries of a transforms.json, and of its frames, that are not about the lens; angles
 are used if focal lengths are missing.
 """
+VIEW_KEYS = frozenset(("object_to_camera", "up", "part", "set", "occluder"))
+"""Entries of the camera file of a single photograph that are not about the lens (see
+`advsearch.scene.photograph_files`).
+"""
 
 
 def _list_lines(text: str) -> list[str]:
@@ -177,23 +181,13 @@ def read_camera(spec: str) -> CameraModel:
             and is not read.
     """
     path, _, camera_name = spec.partition("#")
-    suffix = Path(path).suffix.lower()
-    if suffix in CAMERA_FORMAT_ADVICE and Path(path).is_file():
-        raise FileFormatError(
-            f"{path}: expected a camera as text, got {CAMERA_FORMAT_ADVICE[suffix]}"
-        )
-    if suffix in MESHES:
-        raise FileFormatError(
-            f"{path}: expected a camera file, got a mesh; it is an "
-            "object's, not a camera's"
-        )
-    limit = MAX_JSON_SIZE if suffix == ".json" else MAX_YAML_BYTES
-    text = read_existing_text(path, "a camera file", limit)
+    text = _read_camera_text(path)
     lines = _list_lines(text)
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _read_colmap(spec, path, camera_name, lines)
     check_text_format(path, text)
-    data = _parse_file(path, text)
+    entries = _parse_file(path, text)
+    data = {name: value for name, value in entries.items() if name not in VIEW_KEYS}
     translated = translate_entries(path, camera_name, data)
     if translated is not None:
         return _read_opencv(spec, Entries(path, translated))
@@ -218,6 +212,35 @@ def read_camera(spec: str) -> CameraModel:
     if "intrinsics" in data and "camera_model" in data:
         return _read_kalibr(spec, Entries(path, data))
     return _read_opencv(spec, Entries(path, _flatten_groups(data)))
+
+
+def read_camera_entries(path: str) -> dict[str, Any]:
+    """Return the entries of a camera file in YAML, JSON or XML, by name.
+
+    Raises FileFormatError: it is none, or cannot be read.
+    """
+    text = _read_camera_text(path)
+    check_text_format(path, text)
+    return _parse_file(path, text)
+
+
+def _read_camera_text(path: str) -> str:
+    """Return the text of a camera file.
+
+    Raises FileFormatError: it is missing, too large, or has another kind of content.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix in CAMERA_FORMAT_ADVICE and Path(path).is_file():
+        raise FileFormatError(
+            f"{path}: expected a camera as text, got {CAMERA_FORMAT_ADVICE[suffix]}"
+        )
+    if suffix in MESHES:
+        raise FileFormatError(
+            f"{path}: expected a camera file, got a mesh; it is an "
+            "object's, not a camera's"
+        )
+    limit = MAX_JSON_SIZE if suffix == ".json" else MAX_YAML_BYTES
+    return read_existing_text(path, "a camera file", limit)
 
 
 def _flatten_groups(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -84,6 +84,7 @@ from advsearch.scene.parts import (
     iterate_plugins,
     make_mesh_part,
 )
+from advsearch.scene.photograph_files import PhotographFolder
 from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
 from advsearch.scene.rig import Mount, read_rig
@@ -137,6 +138,9 @@ class SceneDescription:
     backdrop: bool = False
     # Backdrop photograph that it is rendered into; None for none.
     backdrop_photograph: BackdropPhotograph | None = None
+    # the folder of photographs among which the control `backdrop` chooses; the scene
+    # itself is in the first of them
+    photographs: PhotographFolder | None = None
     aspect: float = 1.0  # width over height of the picture
     # those with poses of their own, by name
     cameras: Mapping[str, PosedCamera] = field(default_factory=dict)

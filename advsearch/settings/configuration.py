@@ -244,6 +244,7 @@ repetition has.
 FILES = (
     *("object", "environment", "camera", "model", "labels", "recipe", "suite"),
     *("held_out", "held_out_environment", "compared", "path"),
+    *("backdrop", "occluder"),
 )
 """The settings that may name files."""
 
@@ -556,9 +557,10 @@ class Config(BaseModel):
         for name in FILES:
             value = getattr(self, name, None)
             if value is not None:
-                absolute[name] = ",".join(
-                    map(_make_absolute, written.split_names(value))
-                )
+                convert = _make_absolute
+                if name == "backdrop":
+                    convert = _make_backdrop_absolute
+                absolute[name] = ",".join(map(convert, written.split_names(value)))
         return self.model_copy(update={**absolute, **RUN_LOCATION})
 
     def command_line(self, run: str | Path | None) -> str | None:
@@ -694,6 +696,13 @@ def _make_absolute(name: str) -> str:
     if looks_like_path and os.path.isfile(path):
         return f"{Path(path).resolve()}{suffix}"
     return name
+
+
+def _make_backdrop_absolute(name: str) -> str:
+    """Return a photograph, a part of one or a folder of them with an absolute path."""
+    if os.path.isdir(name):
+        return str(Path(name).resolve())
+    return _make_absolute(name)
 
 
 def _strip_directories(entry: str) -> str:

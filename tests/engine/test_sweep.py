@@ -40,6 +40,7 @@ from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import GradientPlan
 from advsearch.statistics.intervals import clopper_pearson
 from covering import once_each
+from samples import PHOTOGRAPHS, write_photograph_folder
 from samples import attack as attack_result
 
 SIZE = 16
@@ -600,3 +601,19 @@ def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path
     advsearch.sweep("mug", model(), run=path, **SURVIVES)
     with pytest.raises(RunExistsError, match="the run exists already"):
         advsearch.sweep("mug", model(), run=path, **SURVIVES)
+
+
+@pytest.mark.medium
+def test_each_photograph_of_a_folder_is_a_scene_and_a_unit(tmp_path: Path) -> None:
+    folder = write_photograph_folder(tmp_path / "desk", set={"ground.size": 0.0})
+    box = str(PHOTOGRAPHS / "models" / "obj_000002.ply")
+    options: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "denoise": "none", "label": "mug"}
+    scene = advsearch.load_scene(box, backdrop=folder, unit="mm")
+    table = advsearch.sweep(scene, "small_models:easy", controls={"pose": {"yaw": [0, 20]}}, samples=2, **options)
+    rows = list(table.rows())
+    names = [f"{number:06d}.jpg" for number in (1, 3, 5, 7, 9, 11)]
+    assert [row.values["backdrop"]["value"] for row in rows] == [name for name in names for _ in range(2)]
+    assert [row.value for row in table.summary.axes if row.axis == "backdrop"] == names
+    assert table.summary.units == 6 and table.summary.configurations == 12
+    drawn = advsearch.sweep(scene, "small_models:easy", controls="backdrop", samples=8, **options)
+    assert {row.values["backdrop.which"]["value"] for row in drawn.rows()} <= set(names)

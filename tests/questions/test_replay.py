@@ -10,13 +10,20 @@ import pytest
 import torch
 
 import advsearch
+import samples
 from advsearch.cli.main import main
 from advsearch.engine.problem import Problem
-from advsearch.errors import FileFormatError
+from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.replay import replay
-from advsearch.questions.replay.result import ReplayConfig
+from advsearch.questions.replay.result import (
+    PHOTOGRAPH,
+    ReplayConfig,
+    ReplayRow,
+    count_transfer,
+    describe_transfer,
+)
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_configuration, read_result, write_configuration
 
@@ -105,6 +112,48 @@ def test_what_changes_only_after_rendering_renders_nothing(attacked: Path, tmp_p
     assert len(together.table) == 10 and together.table[-1].condition == "small_models:hard"
     (_, alone) = advsearch.replay(attacked, ways="sampler", trials=6, run=tmp_path / "sampler").table
     assert alone == together.table[1], "rows are in the order of the conditions"
+
+
+def make_rows(**counts: int) -> list[ReplayRow]:
+    """Return rows of photographs by status, and one of another condition that holds."""
+    endings = [ending.replace("_", " ") for ending, count in counts.items() for _ in range(count)]
+    rows = [ReplayRow(way=PHOTOGRAPH, condition=f"{index}.jpg", ending=ending) for index, ending in enumerate(endings)]
+    return [ReplayRow(way="as verified", condition="as verified", ending="found"), *rows]
+
+
+def test_photographs_are_counted_where_the_clean_scene_is_right() -> None:
+    assert count_transfer(make_rows()) is None
+    transfer = count_transfer(make_rows(found=3, already_wrong=2, not_verified=5, not_done=4))
+    assert transfer and transfer.rate and transfer.rate.interval
+    assert (transfer.photographs, transfer.clean_right, transfer.holding) == (10, 8, 3)
+    # Clopper and Pearson's interval of 3 in 8, from a table
+    assert transfer.rate.interval == pytest.approx((0.0852, 0.7551), abs=1e-4)
+    assert describe_transfer(transfer) == (
+        "It was tried in 10 other photographs: the clean scene is right in 8 of them, and of these it holds in 3 (38%, "
+        "95 % interval 9-76 %)."
+    )
+    wrong = count_transfer(make_rows(already_wrong=2))
+    assert wrong and wrong.rate is None and "right in 0 of them, so that they say nothing" in describe_transfer(wrong)
+
+
+@pytest.mark.medium
+def test_a_texture_of_a_room_is_tried_in_photographs(tmp_path: Path) -> None:
+    folder = samples.write_photograph_folder(tmp_path / "desk", set={"ground.size": 0.0})
+    box = str(samples.PHOTOGRAPHS / "models" / "obj_000002.ply")
+    settings = {"object": box, "unit": "mm", "label": "mug", "controls": {"texture": {"epsilon": 0.8}}, "steps": 8}
+    in_room = {"environment": "room", "set": {"camera.azimuth": 40.0}, "over": {"camera": {"roll": [0, 9]}}}
+    in_photograph = {"backdrop": str(folder / "000001.jpg")}
+    transfers = []
+    for name, scene in (("room", in_room), ("photograph", in_photograph)):
+        run = tmp_path / name
+        assert attack_once(AttackConfig(**SHORT | settings | scene, run=str(run))).found
+        replayed = advsearch.replay(run, backdrop=folder, trials=6, run=tmp_path / f"{name}-replay")
+        assert [row.way for row in replayed.table[1:]] == [PHOTOGRAPH] * (len(replayed.table) - 1)
+        transfers.append(replayed.transfer)
+    assert [transfer.photographs for transfer in transfers] == [6, 5], "not in the photograph that was searched"
+    assert all(transfer.holding <= transfer.clean_right <= transfer.photographs for transfer in transfers)
+    with pytest.raises(InputError, match="expected a folder of photographs with their camera files"):
+        advsearch.replay(tmp_path / "room", backdrop=folder / "000001.jpg", trials=6, run=tmp_path / "none")
 
 
 @pytest.mark.parametrize(

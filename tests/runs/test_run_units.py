@@ -54,3 +54,14 @@ def test_a_run_notes_its_units_and_what_is_none_is_refused(tmp_path: Path) -> No
             store.write_note(UNITS_NOTE, text)
             with pytest.raises(FileFormatError, match="what units of sampling are"):
                 read_units(store)
+
+
+@pytest.mark.parametrize("again", [0, 1])
+def test_pictures_in_one_photograph_are_one_unit(again: int) -> None:
+    # two objects in three photographs, five draws each, two models
+    units = Units((), samples=5, models=2, again=again * 30, photographs=3, scene=5)
+    digits = product(range(1 + again), range(2), range(3), range(5), range(2))
+    assert [units.find_unit(step) for step in range(60 * (1 + again))] == [
+        photograph for *_, photograph, _, _ in digits
+    ]
+    assert units.name == "photograph" and units.find_draw(7) == 7, "draws are as ever"

@@ -57,11 +57,16 @@ from advsearch.questions.attack.settings import (
     AttackConfig,
 )
 from advsearch.runs.directory import CONFIG, read_python_only
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import (
     ALL_OMISSIONS,
     NO_OMISSIONS,
     parse_aovs,
     round_sample_count,
+)
+from advsearch.scene.photograph_files import (
+    is_photograph_folder,
+    read_photograph_folder,
 )
 from advsearch.scene.things import ALL_THINGS
 from advsearch.settings import FILES
@@ -167,6 +172,92 @@ def load_parts_of_run(run: Path) -> AttackParts:
             "asked has what judges its result"
         )
     return load_parts(with_evaluation_only(AttackConfig.from_yaml(run / CONFIG)))
+
+
+def move_to_photographs(
+    parts: AttackParts, folder: str
+) -> tuple[dict[str, AttackParts], dict[str, AttackParts]]:
+    """Return the parts of an attack with its scene in each photograph of a folder.
+
+    What the camera files state takes the place of what the attack states of camera,
+    pose and ground. Controls that vary by chance what a photograph fixes are left out.
+
+    Args:
+        parts: of the attack.
+        folder: of photographs.
+
+    Returns:
+        The parts by the name of the photograph's file: in photographs that the attack
+        did not use, and in those that it used.
+
+    Raises:
+        FileFormatError: the folder cannot be used.
+        InputError: the scene cannot be rendered into it.
+    """
+    config = _put_config_into_folder(parts.config, folder)
+    scene = naming.load_configured_scene(config)
+    photographs = scene.description.photographs
+    if photographs is None:
+        raise InputError(
+            f"{parts.config.object}: only the Python session that asked has the scene"
+        )
+    used = list_used_photographs(parts.scene.description)
+    random_controls = tuple(
+        control
+        for control in parts.random_controls
+        if not control.photograph_refusal and control.kind != "backdrop"
+    )
+    others: dict[str, AttackParts] = {}
+    used_parts: dict[str, AttackParts] = {}
+    for name, description in photographs.scenes.items():
+        is_used = bool(used & list_used_photographs(description))
+        moved = used_parts if is_used else others
+        moved[name] = replace(
+            parts,
+            config=config,
+            scene=replace(scene, description=description),
+            random_controls=random_controls,
+            clean_matrix=CleanMatrix(),
+        )
+    return others, used_parts
+
+
+def _put_config_into_folder(config: AttackConfig, folder: str) -> AttackConfig:
+    """Return settings whose scene is rendered into the photographs of a folder.
+
+    What the camera files state is left out of the settings.
+
+    Raises:
+        FileFormatError: the folder cannot be used.
+        InputError: it is none.
+    """
+    if not is_photograph_folder(folder):
+        raise InputError(
+            f"backdrop: expected a folder of photographs with their camera files, got "
+            f"{folder}"
+        )
+    view = next(iter(read_photograph_folder(folder).values()))
+    other_settings = {
+        name: value
+        for name, value in config.set_.items()
+        if not name.startswith(view.replaced_settings)
+    }
+    changes = {"backdrop": folder, "occluder": None, "set_": other_settings}
+    if view.camera is not None:
+        changes["camera"] = None
+    return config.model_copy(update=changes)
+
+
+def list_used_photographs(description: SceneDescription) -> set[str]:
+    """Return the digests of the photographs that a scene is rendered into."""
+    scenes = [description]
+    if description.photographs is not None:
+        scenes += description.photographs.scenes.values()
+    return {
+        scene.backdrop_photograph.digest
+        for scene in scenes
+        if scene.backdrop_photograph is not None
+    }
 
 
 def make_attack_controls(
@@ -359,7 +450,9 @@ def _check_printable(
 ) -> None:
     """Raise an error if colors are to be printed and nothing can be."""
     if config.printable:
-        searched_space = make_space(parts.controls, description)
+        # without the photographs, among which only another control chooses
+        scene = replace(description, photographs=None)
+        searched_space = make_space(parts.controls, scene)
         # raises where nothing can be printed
         judging.measure_print_terms(searched_space, searched_space.start)
 

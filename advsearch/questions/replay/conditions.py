@@ -32,9 +32,12 @@ from advsearch.extend import (
 from advsearch.questions.replay.cycles import BlenderError, Cycles
 from advsearch.questions.replay.result import (
     NOT_DONE,
+    PHOTOGRAPH,
+    SEARCHED_PHOTOGRAPH,
     ReplayConfig,
     ReplayResult,
     ReplayRow,
+    count_transfer,
 )
 
 AttackResult = workbench.AttackResult
@@ -314,6 +317,40 @@ def model_condition(
     )
 
 
+def photograph_conditions(
+    parts: workbench.AttackParts, folder: str, spp: int, threads: Mapping[str, int]
+) -> Iterator[ReplayCondition]:
+    """Yield a condition for each photograph of a folder.
+
+    If the run used a single one of them, that is left out: it is tried as verified.
+
+    Args:
+        parts: of the attack.
+        folder: of photographs.
+        spp: samples per pixel.
+        threads: other settings of the problems.
+    """
+    others, used = workbench.move_to_photographs(parts, folder)
+    if len(used) == 1:
+        used = {}
+    for method, parts_by_name in ((PHOTOGRAPH, others), (SEARCHED_PHOTOGRAPH, used)):
+        for name, moved in parts_by_name.items():
+            yield ReplayCondition(
+                method,
+                name,
+                make_problem=partial(_make_photograph_problem, moved, threads),
+                spp=spp,
+            )
+
+
+def _make_photograph_problem(
+    parts: workbench.AttackParts, threads: Mapping[str, int]
+) -> Problem:
+    """Make the problem of an attack in a photograph, of which no derivative is needed."""
+    config = parts.config.model_copy(update=dict(threads))
+    return workbench.make_problem(replace(parts, config=config), differentiated=False)
+
+
 # ---- the experiment
 # ----------------------------------------------------------------------------------
 
@@ -394,6 +431,8 @@ def run_replay(
 
     spp = verification_spp(attack)
     conditions = select_conditions(config, problem, spp, load_problem)
+    if config.backdrop is not None:
+        conditions += photograph_conditions(parts, config.backdrop, spp, threads)
     table = _Table(
         u=workbench.read_stored_configuration(attack_directory, problem),
         trials=config.trials,
@@ -404,6 +443,9 @@ def run_replay(
     with context.until_interrupted():
         for batch in batch_by_light(conditions, spp):
             table.fill(batch)
+    rows = [
+        table.rows[condition] for condition in conditions if condition in table.rows
+    ]
     return context.result(
         ReplayResult,
         answer=str(attack_directory),
@@ -413,9 +455,9 @@ def run_replay(
         task=attack.task,
         environment=attack.environment,
         controls=attack.controls,
-        table=[
-            table.rows[condition] for condition in conditions if condition in table.rows
-        ],
+        table=rows,
+        transfer=count_transfer(rows, PHOTOGRAPH),
+        searched=count_transfer(rows, SEARCHED_PHOTOGRAPH),
         renders=table.renders,
         warnings=warnings,
         seed=parts.config.seed,

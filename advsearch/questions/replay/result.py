@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import ClassVar
 
@@ -18,6 +18,7 @@ from advsearch.extend import (
     setting,
     setting_as_in,
     settings,
+    statistics,
     views,
     wording,
 )
@@ -60,7 +61,15 @@ class ReplayConfig(Config):
         "replay",
         "what is changed, separated by commas",
         f"some of {', '.join(RENDER_METHODS)}",
-        otherwise="all",
+        otherwise="all, or with `backdrop` none",
+    )
+    backdrop: str | None = setting_as_in(
+        SceneConfig,
+        "backdrop",
+        group="replay",
+        description="other photographs that the scene is tried in",
+        expects="a folder of photographs with their camera files",
+        otherwise="none",
     )
     model: str | None = setting(
         None,
@@ -82,7 +91,9 @@ class ReplayConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = settings.text_validator("attack", "run", several=["ways", "model"])
+    _named = settings.text_validator(
+        "attack", "backdrop", "run", several=["ways", "model"]
+    )
     _different = settings.unique_names_validator("ways")
 
     @field_validator("ways")
@@ -95,7 +106,9 @@ class ReplayConfig(Config):
     @property
     def selected_names(self) -> tuple[str, ...]:
         """The names of the conditions that are rendered."""
-        return RENDER_METHODS if self.ways is None else settings.split_names(self.ways)
+        if self.ways is not None:
+            return settings.split_names(self.ways)
+        return RENDER_METHODS if self.backdrop is None else ()
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -138,6 +151,23 @@ class ReplayRow(results.Fields):
     )
 
 
+PHOTOGRAPH = "photograph"
+"""Name of the conditions under which the scene is rendered into another photograph."""
+SEARCHED_PHOTOGRAPH = "searched photograph"
+"""The same for the photographs that the run itself was searched over."""
+
+
+class PhotographTransfer(results.Fields):
+    """In how many photographs an adversarial scene holds."""
+
+    photographs: int = Field(description="that it was tried in")
+    clean_right: int = Field(description="in which the model is right without it")
+    holding: int = Field(description="of these, in which it holds")
+    rate: results.Estimate | None = Field(
+        description="holding of clean_right; null where that is 0"
+    )
+
+
 class ReplayResult(views.InNotebook, results.SceneResult):
     """How an adversarial scene fares under other conditions than it was verified
     under.
@@ -148,11 +178,26 @@ class ReplayResult(views.InNotebook, results.SceneResult):
     answer: str = Field(description="the run whose adversarial scene it is")
     answered: str = Field(description="how that run ended")
     table: list[ReplayRow]
+    transfer: PhotographTransfer | None = Field(
+        None,
+        description="over the photographs of `backdrop` that the run did not use; "
+        "absent without",
+    )
+    searched: PhotographTransfer | None = Field(
+        None,
+        description="over those that it was searched over, as `transfer`; absent "
+        "without",
+    )
     renders: int = Field(description="pictures that were rendered in this sitting")
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
     def brief(self) -> str:
+        if self.transfer is not None:
+            return (
+                f"holds in {self.transfer.holding} of {self.transfer.clean_right} "
+                "photographs"
+            )
         done = [row for row in self.table if row.ending != NOT_DONE]
         if not done:
             return ""
@@ -178,6 +223,54 @@ TRIALS_NOTE = (
 )
 VERDICTS = {HOLDS: "holds", CLEAN_IS_WRONG: "clean is wrong too"}
 """By status; all others do not hold."""
+
+
+def count_transfer(
+    table: Sequence[ReplayRow], method: str = PHOTOGRAPH
+) -> PhotographTransfer | None:
+    """Count in how many photographs an adversarial scene holds; None without any.
+
+    Each photograph counts once, however many renders it was tried with.
+
+    Args:
+        table: all rows.
+        method: the `way` of the rows that count.
+    """
+    rows = [row for row in table if row.way == method and row.ending != NOT_DONE]
+    if not rows:
+        return None
+    n_clean_right = sum(row.ending != CLEAN_IS_WRONG for row in rows)
+    n_holding = sum(row.ending == HOLDS for row in rows)
+    rate = None
+    if n_clean_right:
+        rate = results.Estimate(
+            value=n_holding / n_clean_right,
+            interval=statistics.intervals.clopper_pearson(n_holding, n_clean_right),
+        )
+    return PhotographTransfer(
+        photographs=len(rows),
+        clean_right=n_clean_right,
+        holding=n_holding,
+        rate=rate,
+    )
+
+
+def describe_transfer(transfer: PhotographTransfer, kind: str = "other") -> str:
+    """Return a sentence on the photographs in which an adversarial scene holds.
+
+    Args:
+        transfer: the counts.
+        kind: of the photographs, an adjective.
+    """
+    clean = f"the clean scene is right in {transfer.clean_right} of them"
+    photographs = wording.format_count(transfer.photographs, f"{kind} photograph")
+    if transfer.rate is None or transfer.rate.interval is None:
+        return f"It was tried in {photographs}: {clean}, so that they say nothing."
+    interval = wording.format_interval(transfer.rate.interval)
+    return (
+        f"It was tried in {photographs}: {clean}, and of these it holds in "
+        f"{transfer.holding} ({transfer.rate.value:.0%}, 95 % interval {interval})."
+    )
 
 
 def make_replay_view(result: ReplayResult) -> ShownResult:
@@ -218,13 +311,28 @@ def make_replay_claims(result: ReplayResult) -> Iterator[views.Claim]:
         if row.way != row.condition:
             name += f": {row.condition}"
         yield views.Claim.from_case(name, row.ending, row.verified)
+    transfer = result.transfer
+    if transfer is not None and transfer.rate is not None:
+        extent = results.Extent.from_count(
+            "photographs in which the clean scene is right and the adversarial one holds",
+            transfer.holding,
+            transfer.clean_right,
+            transfer.rate.interval,
+        )
+        yield views.Claim(
+            kind="measured", statement=describe_transfer(transfer), extent=extent
+        )
 
 
 def summarize_replay(result: ReplayResult) -> str:
     """Summarise in words under which conditions the adversarial scene holds."""
     if all(row.ending == NOT_DONE for row in result.table):
         return "Nothing was rendered again."
-    changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
+    changed = [
+        row
+        for row in result.table[1:]
+        if row.ending != NOT_DONE and row.way not in (PHOTOGRAPH, SEARCHED_PHOTOGRAPH)
+    ]
     unchanged_status = result.table[0].ending  # the first row changes nothing
     unchanged_text = "does not hold"
     if unchanged_status == HOLDS:
@@ -237,7 +345,14 @@ def summarize_replay(result: ReplayResult) -> str:
         changed_text = (
             f"changed, it holds under {n_holding} of {len(changed)} conditions"
         )
-    text = f"As verified, the adversarial scene {unchanged_text}; {changed_text}."
+    text = f"As verified, the adversarial scene {unchanged_text}"
+    if changed or (result.transfer is None and result.searched is None):
+        text += f"; {changed_text}"
+    text += "."
+    if result.transfer is not None:
+        text += f" {describe_transfer(result.transfer)}"
+    if result.searched is not None:
+        text += f" {describe_transfer(result.searched, 'searched')}"
     clean_wrong = [row for row in changed if row.ending == CLEAN_IS_WRONG]
     if clean_wrong:
         names = ", ".join(f"{row.way}: {row.condition}" for row in clean_wrong)

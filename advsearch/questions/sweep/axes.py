@@ -532,6 +532,7 @@ class Points:
         repeat_after_scenes: after so many scenes the draws repeat, so that scenes that
             are compared have the same ones; 0 for never.
         n_scenes: scenes of the sweep.
+        n_photographs: of a folder, in which the scenes are in turn; 1 without one.
 
     Attributes:
         count: images of the scene.
@@ -553,6 +554,7 @@ class Points:
         seed: int,
         repeat_after_scenes: int = 0,
         n_scenes: int = 1,
+        n_photographs: int = 1,
     ) -> None:
         self.grid = ProductIndex(tuple(len(axis.values) for axis in axes))
         self.samples = samples
@@ -596,6 +598,8 @@ class Points:
             samples=n_draws,
             again=repeat_after_scenes * self.count,
             noise=samples // n_draws,
+            photographs=n_photographs,
+            scene=self.count if n_photographs > 1 else 1,
         )
         numbers = tuple(
             (number.name, number.column, len(number.parts))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -84,6 +84,7 @@ SCENE_SETTINGS = (
 )
 """Settings that a scene has which the caller loaded."""
 WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"
+BACKDROP = "backdrop"  # the control that draws a photograph
 # name of the scene without the adversarial configuration of a run
 CLEAN = "clean"
 AnyScene = Scene | str | Path
@@ -393,7 +394,7 @@ def _run_config(
         # a check before the work: raises an error if it cannot be read
         read_twins(config.twins)
     with context as directory:
-        named_scenes = scenes or load_scenes(config)
+        named_scenes = expand_photographs(config, scenes) or load_scenes(config)
         job = _make_job(
             config, named_scenes, naming.list_models(models), task, controls
         )
@@ -675,14 +676,17 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
 
     They are sorted by object, then by environment. Without an `environment`, each
     object has that of its own scene. A scene that a Python caller passed is the only
-    one.
+    one. Each is in every photograph, if `backdrop` is a folder.
 
     Args:
         config: settings of the sweep.
     """
     passed: Scene | None = config.python_object(naming.SCENE, config.object)
     if passed is not None:
-        return (NamedScene(config.object, passed.description.environment_name, passed),)
+        environment = passed.description.environment_name
+        return expand_photographs(
+            config, [NamedScene(config.object, environment, passed)]
+        )
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
     first_environment = environments[0] if config.environment else None
@@ -691,9 +695,12 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
         for name in objects
     }
     if first_environment is None:
-        return tuple(
-            NamedScene(name, scene.description.environment_name, scene)
-            for name, scene in scenes.items()
+        return expand_photographs(
+            config,
+            [
+                NamedScene(name, scene.description.environment_name, scene)
+                for name, scene in scenes.items()
+            ],
         )
     first_scene = scenes[objects[0]].description
     # Environments are loaded once, with the first object, and given to all others.
@@ -701,11 +708,45 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
     for name in environments[1:]:
         scene = load_scene(first_scene.object, name)
         maps[name] = scene.description.environment
-    return tuple(
-        NamedScene(name, environment, scenes[name].with_environment(maps[environment]))
-        for name in objects
-        for environment in maps
+    return expand_photographs(
+        config,
+        [
+            NamedScene(
+                name, environment, scenes[name].with_environment(maps[environment])
+            )
+            for name in objects
+            for environment in maps
+        ],
     )
+
+
+def expand_photographs(
+    config: SweepConfig, scenes: Iterable[NamedScene]
+) -> tuple[NamedScene, ...]:
+    """Return scenes, and of a scene in a folder of photographs one for each of them.
+
+    They stay as they are if a control draws the photograph, or the grid names it.
+    """
+    names = [*config.controls, *(name.partition(".")[0] for name in config.grid)]
+    if any(getattr(config.find_control_type(n), "kind", "") == BACKDROP for n in names):
+        return tuple(scenes)
+    expanded = list[NamedScene]()
+    for named_scene in scenes:
+        folder = named_scene.scene.description.photographs
+        if folder is None:
+            expanded.append(named_scene)
+            continue
+        for name, description in folder.scenes.items():
+            scene = replace(named_scene.scene, description=description)
+            expanded.append(
+                replace(
+                    named_scene,
+                    scene=scene,
+                    environment=description.environment_name,
+                    photograph=name,
+                )
+            )
+    return tuple(expanded)
 
 
 def _check_different(names: Sequence[str]) -> None:

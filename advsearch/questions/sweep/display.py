@@ -367,7 +367,8 @@ def _worst_configuration(summary: SweepSummary) -> str:
     if summary.worst is None:
         return ""
     values = summary.worst.values
-    outside = [name for name in ("object", "environment", "model") if name in values]
+    names = ("object", "environment", "backdrop", "model")
+    outside = [name for name in names if name in values]
     texts = [shorten_name(values[name].value) for name in outside]
     for name, described in values.items():
         if name not in outside:

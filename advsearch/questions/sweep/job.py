@@ -58,6 +58,8 @@ class NamedScene:
         u: (d,) their configuration; None leaves the scene as it is.
         arm: name of the arm of a comparison without and with the adversarial
             configuration of a run; empty if nothing is compared.
+        photograph: name of the photograph of a folder that it is in; empty if it is in
+            none of a folder.
     """
 
     object: str
@@ -66,11 +68,14 @@ class NamedScene:
     fixed_controls: tuple[Control, ...] = ()
     u: Tensor | None = None
     arm: str = ""
+    photograph: str = ""
 
     @property
     def names(self) -> dict[str, str]:
         """The values of the axes outside the scene, by their names."""
         names = {"object": self.object, "environment": self.environment}
+        if self.photograph:
+            names["backdrop"] = self.photograph
         if self.arm:
             names["answer"] = self.arm
         return names
@@ -323,6 +328,7 @@ class Job:
             seed=self.config.seed,
             repeat_after_scenes=repeat_after_scenes,
             n_scenes=len(self.scenes),
+            n_photographs=len({scene.photograph for scene in self.scenes}),
         )
 
     def make_facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:

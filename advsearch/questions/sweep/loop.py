@@ -395,8 +395,8 @@ class Sweep:
     def _make_axes(self, rows: npt.NDArray[np.int64]) -> list[TableAxis]:
         """Return what tables are by: all axes with several values.
 
-        These are object, environment and adversarial scene, the model, the axes of the
-        grid, and the parts of sampled numbers.
+        These are object, environment, photograph and adversarial scene, the model, the
+        axes of the grid, and the parts of sampled numbers.
 
         Args:
             rows: (n,) numbers of the rows, ascending, whose values are looked up.
@@ -427,7 +427,7 @@ class Sweep:
 
     def _scene_axes(self, scene: npt.NDArray[np.int64]) -> Iterator[TableAxis]:
         """Yield the axes over scenes; `scene` (n,) has the scene of each row."""
-        for name in ("object", "environment", "answer"):
+        for name in ("object", "environment", "backdrop", "answer"):
             scene_values = [
                 named_scene.names.get(name, "") for named_scene in self.job.scenes
             ]
@@ -645,9 +645,9 @@ class Sweep:
                 description = fit_camera(
                     named_scene.scene.description, self.job.image_sizes[0]
                 )
-                gains[f"{named_scene.object}, {named_scene.environment}"] = (
-                    description.gain
-                )
+                names = dict(named_scene.names)
+                names.pop("answer", None)
+                gains[", ".join(names.values())] = description.gain
         if len(set(gains.values())) != 1:
             formation = formation.model_copy(update={"gain": None})
         return formation, gains
@@ -729,7 +729,7 @@ class Sweep:
         """Yield what a reader of the result has to know."""
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
-        if self.units.noise > 1:
+        if self.units.noise > 1 and self.units.photographs == 1:
             yield explain_repeats(
                 self.units.name, self.units.noise, self.n_rows // self.units.size
             )

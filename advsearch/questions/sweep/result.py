@@ -226,7 +226,7 @@ class Predictions:
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])
             if len(images):
-                draws = units.find_draw(images)
+                draws = units.find_cluster(images)
                 pairs.append(
                     _compare_pairs(
                         name,

@@ -479,7 +479,7 @@ def _draw_of_images(
     """Return the draw of each image, (scenes, images of a scene)."""
     units = scenes.load(0).points[job.image_sizes[0]].units
     image_numbers = np.arange(wrong[..., 0].size)
-    return np.asarray(units.find_draw(image_numbers)).reshape(wrong.shape[:2])
+    return np.asarray(units.find_cluster(image_numbers)).reshape(wrong.shape[:2])
 
 
 def _make_part_counts(

@@ -1,0 +1,226 @@
+"""The `backdrop` control: which photograph of a folder the scene is rendered into.
+
+The photographs were taken by cameras of their own, of an object that may have been
+turned and moved. The object stays as it stands in the first photograph, and camera and
+light are carried there from the others:
+
+    T = pose of the object in the first . inverse(pose of the object in another)
+    camera = T . camera of the other;   light is turned about the vertical by T
+
+so that controls of the object mean the same in each. T has to leave the plane that
+takes the shadow where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Control, Values
+from advsearch.controls.environment import rotate_map
+from advsearch.controls.ranges import ParameterValue
+from advsearch.errors import InputError
+from advsearch.scene.assembly import PHOTOGRAPH_INPUT
+from advsearch.scene.assets import Float64Array
+from advsearch.scene.backdrop import has_plane
+from advsearch.scene.camera_model import CameraModel, make_pinhole
+from advsearch.scene.description import SCENE_ENVIRONMENT, SceneDescription
+from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.settings import Parameter
+
+# of a pose, in object sizes and of a cosine: how far the plane may be off
+PLANE_TOLERANCE = 1e-3
+
+
+class BackdropControl(Control):
+    """Which photograph of a folder the scene is rendered into, seen by its camera."""
+
+    kind = "backdrop"
+    parameters = (
+        Parameter.named(
+            "which",
+            (SCENE_ENVIRONMENT,),
+            SCENE_ENVIRONMENT,
+            "The photograph, by the name of its file.",
+        ),
+    )
+
+    @classmethod
+    def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+        """Return the parameter, with the photographs that a setting names as options.
+
+        The setting is a name, a list of names, or a mapping with "choices".
+        """
+        which = cls.parameters[0]
+        setting = settings.get("which") if isinstance(settings, Mapping) else None
+        if isinstance(setting, Mapping):
+            setting = setting.get("choices")
+        names = [setting] if isinstance(setting, str) else setting or []
+        options = [name for name in names if isinstance(name, str)]
+        if not options:
+            return (which,)
+        return (
+            replace(
+                which,
+                options=tuple(dict.fromkeys(options)),
+                default=options[0],
+                high=len(options) - 1.0,
+            ),
+        )
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Check the photographs, and begin with the first one that is allowed.
+
+        The scene gets a camera model if one of the cameras has one.
+
+        Raises:
+            InputError: the scene is rendered into no folder, a name is none of its
+                photographs, or one of them can not be shown beside the others.
+        """
+        folder = scene.photographs
+        if folder is None:
+            raise InputError(
+                f"`controls` {self.name}: chooses among the photographs of a folder, "
+                "and there is none; give `backdrop=FOLDER`"
+            )
+        scenes = folder.scenes
+        allowed = [str(name) for name in self._list_names(scene)]
+        for name in allowed:
+            if name not in scenes:
+                raise InputError(
+                    f"{self.name}.which: {folder.path} has no photograph "
+                    f"{name}; it has {', '.join(scenes)[:200]}"
+                )
+        first = scenes[allowed[0]]
+        lenses = [_get_lens(scenes[name]) for name in allowed]
+        for name, lens in zip(allowed, lenses, strict=True):
+            if lens.kind != lenses[0].kind:
+                raise InputError(
+                    f"`controls` {self.name}: {name} has a {lens.kind} lens and "
+                    f"{allowed[0]} a {lenses[0].kind} one; choose among photographs "
+                    f"of one kind, with {self.name}.which"
+                )
+            _check_compatible(name, scenes[name], first)
+        has_model = any(scenes[name].camera_model is not None for name in allowed)
+        if first.backdrop_photograph is not scene.backdrop_photograph:
+            scene = replace(
+                scene,
+                backdrop_photograph=first.backdrop_photograph,
+                camera=first.camera,
+                values=first.values,
+            )
+        allowed_scenes = {name: scenes[name] for name in allowed}
+        model = lenses[0] if has_model else None
+        return replace(
+            scene,
+            camera_model=model,
+            photographs=replace(folder, scenes=allowed_scenes),
+        )
+
+    def _list_names(self, scene: SceneDescription) -> tuple[ParameterValue, ...]:
+        """Return the names of the photographs that may be chosen."""
+        if scene.photographs is None:
+            return ()
+        return self.list_allowed_values("which", *scene.photographs.scenes)
+
+    def resolve_parameter(self, parameter: Parameter) -> Parameter:
+        """Return the parameter with the photographs as options, the first as default.
+
+        They are searched unless the user chose among them.
+        """
+        options = tuple(map(str, self._list_names(self.scene)))
+        high = max(len(options) - 1.0, 0.0)
+        return replace(
+            parameter,
+            options=options,
+            default=options[0],
+            high=high,
+            search=(0.0, high),
+        )
+
+    def scene_inputs(
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Return the photograph, its camera, its exposure and its light."""
+        index = int(values["which"])
+        inputs = _compute_view_inputs(self.scene, index)
+        return {name: value.clone() for name, value in inputs.items()}
+
+
+@lru_cache(maxsize=256)
+def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tensor]:
+    """Return the inputs by which a scene is seen as in one of its photographs.
+
+    Args:
+        scene: in the first photograph.
+        index: of the photograph.
+    """
+    assert scene.photographs is not None
+    view = list(scene.photographs.scenes.values())[index]
+    carry = _compute_carry(view, scene)
+    pose = carry @ camera_to_world(view)
+    inputs = {
+        PHOTOGRAPH_INPUT: torch.tensor(float(index)),
+        "camera.to_world": torch.from_numpy(pose).float(),
+        "camera.exposure": torch.tensor(math.log2(view.gain / scene.gain)),
+    }
+    if scene.camera_model is not None:
+        inputs["camera.lens"] = torch.tensor(_get_lens(view).numbers)
+    else:
+        inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
+    if scene.environment is not None:
+        radiance = torch.from_numpy(scene.environment.radiance.copy())
+        degrees = math.degrees(math.atan2(carry[1, 0], carry[0, 0]))
+        inputs["environment.data"] = rotate_map(radiance, torch.tensor(degrees))
+    return inputs
+
+
+def _compute_carry(view: SceneDescription, first: SceneDescription) -> Float64Array:
+    """Return the map (4, 4) by which an object in a view stands as in the first."""
+    carry: Float64Array = object_to_world(first) @ np.linalg.inv(object_to_world(view))
+    return carry
+
+
+def _get_lens(view: SceneDescription) -> CameraModel:
+    """Return the camera model of a view, for a pinhole without one that of its angle."""
+    if view.camera_model is not None:
+        return view.camera_model
+    return make_pinhole(view.get_number("camera.fov"), view.aspect)
+
+
+def _check_compatible(
+    name: str, view: SceneDescription, first: SceneDescription
+) -> None:
+    """Raise InputError if a photograph can not be shown in the scene of the first one.
+
+    Args:
+        name: of the photograph.
+        view: the scene in it.
+        first: the scene in the first one.
+    """
+    if view.environment_spec != first.environment_spec:
+        raise InputError(
+            f"`controls` backdrop: {name} has a light of its own beside it; state one "
+            "`environment` for all photographs, or sweep over them"
+        )
+    carry = _compute_carry(view, first)
+    up = carry[2, :3] - [0.0, 0.0, 1.0]
+    level = (
+        carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
+    )
+    is_level = np.abs(up).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
+    same_plane = has_plane(view) == has_plane(first) and (
+        not has_plane(first) or abs(level) <= PLANE_TOLERANCE
+    )
+    if not (is_level and same_plane):
+        raise InputError(
+            f"`controls` backdrop: the object stands in {name} with another side down, "
+            "or at another height above its plane, than in the first photograph; leave "
+            f"it out of backdrop.which, or sweep over the photographs"
+        )

@@ -1,0 +1,360 @@
+"""Photographs with a camera file beside them, and folders of such photographs.
+
+``desk.yaml`` beside ``desk.jpg`` is a camera file of any kind that is read. It may also
+state what no lens has (`VIEW_KEYS`): the pose of the object, the part of the photograph
+to use, settings of the scene, and a mask of what is before the object.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from advsearch.errors import FileFormatError, InputError
+from advsearch.pictures import open_image
+from advsearch.scene.assets import Float64Array
+from advsearch.scene.backdrop import CROP, compute_view_settings
+from advsearch.scene.camera_files import VIEW_KEYS, read_camera_entries
+from advsearch.scene.settings import resolve_settings
+from advsearch.trust.named_files import is_inside
+from advsearch.trust.stored_files import (
+    LARGEST_FILE,
+    check_most,
+    record_opened,
+    track_opened_files,
+)
+
+if TYPE_CHECKING:
+    from advsearch.scene.description import SceneDescription
+
+CAMERA_SUFFIXES = (".yaml", ".yml", ".json")
+PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+MAX_PHOTOGRAPHS = 1000  # of a folder
+MAX_FILES = 100_000  # of all kinds in a folder
+MAX_FOLDER_PIXELS = 1 << 28  # of all photographs of a folder, three bytes each
+VIEW_SETTINGS = ("camera.", "pose.", "ground.", "backdrop.")
+"""How names of settings begin that a camera file may state."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhotographView:
+    """A photograph, and what the file beside it states.
+
+    Attributes:
+        spec: the photograph, and perhaps the part of it, ``desk.jpg#X,Y,WIDTH,HEIGHT``.
+        file: its camera file; "" if there is none.
+        camera: the camera file, if it has a lens; else None.
+        settings: of the scene.
+        object_to_camera: pose (4, 4) of the object; None if it is not stated.
+        up: direction (3,) in the camera's coordinates; None if it is not stated.
+        occluder: mask of what is before the object; None if there is none.
+    """
+
+    spec: str
+    file: str = ""
+    camera: str | None = None
+    settings: Mapping[str, float] = field(default_factory=dict)
+    object_to_camera: Float64Array | None = None
+    up: Float64Array | None = None
+    occluder: str | None = None
+
+    @property
+    def stated_names(self) -> frozenset[str]:
+        """The kinds of statements that the file makes, and the settings by name."""
+        stated = {
+            "a lens": self.camera,
+            "object_to_camera": self.object_to_camera,
+            "up": self.up,
+        }
+        names = {name for name, value in stated.items() if value is not None}
+        return frozenset(names | set(self.settings))
+
+    @property
+    def replaced_settings(self) -> tuple[str, ...]:
+        """How names of settings begin that are about another view than this one."""
+        groups = {name.partition(".")[0] for name in self.settings}
+        if self.object_to_camera is not None:
+            groups |= {"camera", "pose", "ground"}
+        return tuple(sorted(f"{group}." for group in groups))
+
+
+@dataclass(frozen=True, eq=False)
+class PhotographFolder:
+    """A folder of photographs, and the scene as it is rendered into each of them.
+
+    Attributes:
+        path: of the folder, as it was stated.
+        camera: that the user stated for all of them; None if each has its own.
+        scenes: by the name of the photograph's file, in alphabetical order.
+    """
+
+    path: str
+    camera: str | None
+    scenes: Mapping[str, SceneDescription]
+
+
+def is_photograph_folder(spec: object) -> bool:
+    """Return whether a `backdrop` setting names a folder of photographs."""
+    return isinstance(spec, (str, Path)) and os.path.isdir(spec)
+
+
+# ---- reading
+
+
+def read_photograph_view(spec: str | Path) -> PhotographView:
+    """Read what the camera file beside a photograph states, if there is one.
+
+    The photograph itself is not read.
+
+    Args:
+        spec: a picture file, perhaps with the part to use, which is used in the place
+            of the file's.
+
+    Raises:
+        FileFormatError: the file cannot be used.
+    """
+    part = CROP.fullmatch(str(spec))
+    path = Path(part["path"] if part else spec)
+    file = find_camera_file(path)
+    if file is None:
+        return PhotographView(str(spec))
+    with track_opened_files(path):
+        record_opened(file)
+        entries = read_camera_entries(str(file))
+    view = _parse_view(file, path, entries)
+    return replace(view, spec=str(spec)) if part else view
+
+
+def find_camera_file(photograph: Path) -> Path | None:
+    """Return the camera file beside a photograph, which is called as it is; or None."""
+    for suffix in CAMERA_SUFFIXES:
+        file = photograph.with_suffix(suffix)
+        if file != photograph and file.is_file():
+            return file
+    return None
+
+
+def read_photograph_folder(folder: str | Path) -> dict[str, PhotographView]:
+    """Read the camera files of all photographs of a folder.
+
+    Other files, hidden ones and folders in it are not looked at.
+
+    Returns:
+        The views by the name of the photograph's file, in alphabetical order.
+
+    Raises:
+        FileFormatError: there are no photographs or too many, or they have too many
+            pixels; one has no camera file, or its file states other things than that of
+            the first; a file leads out of the folder or cannot be used.
+    """
+    directory = Path(folder)
+    views: dict[str, PhotographView] = {}
+    n_pixels = 0
+    for path in _list_photographs(directory):
+        file = find_camera_file(path)
+        if file is None:
+            raise FileFormatError(
+                f"{path}: expected its camera file beside it, such as "
+                f"{path.with_suffix('.yaml').name}, got none; add it, or take the "
+                "photograph out of the folder"
+            )
+        _check_inside(path, directory)
+        _check_inside(file, directory)
+        with open_image(path, LARGEST_FILE) as image:
+            n_pixels += image.width * image.height
+        check_most(
+            directory, n_pixels, MAX_FOLDER_PIXELS, "photographs of at most {} pixels"
+        )
+        view = read_photograph_view(path)
+        first = next(iter(views.values()), view)
+        _check_same_statements(view, first)
+        views[path.name] = view
+    return views
+
+
+def _list_photographs(folder: Path) -> list[Path]:
+    """Return the photographs of a folder in alphabetical order.
+
+    Raises:
+        FileFormatError: there are none, or too many files.
+    """
+    paths: list[Path] = []
+    with os.scandir(folder) as entries:
+        for index, entry in enumerate(entries, start=1):
+            check_most(folder, index, MAX_FILES, "a folder of at most {} files")
+            is_photograph = Path(entry.name).suffix.lower() in PHOTOGRAPH_SUFFIXES
+            if is_photograph and not entry.name.startswith("."):
+                paths.append(folder / entry.name)
+    if not paths:
+        raise FileFormatError(
+            f"{folder}: expected photographs ({', '.join(PHOTOGRAPH_SUFFIXES)}), each "
+            "with its camera file beside it, got none"
+        )
+    check_most(folder, len(paths), MAX_PHOTOGRAPHS, "at most {} photographs")
+    return sorted(paths)
+
+
+def _check_inside(path: Path, folder: Path) -> None:
+    """Raise FileFormatError if a file of a folder is a link that leads out of it."""
+    if not is_inside(path, folder):
+        raise FileFormatError(
+            f"{path}: leads out of its folder, which only files inside it may; copy it"
+        )
+
+
+def _check_same_statements(view: PhotographView, first: PhotographView) -> None:
+    """Raise FileFormatError if a camera file states other things than the first one.
+
+    What only some of the files state would be unknown for the other photographs.
+    """
+    for file, other in ((view, first), (first, view)):
+        missing = sorted(other.stated_names - file.stated_names)
+        if missing:
+            raise FileFormatError(
+                f"{file.file}: expected {missing[0]}, which "
+                f"{Path(other.file).name} states; add it"
+            )
+
+
+# ---- what a camera file states beside its lens
+
+
+def _parse_view(
+    file: Path, photograph: Path, entries: Mapping[str, Any]
+) -> PhotographView:
+    """Return the view that the entries of a camera file describe."""
+    stated = {name: entries[name] for name in VIEW_KEYS & entries.keys()}
+    has_lens = len(entries) > len(stated)
+    pose = None
+    if "object_to_camera" in stated:
+        pose = np.eye(4)
+        numbers = _parse_numbers(file, "object_to_camera", stated, (12, 16))
+        pose[: len(numbers) // 4] = numbers.reshape(-1, 4)
+    spec = str(photograph)
+    if "part" in stated:
+        part = _parse_numbers(file, "part", stated, (4,))
+        spec += "#" + ",".join(f"{number:.0f}" for number in part.tolist())
+        if not CROP.fullmatch(spec):
+            raise FileFormatError(
+                f"{file}: part: expected X, Y, WIDTH, HEIGHT in pixels, got "
+                f"{stated['part']!s:.60}"
+            )
+    return PhotographView(
+        spec=spec,
+        file=str(file),
+        camera=str(file) if has_lens else None,
+        settings=_parse_settings(file, stated.get("set", {})),
+        object_to_camera=pose,
+        up=_parse_numbers(file, "up", stated, (3,)) if "up" in stated else None,
+        occluder=_parse_occluder(file, stated),
+    )
+
+
+def _parse_numbers(
+    file: Path, name: str, stated: Mapping[str, Any], counts: tuple[int, ...]
+) -> Float64Array:
+    """Return the finite numbers of an entry: a list, a list of rows, or a text.
+
+    OpenCV writes a matrix with its numbers as `data`.
+    """
+    value = stated[name]
+    if isinstance(value, Mapping):
+        value = value.get("data")
+    if isinstance(value, str):
+        value = value.replace(",", " ").split()
+    try:
+        numbers = np.array(value, np.float64).reshape(-1)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if len(numbers) not in counts or not np.isfinite(numbers).all():
+        expected = " or ".join(map(str, counts))
+        raise FileFormatError(
+            f"{file}: {name}: expected {expected} finite numbers, got {value!s:.60}"
+        )
+    return numbers
+
+
+def _parse_settings(file: Path, stated: object) -> dict[str, float]:
+    """Return the settings of the scene that a camera file states as `set`."""
+    if not isinstance(stated, Mapping):
+        raise FileFormatError(f"{file}: set: expected settings by name")
+    for name in stated:
+        if not str(name).startswith(VIEW_SETTINGS):
+            raise FileFormatError(
+                f"{file}: set: {name!s:.60} is not about the view; expected settings "
+                f"that begin with {', '.join(VIEW_SETTINGS)}"
+            )
+    try:
+        values = resolve_settings(stated)
+    except InputError as error:
+        raise FileFormatError(f"{file}: {error}") from None
+    return {str(name): float(values[name] or 0.0) for name in stated}
+
+
+def _parse_occluder(file: Path, stated: Mapping[str, Any]) -> str | None:
+    """Return the path of the mask that a camera file names; None if it names none."""
+    if "occluder" not in stated:
+        return None
+    name = str(stated["occluder"])
+    mask = file.parent / name
+    if "\0" in name or not is_inside(mask, file.parent):
+        raise FileFormatError(
+            f"{file}: occluder: expected a file in its folder or below, got {name:.80}"
+        )
+    return str(mask)
+
+
+# ---- the scene in a photograph
+
+
+def put_into_photograph(
+    description: SceneDescription,
+    view: PhotographView,
+    camera: str | None = None,
+    occluder: str | Path | None = None,
+) -> SceneDescription:
+    """Return a scene as it is rendered into a photograph.
+
+    Settings that the user requested of the scene stay.
+
+    Args:
+        description: the scene.
+        view: the photograph, and what its camera file states.
+        camera: a camera in the place of the file's.
+        occluder: a mask in the place of the file's.
+
+    Raises:
+        FileFormatError: a file cannot be used.
+        InputError: what is stated contradicts the scene.
+    """
+    stated = {
+        name: value
+        for name, value in view.settings.items()
+        if name not in description.requested
+    }
+    # A control may vary the pose, and may not vary the ground.
+    fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
+    scene = replace(
+        description,
+        values={**description.values, **stated},
+        requested=description.requested | fixed,
+    )
+    camera = camera or view.camera
+    if camera is not None:
+        scene = scene.with_camera(camera)
+    scene = scene.with_backdrop(view.spec, occluder or view.occluder)
+    if view.object_to_camera is None:
+        return scene
+    try:
+        measured = compute_view_settings(scene.object, view.object_to_camera, view.up)
+    except InputError as error:
+        raise InputError(f"{view.file}: {error}") from None
+    measured_values = {
+        name: value for name, value in measured.items() if name not in scene.requested
+    }
+    return replace(scene, values={**scene.values, **measured_values})
