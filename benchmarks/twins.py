@@ -105,7 +105,7 @@ def list_crops(
             item, rendering.load_object(item.mesh, item.unit)
         )
         images = []
-        photo_size = (photograph.shape[0], photograph.shape[1])
+        pixels = torch.from_numpy(photograph.levels) / 255.0
         for copy in range(N_COPIES):
             margin = CLASSIFIER_MARGIN
             moved = positions
@@ -115,10 +115,10 @@ def list_crops(
                 margin = float(generator.uniform(0.1, 0.5))
                 moved = positions + 0.08 * extent * generator.standard_normal(2)
                 gain = float(generator.uniform(0.6, 1.4))
-            window = rendering.choose_window(moved, photo_size, SIZE, margin)
+            window = rendering.choose_window(moved, photograph.full_size, SIZE, margin)
             if window is None:
                 break
-            crop = rendering.resize(rendering.cut_window(photograph, window), SIZE)
+            crop = rendering.resize(rendering.cut_window(pixels, window), SIZE)
             images.append((crop * gain).clamp(0.0, 1.0))
         if images:
             yield item, torch.stack(images)

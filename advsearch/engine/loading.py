@@ -31,6 +31,7 @@ from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
 from advsearch.scene.backdrop import (
     BackdropPhotograph,
+    find_photograph_file,
     find_photographed_light,
     fit_to_photograph,
 )
@@ -59,6 +60,7 @@ from advsearch.scene.headlamps import add_lamps
 from advsearch.scene.importing.pictures import read_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.rig import has_photographs
 from advsearch.scene.settings import ORBIT_CAMERA, SettingValues
 from advsearch.settings import parse_controls, to_python
 from advsearch.trust.code import allow_code_of_call
@@ -264,7 +266,8 @@ def load_scene(
             picture belongs to none of them but to what makes it: `resolution` of
             `attack`, `sweep`, `render` and `Scene.renderer`.
         camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose
-            lens the camera around the object then has; "dashcam" or "robot", mounted at
+            lens the camera around the object then has; for a `backdrop`, COLMAP's
+            images.txt or a transforms.json, which names it; "dashcam" or "robot", mounted at
             its height above the ground; the name of a camera of a scene file; "orbit"
             or None for a pinhole.
         texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in
@@ -278,7 +281,8 @@ def load_scene(
             ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels. By default it is lit by the .hdr
             or .exr file of its name beside it, if there is one.
         occluder: a mask of the photograph's size, white where it shows what is before
-            the object.
+            the object; or its depth, an .exr or .npy file in metres, or a picture with
+            the metres of a level behind its name, ``depth.png#0.001``.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of
@@ -306,7 +310,10 @@ def load_scene(
         plugins=mitsuba_dict,
         things=format_things(things),
     )
-    if camera is not None:
+    photograph = find_photograph_file(backdrop)
+    if camera is not None and photograph is not None and has_photographs(camera):
+        description = description.with_photograph_camera(camera, photograph)
+    elif camera is not None:
         description = description.with_camera(camera)
     if backdrop is not None:
         description = description.with_backdrop(backdrop, occluder)

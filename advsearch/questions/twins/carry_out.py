@@ -10,7 +10,7 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +124,6 @@ class Comparison:
         self._size = model.input_size
         self.n_renders = 0
         self._is_calibrated = False
-        self._load_photograph = lru_cache(maxsize=4)(rendering.load_photograph)
 
     @property
     def surroundings(self) -> tuple[str, ...]:
@@ -160,9 +159,9 @@ class Comparison:
                 self._context.progress.stage(f"reading {item.object}")
                 assets[item.mesh] = self._load_asset(item)
             positions = rendering.project_object(item, assets[item.mesh])
-            height, width = self._load_photo(item).shape[:2]
+            photograph = rendering.load_photograph(item.photograph)
             window = rendering.choose_window(
-                positions, (height, width), self._size, self.margin
+                positions, photograph.full_size, self._size, self.margin
             )
             if window is None:
                 n_outside += 1
@@ -187,9 +186,6 @@ class Comparison:
 
     def _load_asset(self, item: PhotographedObject) -> Any:
         return rendering.load_object(item.mesh, item.unit)
-
-    def _load_photo(self, item: PhotographedObject) -> Tensor:
-        return self._load_photograph(item.photograph)
 
     def compare(self, selection: Selection, measurements: Any) -> Iterator[TwinRow]:
         """Yield the rows, object by object, so that each mesh is loaded once."""
@@ -241,7 +237,10 @@ class Comparison:
         for number in numbers:
             item = selection.objects[number]
             window = selection.windows[number]
-            layers[number] = renderer.render(item, window, self._size, number)
+            photograph = rendering.load_photograph(item.photograph)
+            layers[number] = renderer.render(
+                item, photograph, window, self._size, number
+            )
             self.n_renders += 1
         return layers
 
@@ -279,7 +278,12 @@ class Comparison:
         surrounded = {environment: renderer.render(item, window, number)}
         self.n_renders += 1
         twin = rendering.make_twin(
-            item, self._load_photo(item), window, layer, surrounded, self._size
+            item,
+            rendering.load_photograph(item.photograph),
+            window,
+            layer,
+            surrounded,
+            self._size,
         )
         facts = self._make_facts(item, twin)
         self._save_images(number, twin)
