@@ -105,7 +105,6 @@ def list_crops(
             item, rendering.load_object(item.mesh, item.unit)
         )
         images = []
-        pixels = torch.from_numpy(photograph.levels) / 255.0
         for copy in range(N_COPIES):
             margin = CLASSIFIER_MARGIN
             moved = positions
@@ -118,7 +117,7 @@ def list_crops(
             window = rendering.choose_window(moved, photograph.full_size, SIZE, margin)
             if window is None:
                 break
-            crop = rendering.resize(rendering.cut_window(pixels, window), SIZE)
+            crop = rendering.resize(rendering.cut_photograph(photograph, window), SIZE)
             images.append((crop * gain).clamp(0.0, 1.0))
         if images:
             yield item, torch.stack(images)
@@ -165,6 +164,7 @@ def run_twins(options: argparse.Namespace, **model: Any) -> list[str]:
         **model,
         environment=options.environment,
         spp=options.spp,
+        frames=options.frames,
         run=str(options.out),
         overwrite=True,
     )
@@ -182,6 +182,7 @@ def main() -> None:
     parser.add_argument("--labels")
     parser.add_argument("--environment", default="room")
     parser.add_argument("--spp", type=int, default=32)
+    parser.add_argument("--frames", help="of the command, such as 0:600; default: all")
     options = parser.parse_args()
     if options.train:
         lines = run_folds(options)

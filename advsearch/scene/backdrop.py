@@ -11,6 +11,10 @@ albedo times what arrives, so that the ratio is right whatever the albedo of the
 at that pixel is, and it never goes below zero; a difference is right only where the
 albedo of the plane is that of the ground, and makes dark ground negative.
 
+A ground that shines is not covered: its coat reflects without the ground's color, so
+that a ratio tints the reflection and shows the ground's texture in it. It would take a
+second change that is added, and light that is sampled by the coat.
+
 The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
 area of each pixel of the film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT`
 in pixels from its top left corner; the intrinsics of the camera follow.

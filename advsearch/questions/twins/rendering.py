@@ -24,7 +24,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.extend import InputError, assets, color, reading, seeds, workbench
+from advsearch.extend import InputError, assets, reading, seeds, workbench
+from advsearch.questions.twins import counting
 from advsearch.questions.twins.listing import PhotographedObject
 from advsearch.questions.twins.result import COMPOSED, HOLE, PHOTOGRAPH
 
@@ -59,6 +60,8 @@ class Twin:
         brightness: mean of the twin less that of the photograph where the twin covers
             it, in sRGB.
         contrast: standard deviation of the photograph around the object, in sRGB.
+        texture: correlation of twin and photograph where the twin covers it, by
+            luminance in sRGB; None where one of them is even.
     """
 
     images: Mapping[str, Tensor]
@@ -67,6 +70,7 @@ class Twin:
     size: float
     brightness: float
     contrast: float
+    texture: float | None
 
 
 def project_object(item: PhotographedObject, asset: assets.ObjectAsset) -> Float64Array:
@@ -291,7 +295,7 @@ def make_twin(
     if front is not None:
         hidden = cut_window(torch.from_numpy(front), window) / 255.0
         coverage = coverage * (1.0 - hidden)
-    crop = cut_window(torch.from_numpy(photograph.levels), window) / 255.0
+    crop = cut_photograph(photograph, window)
     around = crop[coverage < 0.5]
     mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
     difference = (layer.composed - crop)[coverage >= 0.5]
@@ -308,7 +312,19 @@ def make_twin(
         size=math.sqrt(float(layer.alpha.sum())),
         brightness=float(difference.mean()) if len(difference) else 0.0,
         contrast=float(around.std()) if len(around) > 1 else 0.0,
+        texture=correlate_luminance(
+            layer.composed[coverage >= 0.5], crop[coverage >= 0.5]
+        ),
     )
+
+
+def correlate_luminance(first: Tensor, second: Tensor) -> float | None:
+    """Return the correlation of the luminance of pixels (N, 3); None if one is even."""
+    weights = torch.from_numpy(reading.backdrop.LUMINANCE).to(first)
+    values = torch.stack([first @ weights, second @ weights])
+    if len(first) < 2 or bool((values.std(dim=1) < 1e-6).any()):
+        return None
+    return float(torch.corrcoef(values)[0, 1])
 
 
 def _make_sight(
@@ -395,6 +411,16 @@ def cut_window(image: Tensor, window: PhotoWindow) -> Tensor:
     return image[rows, window.x : window.x + window.width]
 
 
+def cut_photograph(
+    photograph: reading.backdrop.BackdropPhotograph, window: PhotoWindow
+) -> Tensor:
+    """Return a window (h, w, 3) of a photograph, sRGB in [0, 1]."""
+    rows = slice(window.y, window.y + window.height)
+    columns = slice(window.x, window.x + window.width)
+    levels = photograph.levels[rows, columns]
+    return torch.from_numpy(levels.astype(np.float32) / np.float32(255.0))
+
+
 @lru_cache(maxsize=4)
 def load_photograph(path: Path) -> reading.backdrop.BackdropPhotograph:
     """Read a photograph.
@@ -455,17 +481,7 @@ def measure_pose(
         float(columns[-1] - columns[0]) + 1,
         float(rows[-1] - rows[0]) + 1,
     )
-    return compute_box_iou(box, item.box)
-
-
-def compute_box_iou(
-    first: tuple[float, float, float, float], second: tuple[float, float, float, float]
-) -> float:
-    """Return the overlap of two boxes (x, y, width, height) over their union."""
-    width = min(first[0] + first[2], second[0] + second[2]) - max(first[0], second[0])
-    height = min(first[1] + first[3], second[1] + second[3]) - max(first[1], second[1])
-    overlap = max(width, 0.0) * max(height, 0.0)
-    return overlap / (first[2] * first[3] + second[2] * second[3] - overlap)
+    return counting.compute_box_iou(box, item.box)
 
 
 @lru_cache(maxsize=64)
