@@ -164,9 +164,11 @@ def test_boxes_of_a_detector_agree_where_they_overlap_by_half() -> None:
     rows = []
     for number, payload in enumerate((shifted, far, {"found": []}, None)):
         row = make_row(f"{number}", True, True)
-        row.predictions[0].payload = found
-        row.predictions[1].payload = payload
-        rows.append(row)
+        predictions = [
+            prediction.model_copy(update={"payload": value})
+            for prediction, value in zip(row.predictions, (found, payload), strict=True)
+        ]
+        rows.append(row.model_copy(update={"predictions": predictions}))
     # overlaps of 6 of 10, and of 2 of 14
     assert counting.compute_box_iou((0, 0, 4, 2), (1, 0, 4, 2)) == pytest.approx(0.6)
     rate = counting.estimate_box_agreement(rows, "room")
@@ -219,14 +221,16 @@ def test_sweep_gate_and_evidence_state_what_the_run_of_twins_measured(tmp_path: 
     blind, row = (row for row in twins.table if row.surroundings == "studio" and not row.object and not row.condition)
     # it says the same to all, and half of the photographs are of a mug
     assert (blind.model, blind.agreement.value, blind.wrong_photos, row.model) == ("blind", 1.0, 6, "easy")
-    scene: dict[str, Any] = {"object": "mug", "environment": "studio", "resolution": 16, "spp": 1, "denoise": "none"}
-    small: dict[str, Any] = {"trials": 0, "verify_spp": 1, "keep_pictures": "none"}
+    scene: dict[str, Any] = {"environment": "studio", "resolution": 16, "denoise": "none"}
+    small: dict[str, Any] = {"trials": 0, "spp": 1, "keep_pictures": "none"}
     run = str(tmp_path / "sweep")
     swept = advsearch.sweep("mug", model, {"camera.azimuth": [20.0, 140.0]}, twins=twins.run, run=run, **scene, **small)
     assert swept.summary.twins is not None and swept.summary.twins.row == row
     claim = {"claim": "right", "at_least": 0.5, "pictures": 8, "settings": {"controls": "camera", "verify_spp": 1}}
     suite = tmp_path / "suite.yaml"
-    suite.write_text(yaml.safe_dump({"settings": {**scene, "model": model}, "claims": {"front": claim}}))
+    suite.write_text(
+        yaml.safe_dump({"settings": {**scene, "object": "mug", "model": model}, "claims": {"front": claim}})
+    )
     gate = get_experiment("test").run(SuiteConfig(suite=str(suite), twins=twins.run, run=str(tmp_path / "gate")))
     assert gate.twins is not None and gate.twins.row == row
     (remark,) = [text for text in list_remarks(gate, get_view(gate)) if text.startswith("Photographs (")]
