@@ -340,7 +340,7 @@ def make_image_inputs(
         blur = measure_blur((color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32))
     noise = photograph.make_noise(resolution, description.values.get("backdrop.noise"))
     depth = photograph.resample_depth(resolution)
-    if depth is not None and description.object.metres is None:
+    if depth is not None and description.object.size_in_metres is None:
         raise InputError(
             f"occluder: {photograph.front_spec} is in metres, and how large "
             f"{description.object.name} is is not known; give its longest side in "
@@ -350,7 +350,7 @@ def make_image_inputs(
         "backdrop.color": color,
         "backdrop.plane": compute_plane_radiance(description),
         "backdrop.front": photograph.resample_front(resolution),
-        "backdrop.depth": None if depth is None else depth / description.metres,
+        "backdrop.depth": None if depth is None else depth / description.size_in_metres,
         "backdrop.noise": noise if bool(noise.any()) else None,
         "backdrop.blur": torch.tensor([blur]) if blur >= MIN_BLUR else None,
     }
@@ -419,7 +419,8 @@ def compute_front(
     fractions = pool(torch.stack([masks, masks & is_hidden]).float(), n_points)
     around = pool(fractions, 2 * radius + 1, stride=1, padding=radius)
     covered, hidden = torch.where(fractions[0] > 0.0, fractions, around)
-    return (hidden / covered.clamp_min(1e-12)).movedim(0, -1)
+    front: Tensor = (hidden / covered.clamp_min(1e-12)).movedim(0, -1)
+    return front
 
 
 def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
@@ -447,7 +448,7 @@ def make_backdrop(
     """Make a backdrop of 8-bit sRGB levels (H, W, 3).
 
     Args:
-        levels: of the full photograph.
+        levels: levels of the full photograph.
         spec: how it is called.
         crop: left, top, width and height in pixels of the part to use; None: all.
 
@@ -522,9 +523,9 @@ def has_plane(description: SceneDescription) -> bool:
     """
     return (
         description.backdrop_photograph is not None
-        and description.number("ground.size") > 0.0
+        and description.get_number("ground.size") > 0.0
         and bool((compute_level_irradiance(description) > 0.0).all())
-        and camera_to_world(description)[2, 3] > description.number("ground.level")
+        and camera_to_world(description)[2, 3] > description.get_number("ground.level")
     )
 
 
@@ -537,7 +538,7 @@ def compute_plane_radiance(description: SceneDescription) -> Tensor | None:
         return None
     srgb = np.array(description.ground_color, np.float32)
     albedo = srgb_to_linear(srgb).astype(np.float64)
-    brightness = 2.0 ** description.number("environment.exposure")
+    brightness = 2.0 ** description.get_number("environment.exposure")
     radiance = albedo * brightness * compute_level_irradiance(description) / math.pi
     return torch.from_numpy(radiance).float()
 
@@ -553,7 +554,7 @@ def measure_plane_color(
 
     Args:
         description: the scene, with the camera of the full photograph.
-        photograph: that it is rendered into.
+        photograph: photograph that it is rendered into.
     """
     names = [f"ground.{channel}" for channel in CHANNELS]
     if not has_plane(description) or description.requested & set(names):
@@ -580,7 +581,7 @@ def _sample_ring(description: SceneDescription) -> Float64Array:
     center = object_to_world(description)[:2, 3]
     x = center[0] + radius * np.cos(angle)
     y = center[1] + radius * np.sin(angle)
-    level = np.full(N_CONTACT_POINTS, description.number("ground.level"))
+    level = np.full(N_CONTACT_POINTS, description.get_number("ground.level"))
     return np.column_stack([x, y, level])
 
 
@@ -619,7 +620,7 @@ def make_matrix_camera(
     """Return the camera of an intrinsic matrix (3, 3), as OpenCV has it.
 
     Args:
-        camera_matrix: in pixels; the center of the first pixel is (0, 0).
+        camera_matrix: camera matrix in pixels; the center of the first pixel is (0, 0).
         size: height and width in pixels of the photographs that it is for.
 
     Raises:
@@ -662,7 +663,7 @@ def fit_to_photograph(
 
     Args:
         description: the scene, whose camera took the full photograph.
-        photograph: that it is rendered into.
+        photograph: photograph that it is rendered into.
         resolution: height and width of the film, pixels.
 
     Raises:
@@ -680,7 +681,7 @@ def fit_to_photograph(
     plane_color = measure_plane_color(uncropped, photograph)
     if photograph.is_cropped:
         if model is None:
-            fov = description.number("camera.fov")
+            fov = description.get_number("camera.fov")
             model = replace(make_pinhole(fov, full_aspect), name=PHOTOGRAPH_CAMERA)
         model = crop_camera(model, photograph)
     return replace(
@@ -808,7 +809,7 @@ def compute_view_settings(
     lowest = float(((vertices - middle) @ rotation.T)[:, 2].min())
     return {
         **_compute_orbit(world_axes),
-        "camera.distance": distance * (asset.metres or 1.0),
+        "camera.distance": distance * (asset.size_in_metres or 1.0),
         **_decompose_rotation(rotation),
         "pose.x": float(offset[0]),
         "pose.y": float(offset[1]),
@@ -824,7 +825,7 @@ def _check_and_map(asset: ObjectAsset, object_to_camera: npt.ArrayLike) -> Float
     Both are in object sizes. Raises InputError as `compute_view_settings`.
     """
     pose = _check_rigid(object_to_camera)
-    if asset.file_to_mesh is None or asset.metres is None:
+    if asset.file_to_mesh is None or asset.size_in_metres is None:
         raise InputError(
             f"{asset.name}: expected an object from a mesh file with a known unit, to "
             "be seen in a measured pose; give `unit`, such as unit=mm"

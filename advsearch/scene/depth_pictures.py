@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -128,5 +129,6 @@ def _read_array(path: Path) -> np.ndarray:
             f"{path}: expected {height} x {width} numbers, got a file of another "
             "length; save it again"
         )
-    order = "F" if is_by_columns else "C"
-    return np.frombuffer(content, dtype).reshape(shape, order=order)  # type: ignore[call-overload]
+    order: Literal["F", "C"] = "F" if is_by_columns else "C"
+    numbers: np.ndarray = np.frombuffer(content, dtype)
+    return numbers.reshape((height, width), order=order)

@@ -124,7 +124,8 @@ class SceneDescription:
     up: str | None = None  # the up axis that was given for a mesh file
     facing: str | None = None  # the axis of a mesh file that was given for its front
     size: float | None = None  # the object's longest side in metres that was given
-    # of the object's file, that was given (`advsearch.scene.assets.METRES_PER_UNIT`)
+    # Unit of the object's file, that was given
+    # (`advsearch.scene.assets.METRES_PER_UNIT`).
     unit: str | None = None
     # what was asked for: names of settings, and "environment"
     requested: frozenset[str] = frozenset()
@@ -134,7 +135,7 @@ class SceneDescription:
     # the environment may be hidden behind a plain colour or a photograph
     # (`backdrop.color`)
     backdrop: bool = False
-    # that it is rendered into; None for none
+    # Backdrop photograph that it is rendered into; None for none.
     backdrop_photograph: BackdropPhotograph | None = None
     aspect: float = 1.0  # width over height of the picture
     # those with poses of their own, by name
@@ -144,7 +145,7 @@ class SceneDescription:
     # name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for
     # none
     preset: str = ""
-    # of the camera around the object; None for a pinhole
+    # Camera model of the camera around the object; None for a pinhole.
     camera_model: CameraModel | None = None
     # cameras that take pictures at the same time, this one first; empty where it is
     # alone
@@ -153,7 +154,8 @@ class SceneDescription:
     # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba
     # shows it
     metered: bool = True
-    # for users: of further files that controls have read, of things in each other
+    # Remarks for users: of further files that controls have read, of things in each
+    # other.
     remarks: tuple[str, ...] = ()
     things_spec: str = ""  # how the things beside the object were asked for
 
@@ -233,7 +235,7 @@ class SceneDescription:
                 "each other: a photograph was taken by one camera; name one of them, "
                 f"{self.rig_spec}#NAME"
             )
-        if self.number("camera.drops") > 0.0:
+        if self.get_number("camera.drops") > 0.0:
             raise InputError(
                 f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
                 "other: drops would show the photograph; leave one of the two out"
@@ -297,7 +299,7 @@ class SceneDescription:
             InputError: the size of the object is not known; or a setting of the camera
                 around the object was given.
         """
-        if self.object.metres is None:
+        if self.object.size_in_metres is None:
             raise InputError(
                 f"`camera={spec}` is in metres, and how large {self.object.name} is is "
                 "not known; give its longest side in metres, such as `size=0.1`"
@@ -305,7 +307,7 @@ class SceneDescription:
         with track_opened_files(photograph):
             pose, model = read_photograph_camera(spec, photograph)
         to_world = pose @ AXES
-        to_world[:3, 3] /= self.object.metres
+        to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)
         tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
@@ -400,18 +402,18 @@ class SceneDescription:
         Raises InputError: the object's size in metres is not known.
         """
         preset = PRESETS[name]
-        if self.object.metres is None:
+        if self.object.size_in_metres is None:
             raise InputError(
                 f"`camera={name}` is {preset.height:g} m high, and how large "
                 f"{self.object.name} is is not known; give "
                 "its longest side in metres, such as `size=0.1`"
             )
         is_on_plane = (
-            self.number("ground.size") > 0.0
+            self.get_number("ground.size") > 0.0
             and self.photograph is None
             and not is_paved(self)
         )
-        is_on_table = is_on_plane and self.object.metres <= MAX_TABLETOP_SIZE
+        is_on_table = is_on_plane and self.object.size_in_metres <= MAX_TABLETOP_SIZE
         preset_values = {"camera.fov": preset.fov}
         if "camera.elevation" not in self.requested:
             place = find_place(self)
@@ -422,7 +424,7 @@ class SceneDescription:
         if preset.in_lane:
             preset_values["camera.azimuth"] = 0.0
         if is_on_table:
-            preset_values["ground.size"] = TABLE_SIDE / self.metres
+            preset_values["ground.size"] = TABLE_SIDE / self.size_in_metres
         values = dict(self.values)
         for setting, value in preset_values.items():
             if setting not in self.requested:
@@ -432,9 +434,9 @@ class SceneDescription:
         )
         if "camera.distance" in self.requested:
             return scene
-        fov = torch.tensor(scene.number("camera.fov"), dtype=torch.float64)
+        fov = torch.tensor(scene.get_number("camera.fov"), dtype=torch.float64)
         framing = float(geometry.compute_framing_distance(scene, fov, scene.aspect))
-        distance = max(preset.distance, framing * scene.metres)
+        distance = max(preset.distance, framing * scene.size_in_metres)
         return scene.with_values(camera__distance=distance)
 
     @property
@@ -555,9 +557,9 @@ class SceneDescription:
         )
 
     @property
-    def metres(self) -> float:
+    def size_in_metres(self) -> float:
         """Metres of one object size, or 1 where they are not known."""
-        return self.object.metres or 1.0
+        return self.object.size_in_metres or 1.0
 
     @property
     def object_name(self) -> str:
@@ -660,7 +662,7 @@ class SceneDescription:
         """(V, 3) the object's vertices in world space, in its base pose."""
         return geometry.compute_base_vertices(self.meshes[OBJECT])
 
-    def number(self, name: str) -> float:
+    def get_number(self, name: str) -> float:
         """Return a setting that always has a value.
 
         Of the field of view, that of the camera in use.
@@ -701,7 +703,7 @@ class SceneDescription:
         """
         environment = self.environment
         kind = self.values.get("ground.kind")
-        if environment is None or self.number("ground.size") == 0.0:
+        if environment is None or self.get_number("ground.size") == 0.0:
             return None
         if kind is not None:
             shows_photograph = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
@@ -713,21 +715,23 @@ class SceneDescription:
             )
         if not shows_photograph:
             return None
-        rotation = self.number("environment.rotation")
+        rotation = self.get_number("environment.rotation")
         return get_photograph(environment, self.capture_height, rotation)
 
     @property
     def capture_height(self) -> float:
         """Height above the floor of the photograph's camera, object sizes."""
         height = self.values.get("ground.height")
-        if height is None and self.object.metres is None:
+        if height is None and self.object.size_in_metres is None:
             return settings.DEFAULT_PHOTOGRAPH_HEIGHT
-        return (TRIPOD_HEIGHT if height is None else height) / self.metres
+        return (TRIPOD_HEIGHT if height is None else height) / self.size_in_metres
 
     @property
     def ground_color(self) -> tuple[float, ...]:
         """(3,) colour of the ground plane, display-referred sRGB."""
-        return tuple(self.number(f"ground.{channel}") for channel in settings.CHANNELS)
+        return tuple(
+            self.get_number(f"ground.{channel}") for channel in settings.CHANNELS
+        )
 
     @property
     def material(self) -> Material:
@@ -756,7 +760,7 @@ class SceneDescription:
             )
         else:  # saturation (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1)
             exposure = unit / (1.2 * math.pow(2.0, stops))
-        return exposure * math.pow(2.0, self.number("camera.exposure"))
+        return exposure * math.pow(2.0, self.get_number("camera.exposure"))
 
 
 def load_description(
@@ -778,13 +782,13 @@ def load_description(
     and errors that are not listed are as of `advsearch.load_scene`.
 
     Args:
-        object_spec: with `plugins` the id of a shape.
+        object_spec: object spec with `plugins` the id of a shape.
         environment_spec: `NO_ENVIRONMENT` is no map at all.
         setting_values: settings of the scene by name.
         up: the up axis of a mesh file.
         facing: the axis of a mesh file that is its front.
         size: longest side of the object, metres.
-        unit: of the object's file.
+        unit: unit of the object's file.
         plugins: a Mitsuba scene as its loader takes it.
         things: what stands beside the object.
     """
@@ -946,7 +950,7 @@ def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None
     Raises InputError: it has, and another is requested.
 
     Args:
-        parts: of the scene.
+        parts: parts of the scene.
         requester: the setting that needs a map of ours, as users write it.
     """
     for part in parts:

@@ -60,8 +60,8 @@ class Photograph:
 
     Args:
         radiance: (H, W, 3) linear radiance of the map, row 0 straight up.
-        height: of the camera above the ground, object sizes.
-        rotation: of the map about the vertical, degrees.
+        height: height of the camera above the ground, object sizes.
+        rotation: rotation of the map about the vertical, degrees.
 
     Attributes:
         mesh: the plane.
@@ -87,8 +87,8 @@ class Photograph:
         column and row in it.
 
         Args:
-            height: of the camera, object sizes.
-            rotation: of the map about the vertical, degrees.
+            height: height of the camera, object sizes.
+            rotation: rotation of the map about the vertical, degrees.
         """
         radii = np.concatenate(
             [[0.0], np.geomspace(MIN_RING_RADIUS, MAX_RING_RADIUS, N_RINGS)]
@@ -211,8 +211,8 @@ def is_against_traffic(scene: SceneDescription, camera: Float64Array) -> bool:
         return False
     distance_ahead, distance_aside = (
         camera[:2, 3] - compute_center(scene)[:2]
-    ) * scene.metres
-    height = float(camera[2, 3]) * scene.metres
+    ) * scene.size_in_metres
+    height = float(camera[2, 3]) * scene.size_in_metres
     place = find_place(scene)
     width = LANE_WIDTH
     if place is not None and place.file.lane_width is not None:
@@ -266,7 +266,7 @@ def find_ground_kind(scene: SceneDescription) -> str | None:
     table. None where neither names one.
     """
     requested = scene.values.get("ground.kind")
-    if scene.number("ground.size") <= 0.0:
+    if scene.get_number("ground.size") <= 0.0:
         return None
     if requested is not None:
         return settings.GROUND_KINDS[int(requested)]
@@ -301,7 +301,7 @@ def load_requested_place(scene: SceneDescription) -> Place | None:
             return None
         return load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
-    is_described = scene.number("ground.size") <= 0.0 or has_table_settings
+    is_described = scene.get_number("ground.size") <= 0.0 or has_table_settings
     environment = scene.environment
     return None if environment is None or is_described else environment.place
 
@@ -333,7 +333,9 @@ def with_requested_ground(scene: SceneDescription) -> SceneDescription:
             radiance_unit * float(irradiance @ torch.tensor(LUMINANCE))
             < DUSK_ILLUMINANCE
         )
-    place_parts = make_place_parts(place, scene.metres, radiance_unit, is_dark=is_dark)
+    place_parts = make_place_parts(
+        place, scene.size_in_metres, radiance_unit, is_dark=is_dark
+    )
     return replace(scene, parts=(*other_parts, *place_parts))
 
 
@@ -476,10 +478,10 @@ def find_surroundings(scene: SceneDescription) -> Surroundings | None:
             height=picture.height,
             nearest_distance=(*picture.x, *picture.y),
             ground_extent=extent,
-            rotation=scene.number("environment.rotation"),
+            rotation=scene.get_number("environment.rotation"),
         )
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
-        height = scene.capture_height * scene.metres
+        height = scene.capture_height * scene.size_in_metres
         radius = scene.values.get("ground.radius")
         if radius is None:
             radius = DEFAULT_EMPTY_RADIUS * height
@@ -513,10 +515,10 @@ def make_camera_view(
         fov: field of view along the larger side, degrees; None: the scene's.
     """
     pose = camera_to_world(scene) if to_world is None else to_world
-    x, y, z = pose[:3, 3] * scene.metres
+    x, y, z = pose[:3, 3] * scene.size_in_metres
     forward = pose[:3, 2]
     if fov is None:
-        fov = scene.number("camera.fov")
+        fov = scene.get_number("camera.fov")
     half_fov = math.radians(fov) / 2.0
     half_height_angle = math.degrees(
         math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
@@ -574,7 +576,7 @@ def list_view_remarks(
     returned.
 
     Args:
-        scene: that is looked at.
+        scene: scene that is looked at.
         views: at least one.
         rotates_map: whether the map is rotated from view to view.
     """
@@ -601,7 +603,7 @@ def list_view_remarks(
     ]
     if not views_beyond:
         return ()
-    unit = "m" if scene.object.metres is not None else "object sizes"
+    unit = "m" if scene.object.size_in_metres is not None else "object sizes"
     subject = _describe_views_beyond(len(views_beyond), len(views))
     farthest = max(view.distance for view in views_beyond)
     highest = max(view.height for view in views_beyond)
@@ -620,7 +622,7 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
 
     Args:
         limits: distance and height of each view, see `find_valid_range`.
-        unit: of these.
+        unit: unit of these.
     """
     smallest = min(limits)[0]
     largest = max(limits)[0]
@@ -644,8 +646,8 @@ def list_outside_remarks(
     """Return a remark where views are outside of what the place is valid for.
 
     Args:
-        scene: that is looked at.
-        place: of the scene.
+        scene: scene that is looked at.
+        place: place of the scene.
         views: at least one.
     """
     axis_limits = [

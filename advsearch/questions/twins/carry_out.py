@@ -169,7 +169,7 @@ def load_judges(
     by_frame = network if isinstance(network, Mapping) else {}
     networks = list(dict.fromkeys(by_frame.values())) or [network]
     if network is None:
-        networks = settings.split_names(config.model)
+        networks = list(settings.split_names(config.model))
     scene_config: Any = config
     models, warnings = workbench.load_models(networks, task, scene_config)
     if len({model.input_size for model in models}) > 1:

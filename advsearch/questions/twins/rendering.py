@@ -211,7 +211,7 @@ class LayerRenderer:
             rendered = resize(rendered, size)
             image_inputs = self._make_image_inputs(item, photograph, window)
             composed = renderer.finish_image(rendered, image_inputs, renderer.start)
-        sight = _make_sight(surfaces, self._asset.metres, model_size)
+        sight = _make_sight(surfaces, self._asset.size_in_metres, model_size)
         return Layer(composed, rendered[..., 3].clamp(0.0, 1.0), sight)
 
     def _make_image_inputs(
@@ -226,7 +226,7 @@ class LayerRenderer:
         stops over that of the renderer.
         """
         front = read_front(item, photograph)
-        in_window = replace(photograph, crop=tuple(window), front=front)
+        in_window = replace(photograph, crop=window, front=front)
         description = self._description.with_backdrop(in_window)
         size = (window.height, window.width)
         stops = math.log2(description.gain / self._renderer.formation.gain)
