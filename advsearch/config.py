@@ -251,8 +251,8 @@ class SceneConfig(Config):
         "scene",
         "a mask or the depth of what is before the object in the photograph of "
         "`backdrop`",
-        "a picture file of the photograph's size, white where something is before it; "
-        "or depth, an .exr or .npy file in metres, or depth.png#METRES of a level",
+        "a picture of the photograph's size, white where something is before it; or "
+        "depth, .exr or .npy in metres, or depth.png#METRES of a level",
         metavar="FILE",
         otherwise="nothing is before the object",
         min_length=1,
