@@ -110,7 +110,7 @@ def _read_array(path: Path) -> np.ndarray:
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
         shape, is_by_columns, dtype = read_header(stream)
-        has_form = len(shape) == 2 and dtype.kind in "fiu"
+        has_form = len(shape) == 2 and min(shape) > 0 and dtype.kind in "fiu"
     except (ValueError, KeyError, EOFError, SyntaxError, RecursionError) as error:
         raise FileFormatError(
             f"{path}: expected an array of NumPy, got a file that is corrupt or of "

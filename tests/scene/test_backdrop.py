@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from PIL import Image
@@ -29,6 +30,7 @@ from advsearch.scene.backdrop import (
     make_matrix_camera,
     read_backdrop,
 )
+from advsearch.scene.depth_pictures import is_depth, read_depth
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world, project_points
 from advsearch.scene.image_quality import blur_image, measure_blur, measure_noise
@@ -348,14 +350,33 @@ def test_a_pixel_between_two_depths_is_hidden_by_its_part() -> None:
     assert front[0, :, 0].tolist() == pytest.approx([0.5, 0.5]) and front[0, :, 1].tolist() == pytest.approx([0.5, 0.5])
 
 
+def test_depths_are_metres_in_each_kind_of_file(tmp_path: Path) -> None:
+    expected = np.array([[0.5, 2.0, math.inf], [1.25, 3.0, 4.0]], np.float32)
+    stored = np.where(np.isfinite(expected), expected, 0.0).astype(np.float32)
+    Image.fromarray((stored * 1000.0).astype(np.uint16)).save(tmp_path / "a.png")
+    np.save(tmp_path / "a.npy", np.asfortranarray(expected))
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"Y": stored}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    for name in ("a.png#0.001", "a.npy", "a.exr"):
+        assert is_depth(name)
+        np.testing.assert_allclose(read_depth(tmp_path / name), expected, rtol=1e-6)
+    assert not is_depth("mask.png") and not is_depth("a.png#1,2,3,4")
+
+
 def test_hostile_depths_are_refused(tmp_path: Path) -> None:
     write_photograph(tmp_path / "a.png", (12, 16))
     Image.fromarray(np.full((12, 16), 700, np.uint16)).save(tmp_path / "deep.png")
     np.save(tmp_path / "negative.npy", np.full((12, 16), -1.0))
     np.save(tmp_path / "objects.npy", np.array([None]), allow_pickle=True)
     np.save(tmp_path / "small.npy", np.ones((2, 2)))
-    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999, 99999999), }"
-    (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+
+    def header_of(shape: str) -> bytes:
+        header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".encode()
+        return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+
+    (tmp_path / "huge.npy").write_bytes(header_of("(99999999, 99999999)"))
+    (tmp_path / "minus.npy").write_bytes(header_of("(-2, -3)") + bytes(48))
     (tmp_path / "cut.npy").write_bytes((tmp_path / "negative.npy").read_bytes()[:-9])
     (tmp_path / "text.npy").write_text("no array")
     write_photograph(tmp_path / "coloured.png", (12, 16))
@@ -364,6 +385,7 @@ def test_hostile_depths_are_refused(tmp_path: Path) -> None:
         "deep.png#1000": "depths of 0 to 100000 metres, got 700000",
         "negative.npy": "depths of 0 to",
         "objects.npy": "an array .height, width. of numbers",
+        "minus.npy": "an array .height, width. of numbers",
         "small.npy": "depths of 16 x 12 pixels",
         "huge.npy": "at most",
         "cut.npy": "another length",
