@@ -10,7 +10,7 @@ import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -204,6 +204,7 @@ class Comparison:
         self._config = context.config
         self._judges = judges
         self._size = judges[0].model.input_size
+        self._load_photograph = lru_cache(maxsize=4)(rendering.load_photograph)
         self.n_renders = 0
 
     @property
@@ -242,7 +243,7 @@ class Comparison:
                 self._context.progress.stage(f"reading {item.object}")
                 assets[item.mesh] = self._load_asset(item)
             positions = rendering.project_object(item, assets[item.mesh])
-            photograph = rendering.load_photograph(item.photograph)
+            photograph = self._load_photograph(item.photograph)
             window = rendering.choose_window(
                 positions, photograph.full_size, self._size, self.margin
             )
@@ -333,7 +334,7 @@ class Comparison:
         for number in numbers:
             item = selection.objects[number]
             window = selection.windows[number]
-            photograph = rendering.load_photograph(item.photograph)
+            photograph = self._load_photograph(item.photograph)
             layers[number] = renderer.render(
                 item, photograph, window, self._size, number
             )
@@ -375,7 +376,7 @@ class Comparison:
         self.n_renders += 1
         twin = rendering.make_twin(
             item,
-            rendering.load_photograph(item.photograph),
+            self._load_photograph(item.photograph),
             window,
             layer,
             surrounded,

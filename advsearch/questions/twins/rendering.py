@@ -421,7 +421,6 @@ def cut_photograph(
     return torch.from_numpy(levels.astype(np.float32) / np.float32(255.0))
 
 
-@lru_cache(maxsize=4)
 def load_photograph(path: Path) -> reading.backdrop.BackdropPhotograph:
     """Read a photograph.
 
