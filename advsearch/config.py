@@ -250,8 +250,10 @@ class SceneConfig(Config):
     occluder: str | None = setting(
         None,
         "scene",
-        "a mask of what is before the object in the photograph of `backdrop`",
-        "a picture file of the photograph's size, white where something is before it",
+        "a mask or the depth of what is before the object in the photograph of "
+        "`backdrop`",
+        "a picture of the photograph's size, white where something is before it; or "
+        "depth, .exr or .npy in metres, or depth.png#METRES of a level",
         metavar="FILE",
         otherwise="nothing is before the object",
         min_length=1,

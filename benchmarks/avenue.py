@@ -273,6 +273,8 @@ def _print_loading(environments: Sequence[str], rounds: int) -> None:
         both = statistics.median(cost[1] + cost[2] for cost in costs)
         numbers = "  ".join(f"{seconds:8.2f}" for seconds in [*medians, both])
         print(f"{environment:18} {numbers}", flush=True)
+
+
 def _compare_roulette(args: argparse.Namespace) -> None:
     """Print time and squared error of images of the avenue, with and without roulette.
 

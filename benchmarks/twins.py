@@ -115,7 +115,6 @@ def list_crops(
             item, rendering.load_object(item.mesh, item.unit)
         )
         images = []
-        photo_size = (photograph.shape[0], photograph.shape[1])
         for copy in range(N_COPIES):
             margin = CLASSIFIER_MARGIN
             moved = positions
@@ -125,10 +124,10 @@ def list_crops(
                 margin = float(generator.uniform(0.1, 0.5))
                 moved = positions + 0.08 * extent * generator.standard_normal(2)
                 gain = float(generator.uniform(0.6, 1.4))
-            window = rendering.choose_window(moved, photo_size, SIZE, margin)
+            window = rendering.choose_window(moved, photograph.full_size, SIZE, margin)
             if window is None:
                 break
-            crop = rendering.resize(rendering.cut_window(photograph, window), SIZE)
+            crop = rendering.resize(rendering.cut_photograph(photograph, window), SIZE)
             images.append((crop * gain).clamp(0.0, 1.0))
         if images:
             yield item, torch.stack(images)
@@ -314,6 +313,7 @@ def run_twins(options: argparse.Namespace, **model: Any) -> list[str]:
         **model,
         environment=options.environment,
         spp=options.spp,
+        frames=options.frames,
         run=str(options.out),
         overwrite=True,
     )
@@ -332,6 +332,7 @@ def main() -> None:
     parser.add_argument("--labels")
     parser.add_argument("--environment", default="room")
     parser.add_argument("--spp", type=int, default=32)
+    parser.add_argument("--frames", help="of the command, such as 0:600; default: all")
     options = parser.parse_args()
     if options.transfer:
         lines = run_transfer(options)

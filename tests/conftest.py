@@ -40,7 +40,7 @@ def own_models() -> None:
     but what it names."""
     from advsearch.trust.code import allow_code
 
-    allow_code(*(f"small_models:{name}" for name in ("easy", "finder", "hard", "near", "strange", "Colours")))
+    allow_code(*(f"small_models:{name}" for name in ("blind", "easy", "finder", "hard", "near", "strange", "Colours")))
 
 
 @pytest.fixture(scope="module", autouse=True)

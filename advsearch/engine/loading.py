@@ -280,7 +280,8 @@ def load_scene(
             picture belongs to none of them but to what makes it: `resolution` of
             `attack`, `sweep`, `render` and `Scene.renderer`.
         camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose
-            lens the camera around the object then has; "dashcam" or "robot", mounted at
+            lens the camera around the object then has; for a `backdrop`, COLMAP's
+            images.txt or a transforms.json, which names it; "dashcam" or "robot", mounted at
             its height above the ground; the name of a camera of a scene file; "orbit"
             or None for a pinhole.
         texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in
@@ -296,7 +297,8 @@ def load_scene(
             or .exr file of its name beside it, and seen by the camera of the .yaml or
             .json file of its name, if there is one.
         occluder: a mask of the photograph's size, white where it shows what is before
-            the object.
+            the object; or its depth, an .exr or .npy file in metres, or a picture with
+            the metres of a level behind its name, ``depth.png#0.001``.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of

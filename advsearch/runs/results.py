@@ -192,6 +192,10 @@ class TwinAgreement(Fields):
     margins: Estimate | None = Field(
         description="Spearman's correlation of the margins; null where it has none"
     )
+    boxes: Estimate | None = optional_field(
+        "rate of boxes of the right class that overlap by half in photograph and twin, "
+        "of pairs that have one in both; absent without"
+    )
     photo_wrong: Estimate = Field(description="rate of wrong photographs")
     wrong_where_twin_wrong: Estimate | None = Field(
         description="rate of wrong photographs where the twin is wrong; null where "

@@ -42,6 +42,7 @@ IMAGE_INPUTS = frozenset(
     {
         "backdrop.blur",
         "backdrop.color",
+        "backdrop.depth",
         "backdrop.front",
         "backdrop.noise",
         "backdrop.plane",

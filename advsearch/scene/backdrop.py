@@ -11,6 +11,10 @@ albedo times what arrives, so that the ratio is right whatever the albedo of the
 at that pixel is, and it never goes below zero; a difference is right only where the
 albedo of the plane is that of the ground, and makes dark ground negative.
 
+A ground that shines is not covered: its coat reflects without the ground's color, so
+that a ratio tints the reflection and shows the ground's texture in it. It would take a
+second change that is added, and light that is sampled by the coat.
+
 The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
 area of each pixel of the film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT`
 in pixels from its top left corner; the intrinsics of the camera follow.
@@ -22,6 +26,7 @@ import hashlib
 import math
 import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +50,7 @@ from advsearch.scene.camera_model import (
     make_pinhole,
 )
 from advsearch.scene.color import CHANNELS, linear_to_srgb, srgb_to_linear
+from advsearch.scene.depth_pictures import check_no_depth, is_depth, read_depth
 from advsearch.scene.geometry import camera_to_world, object_to_world, project_points
 from advsearch.scene.image_quality import make_noise, measure_blur, measure_noise
 from advsearch.scene.importing.pictures import average_area
@@ -56,6 +62,7 @@ from advsearch.trust.stored_files import (
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
+    from advsearch.scene.formation import Surfaces
 
 MAX_ELEVATION = 89.0  # degrees, of a camera that orbits the object
 MIN_SIDE = 8  # pixels of a photograph, or of what is cut out of it
@@ -68,6 +75,11 @@ PHOTOGRAPH_CAMERA = "photograph"  # name of the pinhole of a part of a photograp
 PLANE_SETTINGS = frozenset(
     ("ground.size", "ground.level", *(f"ground.{channel}" for channel in CHANNELS))
 )
+# points at which depth is looked up in a pixel, along each side
+MIN_DEPTH_POINTS = 2
+MAX_DEPTH_POINTS = 4
+# fraction of a depth: what is nearer by less does not hide, as where things touch
+DEPTH_TOLERANCE = 0.01
 MIN_BLUR = 0.15  # pixels; less is not seen
 PLANE_SIZE = 12.0  # side of the plane, object sizes
 # mean reflectance of what photographs show, that of the grey card to which cameras
@@ -78,6 +90,7 @@ ALBEDO_RANGE = (0.05, 0.8)  # of the plane
 CONTACT_RING = (0.5, 1.5)
 N_CONTACT_POINTS = 400
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue (BT.709)
+GROUND = "ground"  # name of the plane that takes the shadow, among surfaces
 LIGHT_SUFFIXES = (".hdr", ".exr")
 CROP = re.compile(r"(?P<path>.+)#(?P<numbers>\d+,\d+,\d+,\d+)")
 
@@ -93,7 +106,9 @@ class BackdropPhotograph:
     # (H, W) levels: 255 where the photograph shows what is before the object; None if
     # nothing is
     front: npt.NDArray[np.uint8] | None = None
-    front_spec: str = ""  # how that was asked for
+    # (H, W) metres along the camera's axis, infinite where unknown; None if no depth is
+    depth: Float32Array | None = None
+    front_spec: str = ""  # how one of them was asked for
 
     @property
     def full_size(self) -> tuple[int, int]:
@@ -127,6 +142,25 @@ class BackdropPhotograph:
             return None
         fractions = self.front[..., None].astype(np.float32) / np.float32(255.0)
         return self._resample_part(fractions, resolution)
+
+    def resample_depth(self, resolution: tuple[int, int]) -> Tensor | None:
+        """Return the depth (H S, W S) float32 in metres at S x S points of each pixel.
+
+        They are so many that the edges in the depth are followed, at most
+        `MAX_DEPTH_POINTS` along each side. None if there is no depth.
+        """
+        if self.depth is None:
+            return None
+        left, top, width, height = self.crop
+        part = self.depth[top : top + height, left : left + width]
+        needed = math.ceil(max(height / resolution[0], width / resolution[1]))
+        n_points = min(max(needed, MIN_DEPTH_POINTS), MAX_DEPTH_POINTS)
+        picks = [
+            ((np.arange(n_points * n_pixels) + 0.5) * side / (n_points * n_pixels))
+            for n_pixels, side in zip(resolution, part.shape, strict=True)
+        ]
+        rows, columns = (pick.astype(np.intp) for pick in picks)
+        return torch.from_numpy(part[np.ix_(rows, columns)])
 
     def make_noise(self, resolution: tuple[int, int], sigma: float | None) -> Tensor:
         """Return noise (H, W, 3) float32, display-referred, as the photograph has.
@@ -214,15 +248,22 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     return make_backdrop(levels, text, crop)
 
 
+def find_photograph_file(photograph: object) -> Path | None:
+    """Return the file of a photograph without the part to use; None if it has none."""
+    if not isinstance(photograph, (str, Path)):
+        return None
+    part = CROP.fullmatch(str(photograph))
+    return Path(part["path"] if part else photograph)
+
+
 def find_photographed_light(photograph: object) -> Path | None:
     """Return the environment map that lies beside a photograph, or None.
 
     It is called as the photograph, with the suffix .hdr or .exr.
     """
-    if not isinstance(photograph, (str, Path)):
+    path = find_photograph_file(photograph)
+    if path is None:
         return None
-    part = CROP.fullmatch(str(photograph))
-    path = Path(part["path"] if part else photograph)
     for suffix in LIGHT_SUFFIXES:
         light = path.with_suffix(suffix)
         if light != path and light.is_file():
@@ -233,29 +274,44 @@ def find_photographed_light(photograph: object) -> Path | None:
 
 
 def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhotograph:
-    """Return a photograph with the mask of what is before the object.
+    """Return a photograph with what is before the object, by a mask or by depth.
 
     Args:
         photograph: the photograph.
         spec: a picture file of the full photograph's size, white where something is
-            before the object, black elsewhere.
+            before the object, black elsewhere; or one of depth, as `read_depth` takes
+            it.
 
     Raises:
         FileFormatError: the file cannot be used.
         InputError: it has another size.
     """
+    if is_depth(spec):
+        depth = read_depth(spec)
+        _check_front_size(photograph, depth.shape, "depths", spec)
+        return replace(photograph, depth=depth, front_spec=str(spec))
     path = Path(spec)
     with track_opened_files(path), open_image(path, LARGEST_FILE) as image:
+        check_no_depth(image.mode, path)
         levels = _decode_photograph(image, path)
-    if levels.shape != photograph.levels.shape:
-        height, width = photograph.full_size
-        raise InputError(
-            f"occluder: expected a mask of {width} x {height} pixels (width x height), "
-            f"as the photograph has, got {levels.shape[1]} x {levels.shape[0]} in "
-            f"{spec}"
-        )
+    _check_front_size(photograph, levels.shape, "a mask", spec)
     front = np.ascontiguousarray(levels[..., 1])
     return replace(photograph, front=front, front_spec=str(spec))
+
+
+def _check_front_size(
+    photograph: BackdropPhotograph,
+    shape: tuple[int, ...],
+    what: str,
+    spec: str | Path,
+) -> None:
+    """Raise InputError if a mask or depth (H, W, ...) has not its photograph's size."""
+    height, width = photograph.full_size
+    if shape[:2] != (height, width):
+        raise InputError(
+            f"occluder: expected {what} of {width} x {height} pixels (width x height), "
+            f"as the photograph has, got {shape[1]} x {shape[0]} in {spec}"
+        )
 
 
 def make_image_inputs(
@@ -268,8 +324,12 @@ def make_image_inputs(
     Returns:
         ``backdrop.color`` (H, W, 3) the photograph; and if there is any
         ``backdrop.plane`` (3,), see `compute_plane_radiance`; ``backdrop.front`` (H, W,
-        1) what is before the object; ``backdrop.noise`` (H, W, 3) display-referred
-        noise, and ``backdrop.blur`` (1,) in pixels, of what is rendered.
+        1) what is before the object; ``backdrop.depth`` (H S, W S) of the photograph,
+        object sizes; ``backdrop.noise`` (H, W, 3) display-referred noise, and
+        ``backdrop.blur`` (1,) in pixels, of what is rendered.
+
+    Raises:
+        InputError: there is depth, and the object's size in metres is not known.
     """
     photograph = description.backdrop_photograph
     if photograph is None:
@@ -279,14 +339,88 @@ def make_image_inputs(
     if blur is None:
         blur = measure_blur((color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32))
     noise = photograph.make_noise(resolution, description.values.get("backdrop.noise"))
+    depth = photograph.resample_depth(resolution)
+    if depth is not None and description.object.size_in_metres is None:
+        raise InputError(
+            f"occluder: {photograph.front_spec} is in metres, and how large "
+            f"{description.object.name} is is not known; give its longest side in "
+            "metres, such as `size=0.1`"
+        )
     inputs: dict[str, Tensor | None] = {
         "backdrop.color": color,
         "backdrop.plane": compute_plane_radiance(description),
         "backdrop.front": photograph.resample_front(resolution),
+        "backdrop.depth": None if depth is None else depth / description.size_in_metres,
         "backdrop.noise": noise if bool(noise.any()) else None,
         "backdrop.blur": torch.tensor([blur]) if blur >= MIN_BLUR else None,
     }
     return {name: value for name, value in inputs.items() if value is not None}
+
+
+def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> Tensor:
+    """Lay rendered radiance over a photograph.
+
+    The photograph shows where the coverage is below 1, darker or brighter by what the
+    object takes from the plane's light or adds to it, and where something is before
+    the object or the plane.
+
+    Args:
+        rendered: (H, W, 4 or 7), the object's radiance times its coverage, its
+            coverage, and the change of the plane's radiance.
+        behind: (H, W, 3) radiance of the photograph.
+        inputs: as by `make_image_inputs`; the last channel of ``backdrop.front`` is
+            what is before the plane.
+
+    Returns:
+        Radiance (H, W, 3).
+    """
+    radiance = rendered[..., :3]
+    coverage = rendered[..., 3:4]
+    front = inputs.get("backdrop.front")
+    if front is not None:
+        visible = 1.0 - front[..., :1]
+        radiance = visible * radiance
+        coverage = visible * coverage
+    shade = (1.0 - coverage).clamp(0.0, 1.0)
+    if "backdrop.plane" in inputs:
+        change = rendered[..., 4:] / inputs["backdrop.plane"]
+        if front is not None:
+            change = (1.0 - front[..., -1:]) * change
+        shade = (shade + change).clamp_min(0.0)
+    return radiance + shade * behind
+
+
+def compute_front(
+    surfaces: Surfaces, photograph_depth: Tensor, n_points: int, radius: int
+) -> Tensor:
+    """Return the fractions of object and ground that the photograph's depth hides.
+
+    A point is hidden where the photograph is nearer by more than `DEPTH_TOLERANCE`. A
+    pixel with no point of the object takes the fraction around it, for the faint edges
+    of a smooth or blurred outline; so does one with no point of the ground.
+
+    Args:
+        surfaces: what is seen first at n x n points of each pixel.
+        photograph_depth: (H n, W n) at the same points, in the unit of `surfaces`.
+        n_points: n.
+        radius: of the surroundings, pixels.
+
+    Returns:
+        (H, W, 2) float32 in [0, 1].
+    """
+    is_hidden = photograph_depth < surfaces.z_depth * (1.0 - DEPTH_TOLERANCE)
+    is_ground = torch.zeros_like(is_hidden)
+    if GROUND in surfaces.names:
+        is_ground = surfaces.visible_mask(GROUND)
+    is_object = surfaces.z_depth.isfinite() & ~is_ground
+    masks = torch.stack([is_object, is_ground])
+    pool = torch.nn.functional.avg_pool2d
+    # (2, 2, H, W): of all points and of the hidden ones; of the object and the ground
+    fractions = pool(torch.stack([masks, masks & is_hidden]).float(), n_points)
+    around = pool(fractions, 2 * radius + 1, stride=1, padding=radius)
+    covered, hidden = torch.where(fractions[0] > 0.0, fractions, around)
+    front: Tensor = (hidden / covered.clamp_min(1e-12)).movedim(0, -1)
+    return front
 
 
 def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:

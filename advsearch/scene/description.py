@@ -87,7 +87,7 @@ from advsearch.scene.parts import (
 from advsearch.scene.photograph_files import PhotographFolder
 from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
-from advsearch.scene.rig import Mount, read_rig
+from advsearch.scene.rig import AXES, Mount, read_photograph_camera, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import (
     ThingPart,
@@ -211,7 +211,7 @@ class SceneDescription:
             photograph: a picture file; with the part to use behind its name,
                 ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels from the top left corner.
             occluder: a mask of the photograph's size, white where it shows what is
-                before the object.
+                before the object; or its depth (`advsearch.scene.depth_pictures`).
 
         Raises:
             FileFormatError: the file can not be used.
@@ -286,6 +286,38 @@ class SceneDescription:
             values={**self.values, **measured},
             requested=self.requested | set(measured),
         )
+
+    def with_photograph_camera(self, spec: str, photograph: Path) -> SceneDescription:
+        """Return the scene as the camera of one of many photographs sees it.
+
+        The world of the camera file, with z up and in metres, is that of the scene: the
+        object stands at its origin until its pose is set.
+
+        Args:
+            spec: a camera file with the pose of each photograph, see
+                `advsearch.scene.rig.read_photograph_camera`.
+            photograph: the file of the photograph.
+
+        Raises:
+            FileFormatError: the file cannot be used, or does not name the photograph.
+            InputError: the size of the object is not known; or a setting of the camera
+                around the object was given.
+        """
+        if self.object.size_in_metres is None:
+            raise InputError(
+                f"`camera={spec}` is in metres, and how large {self.object.name} is is "
+                "not known; give its longest side in metres, such as `size=0.1`"
+            )
+        with track_opened_files(photograph):
+            pose, model = read_photograph_camera(spec, photograph)
+        to_world = pose @ AXES
+        to_world[:3, 3] /= self.object.size_in_metres
+        model.check_no_fov(self.requested)
+        tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
+        fov = 2.0 * math.degrees(math.atan(max(tangents)))
+        cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}
+        scene = replace(self, cameras=cameras).with_camera(spec)
+        return replace(scene, camera_model=replace(model, name=spec))
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:

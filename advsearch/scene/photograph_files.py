@@ -18,8 +18,9 @@ import numpy as np
 from advsearch.errors import FileFormatError, InputError
 from advsearch.pictures import open_image
 from advsearch.scene.assets import Float64Array
-from advsearch.scene.backdrop import CROP, compute_view_settings
+from advsearch.scene.backdrop import CROP, compute_view_settings, find_photograph_file
 from advsearch.scene.camera_files import VIEW_KEYS, read_camera_entries
+from advsearch.scene.rig import has_photographs
 from advsearch.scene.settings import resolve_settings
 from advsearch.trust.named_files import is_inside
 from advsearch.trust.stored_files import (
@@ -345,7 +346,10 @@ def put_into_photograph(
         requested=description.requested | fixed,
     )
     camera = camera or view.camera
-    if camera is not None:
+    photograph = find_photograph_file(view.spec)
+    if camera is not None and photograph is not None and has_photographs(camera):
+        scene = scene.with_photograph_camera(camera, photograph)
+    elif camera is not None:
         scene = scene.with_camera(camera)
     scene = scene.with_backdrop(view.spec, occluder or view.occluder)
     if view.object_to_camera is None:

@@ -30,6 +30,7 @@ from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.pictures import encode_levels
 from advsearch.scene.assembly import IMAGE_INPUTS, Motion, write_central_differences
+from advsearch.scene.backdrop import compose, compute_front
 from advsearch.scene.color import to_uint8
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import ImageFormation, InputMapping, Moment, Surfaces
@@ -386,7 +387,9 @@ class Renderer:
         u, _ = self._check_arguments(u, 1)
         with torch.no_grad():
             rig = self.scene.definition[0].rig
-            inputs = self._camera_inputs(rig[camera] if rig else None, u)
+            inputs = self.find_front(
+                self._camera_inputs(rig[camera] if rig else None, u)
+            )
             surfaces = self.scene.find_surfaces(
                 _select_scene_inputs(inputs), subdivision
             )
@@ -612,52 +615,47 @@ class Renderer:
             u: configuration, for what controls do to the finished image.
             display: if False, return the radiance that is to be displayed.
         """
+        inputs = self.find_front(inputs)
         exposure = inputs.get("camera.exposure")
-        backdrop = inputs.get("backdrop.color")
         if "backdrop.blur" in inputs:
             rendered = blur_image(rendered, float(inputs["backdrop.blur"]))
         radiance = rendered[..., :3]
         if exposure is not None:
             radiance = radiance * torch.exp2(exposure)
-        if backdrop is not None:
-            radiance = self._compose(radiance, rendered, inputs)
+        if "backdrop.color" in inputs:
+            # the photograph is display-linear: divided by the gain it is radiance
+            behind = inputs["backdrop.color"] / self.formation.gain
+            layers = torch.cat([radiance, rendered[..., 3:]], dim=-1)
+            radiance = compose(layers, behind, inputs)
         if not display:
             return radiance
         image = self.formation.display(radiance)
         if "backdrop.noise" in inputs:
             coverage = rendered[..., 3:4].detach()
             if "backdrop.front" in inputs:
-                coverage = coverage * (1.0 - inputs["backdrop.front"])
+                coverage = coverage * (1.0 - inputs["backdrop.front"][..., :1])
             image = (image + coverage * inputs["backdrop.noise"]).clamp(0.0, 1.0)
         return self.space.apply_to_image(u, image)
 
-    def _compose(
-        self, radiance: Tensor, rendered: Tensor, inputs: Mapping[str, Tensor]
-    ) -> Tensor:
-        """Return radiance (H, W, 3) over its backdrop, see `advsearch.scene.backdrop`.
+    @torch.no_grad()
+    def find_front(self, inputs: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        """Return inputs in which a photograph's depth became what is before the object.
 
-        The backdrop shows where the coverage is below 1, darker or brighter by what the
-        object takes from the plane's light or adds to it; then what is before the
-        object is laid over both.
-
-        Args:
-            radiance: (H, W, 3) of the object, already times its coverage.
-            rendered: (H, W, 4 or 7): its channel 3 is the coverage, those from 4 on are
-                the change of the plane's radiance.
-            inputs: inputs of the scene.
+        ``backdrop.front`` (H, W, 2) takes the place of ``backdrop.depth``; inputs
+        without depth are returned as they are. It has no derivative, as coverage.
         """
-        # the photograph is display-linear: divided by the gain it is radiance
-        behind = inputs["backdrop.color"] / self.formation.gain
-        shade = (1.0 - rendered[..., 3:4]).clamp(0.0, 1.0)
-        if "backdrop.plane" in inputs:
-            change = rendered[..., 4:] / inputs["backdrop.plane"]
-            shade = (shade + change).clamp_min(0.0)
-        composed = radiance + shade * behind
-        if "backdrop.front" not in inputs:
-            return composed
-        return torch.lerp(
-            composed, behind.expand_as(composed), inputs["backdrop.front"]
+        if "backdrop.depth" not in inputs:
+            return inputs
+        front_inputs = dict(inputs)
+        depth = front_inputs.pop("backdrop.depth")
+        n_points = depth.shape[0] // self.formation.resolution[0]
+        surfaces = self.scene.find_surfaces(_select_scene_inputs(inputs), n_points)
+        blur = float(inputs["backdrop.blur"]) if "backdrop.blur" in inputs else 0.0
+        radius = 1 + math.ceil(3.0 * blur)
+        front_inputs["backdrop.front"] = compute_front(
+            surfaces, depth, n_points, radius
         )
+        return front_inputs
 
     def render_radiance(
         self,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -154,6 +154,99 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
     return mounts
 
 
+def has_photographs(spec: str) -> bool:
+    """Return whether a camera file states where each of its photographs was taken.
+
+    It is COLMAP's images.txt, or a transforms.json; `spec` names none of its cameras.
+    """
+    if Path(spec).name == COLMAP_IMAGES:
+        return True
+    if Path(spec).suffix.lower() != ".json":
+        return False
+    try:
+        data = parse_json(read_text(Path(spec), "a camera file", MAX_JSON_SIZE))
+    except (OSError, ValueError):
+        return False  # `read_camera` reports what is wrong with it
+    return isinstance(data, dict) and "frames" in data
+
+
+def read_photograph_camera(
+    path: str, photograph: Path
+) -> tuple[Float64Array, CameraModel]:
+    """Return pose and model of the camera that took a photograph, by its file name.
+
+    Where files of several folders have that name, the folders decide.
+
+    Args:
+        path: COLMAP's images.txt with the cameras.txt beside it, or a transforms.json.
+        photograph: the file.
+
+    Returns:
+        The pose (4, 4) leads from the camera's axes (x to the right, y down, z ahead)
+        to the file's world.
+
+    Raises:
+        FileFormatError: the file cannot be used, or names the photograph never or
+            several times.
+    """
+    if Path(path).name == COLMAP_IMAGES:
+        words_by_id = _parse_images(path)
+        files = {name: words[-1] for name, words in words_by_id.items()}
+        name = _find_photograph(path, files, photograph)
+        words = words_by_id[name]
+        pose = _parse_image(f"{path}: image {name[:40]}", words)
+        return pose, _read_image_model(path, words)
+    data = _parse_transforms(path)
+    files = {
+        str(index): str(frame.get("file_path", ""))
+        for index, frame in enumerate(data["frames"])
+    }
+    name = _find_photograph(path, files, photograph)
+    return _read_frame_pose(path, data, name), read_camera(f"{path}#{name}")
+
+
+def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> str:
+    """Return the name of the entry whose file is a photograph.
+
+    Args:
+        path: of the camera file, for messages.
+        files: of the entries, by name.
+        photograph: the file.
+
+    Raises:
+        FileFormatError: no entry fits, or several do equally well.
+    """
+    counts = {
+        name: _count_shared_parts(file, photograph) for name, file in files.items()
+    }
+    largest = max(counts.values(), default=0)
+    names = [name for name, count in counts.items() if count == largest > 0]
+    if len(names) == 1:
+        return names[0]
+    examples = ", ".join(PurePosixPath(file).name[:40] for file in files.values())
+    raise FileFormatError(
+        f"{path}: expected one camera of the photograph {photograph.name[:80]}, got "
+        f"{len(names) or 'none'}; its photographs are {examples[:120]}"
+    )
+
+
+def _count_shared_parts(file: str, photograph: Path) -> int:
+    """Return how many parts two paths share, counted from the last one.
+
+    A file without a suffix, as Instant NGP has it, fits any.
+    """
+    path = PurePosixPath(file.replace("\\", "/"))
+    full = photograph.absolute()
+    if not path.suffix:
+        full = full.with_suffix("")
+    count = 0
+    for part, other in zip(reversed(path.parts), reversed(full.parts), strict=False):
+        if part != other:
+            break
+        count += 1
+    return count
+
+
 def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
     """Raise FileFormatError unless cameras of a rig fit together.
 
@@ -281,9 +374,20 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
 def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
     """Return frames of nerfstudio's transforms.json as cameras.
 
-    `frame_names` are their indices, with commas. Positions are divided by the scale
-    that the file has applied.
+    `frame_names` are their indices, with commas.
     """
+    data = _parse_transforms(path)
+    frames = data["frames"]
+    names = _parse_names(
+        path, frame_names, [str(index) for index in range(len(frames))]
+    )
+    poses = [_read_frame_pose(path, data, name) for name in names]
+    selected = [frames[int(name)] for name in names]
+    return _make_mounts(path, names, poses, _read_frame_models(path, names, selected))
+
+
+def _parse_transforms(path: str) -> dict[str, Any]:
+    """Parse a transforms.json, whose `frames` are a list of mappings."""
     text = read_existing_text(path, "a camera file", MAX_JSON_SIZE)
     data = parse_text(path, text, "JSON", parse_json)
     frames = data.get("frames") if isinstance(data, dict) else None
@@ -294,20 +398,27 @@ def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
             f"{path}: expected `frames`, a list with a camera each, "
             "as nerfstudio writes it"
         )
-    names = _parse_names(
-        path, frame_names, [str(index) for index in range(len(frames))]
+    return dict(data)
+
+
+def _read_frame_pose(path: str, data: Mapping[str, Any], name: str) -> Float64Array:
+    """Return the pose (4, 4), from its camera to the world, of a frame.
+
+    The camera's axes are x to the right, y down, z ahead. Positions are divided by the
+    scale that the file has applied.
+
+    Args:
+        path: of the transforms.json.
+        data: what is in it.
+        name: index of the frame.
+    """
+    frame = data["frames"][int(name)]
+    matrix = _parse_rigid(
+        f"{path}: frame {name}", "transform_matrix", frame.get("transform_matrix")
     )
-    selected = [frames[int(name)] for name in names]
-    scale = _read_applied_scale(path, data)
-    poses = list[Float64Array]()
-    for name, frame in zip(names, selected, strict=True):
-        matrix = _parse_rigid(
-            f"{path}: frame {name}", "transform_matrix", frame.get("transform_matrix")
-        )
-        pose = matrix @ FROM_OPENGL
-        pose[:3, 3] /= scale
-        poses.append(pose)
-    return _make_mounts(path, names, poses, _read_frame_models(path, names, selected))
+    pose = matrix @ FROM_OPENGL
+    pose[:3, 3] /= _read_applied_scale(path, data)
+    return np.asarray(pose)
 
 
 def _read_frame_models(
@@ -369,10 +480,29 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
 
 
 def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
-    """Return the images of COLMAP's images.txt as cameras.
+    """Return the images of COLMAP's images.txt as cameras."""
+    words_by_id = _parse_images(path)
+    names = _parse_names(path, image_ids or ",".join(words_by_id), list(words_by_id))
+    poses = [
+        _parse_image(f"{path}: image {name[:40]}", words_by_id[name]) for name in names
+    ]
+    models = [_read_image_model(path, words_by_id[name]) for name in names]
+    return _make_mounts(path, names, poses, models)
+
+
+def _read_image_model(path: str, words: Sequence[str]) -> CameraModel:
+    """Return the model of an image of COLMAP, from the cameras.txt beside it.
+
+    `words` are the image's line, of 10 words, of which the ninth is the camera's id.
+    """
+    return read_camera(f"{Path(path).with_name('cameras.txt')}#{words[8]}")
+
+
+def _parse_images(path: str) -> dict[str, list[str]]:
+    """Return the words of the lines of COLMAP's images.txt by the image's id.
 
     Every second line has a rotation (quaternion, real part first) and a shift from the
-    world to the camera, whose model is in the cameras.txt beside it.
+    world to the camera, the id of the camera, and the file.
     """
     text = read_existing_text(path, "COLMAP's images", MAX_IMAGES_SIZE)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
@@ -388,16 +518,7 @@ def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
             f"{path}: expected each image once, got one with the "
             "same number twice; correct the file"
         )
-    names = _parse_names(path, image_ids or ",".join(words_by_id), list(words_by_id))
-    poses = list[Float64Array]()
-    models = list[CameraModel]()
-    cameras_path = Path(path).with_name("cameras.txt")
-    for name in names:
-        words = words_by_id[name]
-        poses.append(_parse_image(f"{path}: image {name[:40]}", words))
-        camera_id = words[8]
-        models.append(read_camera(f"{cameras_path}#{camera_id}"))
-    return _make_mounts(path, names, poses, models)
+    return words_by_id
 
 
 def _parse_image(where: str, words: Sequence[str]) -> Float64Array:

@@ -12,15 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+import yaml
+from PIL import Image, ImageFilter
 from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import InputError
+from advsearch.questions.report.evidence import collect_evidence
+from advsearch.questions.test.settings import SuiteConfig
 from advsearch.questions.twins import counting, rendering
 from advsearch.questions.twins.carry_out import parse_frames
 from advsearch.questions.twins.listing import Pinhole, read_photographs
 from advsearch.questions.twins.result import COMPOSED, HOLE, TwinPrediction, TwinRow, TwinsResult
+from advsearch.registry import get_experiment
 from advsearch.report import wording
 from advsearch.report.views import get_view, list_remarks
 from advsearch.runs import twins as runs_twins
@@ -124,17 +128,59 @@ def test_a_window_is_around_the_silhouette_and_in_the_photograph() -> None:
     assert rendering.choose_window(corners / 40.0, (100, 100), (32, 32), 0.0) is None
 
 
-def test_a_render_is_laid_over_a_photograph_in_linear_light() -> None:
-    photograph = torch.full((1, 2, 3), 0.5)
-    radiance = torch.tensor([[[0.5, 0.5, 0.5], [0.0, 0.0, 0.0]]])
-    alpha = torch.tensor([[0.5, 0.0]])
-    composed = rendering.compose(photograph, radiance, alpha, alpha)
-    linear = ((0.5 + 0.055) / 1.055) ** 2.4
-    expected = 1.055 * (0.5 + 0.5 * linear) ** (1 / 2.4) - 0.055
-    assert composed[0, 0].tolist() == pytest.approx([expected] * 3, abs=1e-4)
-    assert composed[0, 1].tolist() == pytest.approx([0.5] * 3, abs=1e-4)
-    hidden = rendering.compose(photograph, radiance, alpha, torch.zeros(1, 2))
-    assert hidden[0, 0].tolist() == pytest.approx([0.5] * 3, abs=1e-4)
+@pytest.mark.medium
+def test_a_twin_is_the_photograph_where_the_object_is_not_seen(tmp_path: Path) -> None:
+    """Beside the silhouette, and where the mask of what is visible ends; noise and blur are left out on request."""
+    folder = copy_photographs(tmp_path)
+    visible = folder / "test" / "000001" / "mask_visib"
+    shutil.copytree(SCENE / "mask", visible)
+    levels = np.asarray(Image.open(SCENE / "mask" / "000000_000000.png")).copy()
+    rows, columns = np.nonzero(levels)
+    middle = int(columns.mean())
+    levels[:, middle:] = 0
+    Image.fromarray(levels).save(visible / "000000_000000.png")
+    item = read_photographs(folder).objects[0]
+    window = rendering.PhotoWindow(0, 0, 128, 96)
+    photograph = rendering.load_photograph(item.photograph)
+    asset = rendering.load_object(item.mesh, item.unit)
+    renderer = rendering.LayerRenderer(asset, "mm", "studio", (96, 128), spp=4, seed=0, is_matched=False)
+    layer = renderer.render(item, photograph, window, (32, 32))
+    composed = np.round(layer.composed.numpy() * 255.0).astype(int)
+    is_other = np.abs(composed - photograph.levels).max(axis=2) > 0
+    full = np.asarray(Image.open(SCENE / "mask" / "000000_000000.png")) > 0
+    near = np.asarray(Image.fromarray(full).filter(ImageFilter.MaxFilter(5)))
+    assert not is_other[~near].any() and not is_other[:, middle + 1 :].any()
+    assert is_other[full & (np.arange(128) < middle - 1)].mean() > 0.9
+    assert layer.alpha[rows, columns].mean() > 0.9, "whether it is hidden or not"
+    twin = rendering.make_twin(item, photograph, window, layer, {}, (96, 128))
+    assert np.abs(twin.images[HOLE].numpy() * 255.0 - photograph.levels)[:, middle + 2 :].max() < 1e-3
+    assert twin.texture is not None and twin.texture > 0.5
+
+
+def test_boxes_of_a_detector_agree_where_they_overlap_by_half() -> None:
+    found = {"found": [{"label": "dog", "box": [0, 0, 9, 9]}, {"label": "cup", "box": [0, 0, 4, 2]}]}
+    shifted = {"found": [{"label": "cup", "box": [1, 0, 5, 2]}, {"label": "cup", "box": [0, 0, 4, 2]}]}
+    far = {"found": [{"label": "cup", "box": [3, 0, 7, 2]}]}
+    rows = []
+    for number, payload in enumerate((shifted, far, {"found": []}, None)):
+        row = make_row(f"{number}", True, True)
+        predictions = [
+            prediction.model_copy(update={"payload": value})
+            for prediction, value in zip(row.predictions, (found, payload), strict=True)
+        ]
+        rows.append(row.model_copy(update={"predictions": predictions}))
+    # overlaps of 6 of 10, and of 2 of 14
+    assert counting.compute_box_iou((0, 0, 4, 2), (1, 0, 4, 2)) == pytest.approx(0.6)
+    rate = counting.estimate_box_agreement(rows, "room")
+    assert rate is not None and rate.value == pytest.approx(0.5)
+    assert counting.estimate_box_agreement(rows[2:], "room") is None
+
+
+def test_the_texture_is_compared_without_regard_to_brightness() -> None:
+    pixels = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    assert rendering.correlate_luminance(pixels, 0.3 * pixels + 0.1) == pytest.approx(1.0, abs=1e-5)
+    assert rendering.correlate_luminance(pixels, 1.0 - pixels) == pytest.approx(-1.0, abs=1e-5)
+    assert rendering.correlate_luminance(pixels, torch.full((50, 3), 0.5)) is None
 
 
 def test_frames_are_chosen_by_names_and_ranges() -> None:
@@ -162,6 +208,42 @@ def test_an_attack_states_what_the_run_of_twins_measured(compared: TwinsResult, 
     summary = advsearch.attack("mug", other, environment="studio", **settings).summary
     assert summary.twins is not None and summary.twins.match is TwinMatch.OTHER_MODEL
     assert any("was not measured" in text for text in list_remarks(summary, get_view(summary)))
+
+
+@pytest.mark.medium
+def test_sweep_gate_and_evidence_state_what_the_run_of_twins_measured(tmp_path: Path) -> None:
+    """Of one run of two models: the row of the model and its environment, and how it is put into words."""
+    model = "small_models:easy"
+    twins = advsearch.twins(
+        PHOTOGRAPHS / "photographs.csv", model=f"small_models:blind,{model}", environment="studio", spp=1, pictures=24,
+        names={"obj_000001": "mug", "obj_000002": "vase"}, run=str(tmp_path / "twins"),
+    )  # fmt: skip
+    blind, row = (row for row in twins.table if row.surroundings == "studio" and not row.object and not row.condition)
+    # it says the same to all, and half of the photographs are of a mug
+    assert (blind.model, blind.agreement.value, blind.wrong_photos, row.model) == ("blind", 1.0, 6, "easy")
+    scene: dict[str, Any] = {"environment": "studio", "resolution": 16, "denoise": "none"}
+    small: dict[str, Any] = {"trials": 0, "spp": 1, "keep_pictures": "none"}
+    run = str(tmp_path / "sweep")
+    swept = advsearch.sweep("mug", model, {"camera.azimuth": [20.0, 140.0]}, twins=twins.run, run=run, **scene, **small)
+    assert swept.summary.twins is not None and swept.summary.twins.row == row
+    claim = {"claim": "right", "at_least": 0.5, "pictures": 8, "settings": {"controls": "camera", "verify_spp": 1}}
+    suite = tmp_path / "suite.yaml"
+    suite.write_text(
+        yaml.safe_dump({"settings": {**scene, "object": "mug", "model": model}, "claims": {"front": claim}})
+    )
+    gate = get_experiment("test").run(SuiteConfig(suite=str(suite), twins=twins.run, run=str(tmp_path / "gate")))
+    assert gate.twins is not None and gate.twins.row == row
+    (remark,) = [text for text in list_remarks(gate, get_view(gate)) if text.startswith("Photographs (")]
+    pairs = [pair.row for pair in twins.pairs if pair.row.model == "easy"]
+    n_agreeing = sum(pair.photo.right == pair.twin("studio").right for pair in pairs)
+    assert len(pairs) == 12 and row.agreement.value == pytest.approx(n_agreeing / 12)
+    assert f"in {wording.format_estimate(row.agreement)} of 12 pairs of 12 frames" in remark
+    evidence, _ = collect_evidence([run])
+    assert evidence.runs[0].twins is not None and evidence.runs[0].twins.row == row
+    run = str(tmp_path / "unnamed")
+    assert advsearch.sweep("mug", model, {"camera.azimuth": [20.0]}, run=run, **scene, **small).summary.twins is None
+    evidence, _ = collect_evidence([run], twins=twins.run)
+    assert evidence.runs[0].twins is not None and evidence.runs[0].twins.row == row
 
 
 def make_agreement(**changed: Any) -> TwinAgreement:
@@ -214,8 +296,8 @@ def make_row(frame: str, photo_right: bool, twin_right: bool) -> TwinRow:
         for name, right in (("photograph", photo_right), ("room", twin_right))
     ]
     return TwinRow(
-        number=0, photograph="", frame=frame, object="cup", label="cup", condition="", window=(0, 0, 1, 1), size=1.0,
-        brightness=0.0, contrast=0.0, visible=None, overlap=None, predictions=predictions,
+        number=0, model="m", photograph="", frame=frame, object="cup", label="cup", condition="", window=(0, 0, 1, 1),
+        size=1.0, brightness=0.0, contrast=0.0, texture=None, visible=None, overlap=None, predictions=predictions,
     )  # fmt: skip
 
 

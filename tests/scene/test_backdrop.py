@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
+import json
+import math
+import shutil
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from PIL import Image
 from scipy import ndimage
 
 import advsearch
-from advsearch.engine.loading import Scene, fit_camera
+from advsearch.engine.loading import Scene, fit_camera, scene_to_settings
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene import assets
 from advsearch.scene.backdrop import (
+    compute_front,
     compute_plane_radiance,
     compute_view_settings,
     make_backdrop,
+    make_image_inputs,
     make_matrix_camera,
     read_backdrop,
 )
+from advsearch.scene.depth_pictures import is_depth, read_depth
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import camera_to_world, project_points
 from advsearch.scene.image_quality import blur_image, measure_blur, measure_noise
@@ -289,6 +297,112 @@ def test_the_object_has_the_noise_and_the_blur_of_the_photograph_and_is_behind_w
     assert steps["blurred"] < 0.6 * steps["plain"]
 
 
+@pytest.mark.medium
+@pytest.mark.parametrize("kind", ["png", "npy"])
+def test_what_is_farther_than_the_depth_of_the_photograph_is_hidden(tmp_path: Path, kind: str) -> None:
+    """A ball is cut by a slanted plane, where rays meet the plane before the ball."""
+    height, width, metres, distance, fov = 48, 64, 0.2, 0.5, 50.0
+    Image.new("RGB", (2 * width, 2 * height), (120, 160, 90)).save(tmp_path / "a.png")
+    focal = 0.5 * 2 * width / np.tan(np.radians(fov) / 2.0)
+    x = (np.arange(2 * width) + 0.5 - width) / focal
+    y = (np.arange(2 * height) + 0.5 - height) / focal
+    # the plane z = distance - radius + 1.5 x, in metres
+    depth = np.tile((distance - metres / 2) / (1.0 - 1.5 * x), (2 * height, 1))
+    depth[:, x > 0.6] = 0.0  # nothing is known there, and nothing hidden
+    if kind == "png":
+        Image.fromarray(np.round(depth / 1e-4).astype(np.uint16)).save(tmp_path / "depth.png")
+        occluder = f"{tmp_path / 'depth.png'}#0.0001"
+    else:
+        np.save(tmp_path / "depth.npy", depth)
+        occluder = str(tmp_path / "depth.npy")
+    settings = {"camera.distance": distance, "camera.elevation": 0.0, "camera.fov": fov, **AS_RENDERED, **NO_SHADOW}
+    scene = advsearch.load_scene("ball", size=metres, backdrop=tmp_path / "a.png", occluder=occluder, settings=settings)
+    render = scene.renderer("texture", resolution=(height, width), denoise="none")
+    # a ray (x, y, 1) t meets the ball where |t (x, y, 1) - (0, 0, distance)| is its radius
+    square = 1.0 + x[None] ** 2 + y[:, None] ** 2
+    root = distance**2 - square * (distance**2 - metres**2 / 4)
+    ball = np.where(root > 0.0, (distance - np.sqrt(np.maximum(root, 0.0))) / square, np.inf)
+    shown = np.isfinite(ball) & ((depth == 0.0) | (ball < depth))
+    fraction = shown.reshape(height, 2, width, 2).mean(axis=(1, 3))
+    found = render.mask(render.start).numpy()
+    sure = (fraction == 0.0) | (fraction == 1.0)
+    assert 200 < shown.sum() / 4 < 0.8 * np.isfinite(ball).sum() / 4
+    assert (found == (fraction == 1.0))[sure].mean() > 0.99
+    picture = render(render.start, 0, 16).detach().numpy() * 255.0
+    is_photograph = np.abs(picture - [120, 160, 90]).max(axis=2) < 0.01
+    assert is_photograph[fraction == 0.0].mean() > 0.98
+    assert is_photograph[fraction == 1.0].mean() < 0.02
+    predicted = LinearRenderer(render, render.start, 0, spp=16)
+    assert np.abs(predicted(render.start).detach().numpy() * 255.0 - [120, 160, 90])[fraction == 0.0].mean() < 0.5
+
+
+def test_a_pixel_between_two_depths_is_hidden_by_its_part() -> None:
+    """Two of four points of the object are hidden, and one of the two of the ground in the next pixel."""
+    infinite = math.inf
+    surfaces = SimpleNamespace(
+        names=("ground", "object"),
+        z_depth=torch.tensor([[2.0, 2.0, 3.0, infinite], [2.0, 2.0, 3.0, infinite]]),
+        visible_mask=lambda name: torch.tensor([[False, False, True, False]] * 2),
+    )
+    depth = torch.tensor([[1.0, infinite, 1.0, 1.0], [1.0, 1.99, 2.98, 1.0]])
+    front = compute_front(surfaces, depth, 2, 1)  # type: ignore[arg-type]
+    # the second pixel has no point of the object, and the first none of the ground
+    assert front[0, :, 0].tolist() == pytest.approx([0.5, 0.5]) and front[0, :, 1].tolist() == pytest.approx([0.5, 0.5])
+
+
+def test_depths_are_metres_in_each_kind_of_file(tmp_path: Path) -> None:
+    expected = np.array([[0.5, 2.0, math.inf], [1.25, 3.0, 4.0]], np.float32)
+    stored = np.where(np.isfinite(expected), expected, 0.0).astype(np.float32)
+    Image.fromarray((stored * 1000.0).astype(np.uint16)).save(tmp_path / "a.png")
+    np.save(tmp_path / "a.npy", np.asfortranarray(expected))
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"Y": stored}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    for name in ("a.png#0.001", "a.npy", "a.exr"):
+        assert is_depth(name)
+        np.testing.assert_allclose(read_depth(tmp_path / name), expected, rtol=1e-6)
+    assert not is_depth("mask.png") and not is_depth("a.png#1,2,3,4")
+
+
+def test_hostile_depths_are_refused(tmp_path: Path) -> None:
+    write_photograph(tmp_path / "a.png", (12, 16))
+    Image.fromarray(np.full((12, 16), 700, np.uint16)).save(tmp_path / "deep.png")
+    np.save(tmp_path / "negative.npy", np.full((12, 16), -1.0))
+    np.save(tmp_path / "objects.npy", np.array([None]), allow_pickle=True)
+    np.save(tmp_path / "small.npy", np.ones((2, 2)))
+
+    def header_of(shape: str) -> bytes:
+        header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".encode()
+        return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+
+    (tmp_path / "huge.npy").write_bytes(header_of("(99999999, 99999999)"))
+    (tmp_path / "minus.npy").write_bytes(header_of("(-2, -3)") + bytes(48))
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "negative.npy").read_bytes()[:-9])
+    (tmp_path / "text.npy").write_text("no array")
+    write_photograph(tmp_path / "coloured.png", (12, 16))
+    messages = {
+        "deep.png": "metres of a level behind its name",
+        "deep.png#1000": "depths of 0 to 100000 metres, got 700000",
+        "negative.npy": "depths of 0 to",
+        "objects.npy": "an array .height, width. of numbers",
+        "minus.npy": "an array .height, width. of numbers",
+        "small.npy": "depths of 16 x 12 pixels",
+        "huge.npy": "at most",
+        "cut.npy": "another length",
+        "text.npy": "corrupt or of another version",
+        "coloured.png#0.001": "one depth for each pixel",
+        "missing.npy": "expected a picture of depth",
+    }
+    for name, message in messages.items():
+        with pytest.raises(InputError, match=message):
+            load_description("mug").with_backdrop(tmp_path / "a.png", tmp_path / name)
+    np.save(tmp_path / "good.npy", np.ones((12, 16)))
+    mesh = Path(__file__).parents[2] / "scenes" / "photographs" / "models" / "obj_000001.ply"
+    scene = load_description(mesh).with_backdrop(tmp_path / "a.png", tmp_path / "good.npy")
+    with pytest.raises(InputError, match=r"how large .* is is not known; give its longest side"):
+        make_image_inputs(scene, (12, 16))
+
+
 def test_what_is_said_of_a_photograph_needs_one_and_a_mask_has_its_size(tmp_path: Path) -> None:
     write_photograph(tmp_path / "a.png")
     write_photograph(tmp_path / "b.png", (12, 16))
@@ -306,6 +420,65 @@ def test_a_photograph_is_averaged_in_linear_light(tmp_path: Path) -> None:
     np.testing.assert_allclose(got, expected, atol=1e-6)
     larger = read_backdrop(tmp_path / "a.png").resample((24, 40)).numpy()
     assert larger.shape == (24, 40, 3) and larger.mean() == pytest.approx(decode(levels).mean(), abs=2e-3)
+
+
+ROTATION = np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8], [-0.8, 0.0, -0.6]])
+"""From the world, z up, to a camera that looks along (-0.8, 0, -0.6): x right, y down, z ahead."""
+SHIFT = np.array([0.1, 0.05, 0.7])
+
+
+def write_poses(folder: Path) -> list[str]:
+    """Write COLMAP's files and a transforms.json, which name two photographs of one name in two folders."""
+    # the rotation as a quaternion, the real part first, found by its trace
+    w = np.sqrt(1.0 + np.trace(ROTATION)) / 2.0
+    skew = (ROTATION - ROTATION.T) / (4.0 * w)
+    quaternion = f"{w} {skew[2, 1]} {skew[0, 2]} {skew[1, 0]}"
+    (folder / "cameras.txt").write_text("4 FULL_OPENCV 64 48 50 60 32 24 0.1 0.02 0.001 0.002 0.03 0.2 0.1 0.05\n")
+    shift = " ".join(map(str, SHIFT))
+    (folder / "images.txt").write_text(f"1 {quaternion} {shift} 4 left/a.png\n\n2 1 0 0 0 0 0 1 4 right/a.png\n\n")
+    pose = np.linalg.inv(np.vstack([np.column_stack([ROTATION, SHIFT]), [0, 0, 0, 1]])) @ np.diag([1, -1, -1, 1])
+    lens = {"camera_model": "OPENCV", "fl_x": 50, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48, "k1": 0.1}
+    frames = [
+        {"file_path": "./left/a", "transform_matrix": pose.tolist()},
+        {"file_path": "./right/a", "transform_matrix": np.eye(4).tolist()},
+    ]
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    return [str(folder / "images.txt"), str(folder / "transforms.json")]
+
+
+def test_a_file_with_poses_has_the_camera_by_the_name_of_the_photograph(tmp_path: Path) -> None:
+    """Points of the world lie where COLMAP's own formula, written out, has them."""
+    (tmp_path / "left").mkdir()
+    write_photograph(tmp_path / "left" / "a.png", (48, 64))
+    shutil.copy(tmp_path / "left" / "a.png", tmp_path / "a.png")
+    points = np.array([[0.0, 0.0, 0.0], [0.05, 0.1, 0.02], [0.0, -0.1, 0.1]])  # metres
+    x, y, z = (points @ ROTATION.T + SHIFT).T
+    x, y, square = x / z, y / z, (x**2 + y**2) / z**2
+    full = (1 + 0.1 * square + 0.02 * square**2 + 0.03 * square**3) / (
+        1 + 0.2 * square + 0.1 * square**2 + 0.05 * square**3
+    )
+    columns = x * full + 2 * 0.001 * x * y + 0.002 * (square + 2 * x**2)
+    rows = y * full + 0.001 * (square + 2 * y**2) + 2 * 0.002 * x * y
+    images, transforms = write_poses(tmp_path)
+    expected = {
+        images: np.column_stack([50 * columns, 60 * rows]),
+        transforms: np.column_stack([50 * x * (1 + 0.1 * square), 60 * y * (1 + 0.1 * square)]),
+    }
+    for camera, pixels in expected.items():
+        scene = advsearch.load_scene("mug", camera=camera, backdrop=f"{tmp_path / 'left' / 'a.png'}#0,0,64,48")
+        description = fit_camera(scene.description, (48, 64))
+        to_world = camera_to_world(description)
+        relative = (points / description.size_in_metres - to_world[:3, 3]) @ to_world[:3, :3]
+        found, visible = project_points(description, {}, torch.from_numpy(relative), (48, 64))
+        assert bool(visible.all())
+        np.testing.assert_allclose(found.numpy(), pixels, atol=1e-9)
+        assert scene_to_settings(scene)["camera"] == camera
+        with pytest.raises(FileFormatError, match=r"one camera of the photograph a\.png, got 2"):
+            advsearch.load_scene("mug", camera=camera, backdrop=tmp_path / "a.png")
+        with pytest.raises(InputError, match="has a place and a field of view of its own"):
+            advsearch.load_scene(
+                "mug", camera=camera, backdrop=tmp_path / "left" / "a.png", settings={"camera.azimuth": 1}
+            )
 
 
 def test_a_part_is_seen_by_the_camera_of_the_photograph(tmp_path: Path) -> None:

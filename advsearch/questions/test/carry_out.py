@@ -340,10 +340,14 @@ class _SuiteRun:
         config = self.tester.config
         return workbench.find_twin_evidence(
             config.twins,
-            model=_join_distinct(claim.model for claim in configs),
+            model=_join_distinct(
+                self.tester.model_names.get(claim.model, claim.model)
+                for claim in configs
+            ),
             task=_join_distinct(claim.task_name for claim in configs),
             object_name=_join_distinct(claim.object for claim in configs),
             environment=_join_distinct(claim.environment_name for claim in configs),
+            in_photograph=all(claim.backdrop is not None for claim in configs),
         )
 
 

@@ -100,12 +100,14 @@ class ClaimTester:
         suite: the suite.
         start_time: when it began, by `time.perf_counter`.
         warnings: gets what a reader has to know.
+        model_names: gets the names that loaded models have, by how they are asked for.
     """
 
     context: RunContext[suites.SuiteConfig]
     suite: suites.Suite
     start_time: float
     warnings: list[str]
+    model_names: dict[str, str] = field(default_factory=dict)
 
     @property
     def run(self) -> RunDirectory:
@@ -585,6 +587,7 @@ class ClaimTester:
         # without the remarks of the task, which the reason has
         remarks = [*parts.model_and_warnings[1]]
         problem = workbench.make_problem(parts, differentiated=False)
+        self.model_names[config.model] = problem.model.name
         self.warnings += [*problem.space.list_notes(parts.scene.description), *remarks]
         return problem
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import gc
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from advsearch.extend import (
     RunContext,
     Task,
     color,
+    settings,
     tasks,
     workbench,
 )
@@ -72,16 +73,8 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
     config = context.config
     context.progress.stage("loading")
     listing = read_photographs(Path(config.photographs).expanduser())
-    task = workbench.make_task(config.task)
-    settings: Any = config
-    by_frame = network if isinstance(network, Mapping) else {}
-    networks = list(dict.fromkeys(by_frame.values())) or [network or config.model]
-    models, warnings = workbench.load_models(networks, task, settings)
-    model_of_frame = {
-        frame: models[networks.index(model)] for frame, model in by_frame.items()
-    }
-    task = task.on(models[0])
-    comparison = Comparison(context, task, models[0], model_of_frame)
+    judges, warnings = load_judges(config, network)
+    comparison = Comparison(context, judges)
     selection = comparison.select(listing.objects)
     if listing.n_missing:
         warnings.append(
@@ -92,39 +85,127 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
     measurements = context.open_measurements()
 
     def make_result(rows: list[TwinRow]) -> TwinsResult:
-        return comparison.make_result(rows, [*warnings, *task.remarks])
+        remarks = [remark for judge in judges for remark in judge.task.remarks]
+        return comparison.make_result(rows, [*warnings, *remarks])
 
     return measurements.collect(
         comparison.compare(selection, measurements), make_result
     )
 
 
-class Comparison:
-    """Compares photographs with their twins for one model and task.
+class ModelJudge:
+    """Judges what one model predicts of photographs and twins.
 
     Args:
-        context: of the run.
-        task: judges the predictions of the model.
+        task: judges the predictions.
         model: predicts.
         model_of_frame: models that predict some frames instead.
+
+    Attributes:
+        task: for this model, and calibrated if it needs that.
+        model: as above.
     """
 
     def __init__(
-        self,
-        context: RunContext[TwinsConfig],
-        task: Task,
-        model: Model,
-        model_of_frame: Mapping[str, Model],
+        self, task: Task, model: Model, model_of_frame: Mapping[str, Model]
+    ) -> None:
+        self.task = task.on(model)
+        self.model = model
+        self._model_of_frame = model_of_frame
+        self._is_calibrated = False
+
+    def predict(
+        self, frame: str, twin: rendering.Twin, facts: tasks.Facts
+    ) -> Iterator[TwinPrediction]:
+        """Yield the predictions about the photograph and its twins."""
+        truth = self.task.truth(facts)
+        self._calibrate_once(twin, truth)
+        model = self._model_of_frame.get(frame, self.model)
+        for name, image in twin.images.items():
+            rounded = color.round_to_8_bit(image.clamp(0.0, 1.0))
+            output = model(rounded)
+            (judgement,) = workbench.judge_images(
+                self.task, output, rounded[None], [truth]
+            )
+            yield TwinPrediction(
+                surroundings=name,
+                label=judgement.prediction.label,
+                probability=judgement.prediction.probability,
+                right=judgement.right,
+                margin=judgement.margin,
+                payload=judgement.payload,
+            )
+
+    def _calibrate_once(self, twin: rendering.Twin, truth: Any) -> None:
+        """Let a task that needs it look at the first photograph.
+
+        Raises:
+            InputError: the user has to state how the outputs are read.
+        """
+        if self._is_calibrated:
+            return
+        self._is_calibrated = True
+        if self.task.calibrates:
+            photograph = twin.images[PHOTOGRAPH].clamp(0.0, 1.0)
+            output = self.model(color.round_to_8_bit(photograph))
+            self.task = self.task.after_calibration(output, truth)
+        if self.task.ambiguities:
+            raise InputError(f"task {self.task.name}: {self.task.ambiguities}")
+
+
+def load_judges(
+    config: TwinsConfig, network: Any
+) -> tuple[list[ModelJudge], list[str]]:
+    """Load the models, and return a judge for each, and warnings.
+
+    Args:
+        config: of the run.
+        network: as for `run_twins`.
+
+    Raises:
+        InputError: the models take images of different sizes.
+    """
+    task = workbench.make_task(config.task)
+    by_frame = network if isinstance(network, Mapping) else {}
+    networks = list(dict.fromkeys(by_frame.values())) or [network]
+    if network is None:
+        networks = list(settings.split_names(config.model))
+    scene_config: Any = config
+    models, warnings = workbench.load_models(networks, task, scene_config)
+    if len({model.input_size for model in models}) > 1:
+        sizes = ", ".join(
+            f"{model.name} {model.input_size[1]} x {model.input_size[0]}"
+            for model in models
+        )
+        raise InputError(
+            f"model: expected models that take pictures of one size, got {sizes}; "
+            "compare them one by one"
+        )
+    if by_frame:
+        model_of_frame = {
+            frame: models[networks.index(model)] for frame, model in by_frame.items()
+        }
+        return [ModelJudge(task, models[0], model_of_frame)], warnings
+    return [ModelJudge(task, model, {}) for model in models], warnings
+
+
+class Comparison:
+    """Compares photographs with their twins.
+
+    Args:
+        context: of the run.
+        judges: of the models, at least one.
+    """
+
+    def __init__(
+        self, context: RunContext[TwinsConfig], judges: Sequence[ModelJudge]
     ) -> None:
         self._context = context
         self._config = context.config
-        self._task = task
-        self._model = model
-        self._model_of_frame = model_of_frame
-        self._size = model.input_size
-        self.n_renders = 0
-        self._is_calibrated = False
+        self._judges = judges
+        self._size = judges[0].model.input_size
         self._load_photograph = lru_cache(maxsize=4)(rendering.load_photograph)
+        self.n_renders = 0
 
     @property
     def surroundings(self) -> tuple[str, ...]:
@@ -136,13 +217,14 @@ class Comparison:
         """How far a window reaches beyond the object's box, in its longer sides."""
         if self._config.margin is not None:
             return self._config.margin
-        return DETECTOR_MARGIN if self._task.varies else CLASSIFIER_MARGIN
+        is_detector = self._judges[0].task.varies
+        return DETECTOR_MARGIN if is_detector else CLASSIFIER_MARGIN
 
     def select(self, objects: Sequence[PhotographedObject]) -> Selection:
         """Choose the rows that are used, and their windows.
 
         Raises:
-            InputError: none is left, or the model does not know a label.
+            InputError: none is left, or a model does not know a label.
         """
         is_frame = parse_frames(self._config.frames)
         assets: dict[Path, Any] = {}
@@ -156,13 +238,14 @@ class Comparison:
                 n_hidden += 1
                 continue
             if item.mesh not in assets:
-                self._task.check(self._make_facts(item))
+                for judge in self._judges:
+                    judge.task.check(self._make_facts(item))
                 self._context.progress.stage(f"reading {item.object}")
                 assets[item.mesh] = self._load_asset(item)
             positions = rendering.project_object(item, assets[item.mesh])
-            height, width = self._load_photo(item).shape[:2]
+            photograph = self._load_photograph(item.photograph)
             window = rendering.choose_window(
-                positions, (height, width), self._size, self.margin
+                positions, photograph.full_size, self._size, self.margin
             )
             if window is None:
                 n_outside += 1
@@ -188,9 +271,6 @@ class Comparison:
     def _load_asset(self, item: PhotographedObject) -> Any:
         return rendering.load_object(item.mesh, item.unit)
 
-    def _load_photo(self, item: PhotographedObject) -> Tensor:
-        return self._load_photograph(item.photograph)
-
     def compare(self, selection: Selection, measurements: Any) -> Iterator[TwinRow]:
         """Yield the rows, object by object, so that each mesh is loaded once."""
         context = self._context
@@ -204,7 +284,10 @@ class Comparison:
             missing = [
                 number
                 for number in numbers
-                if measurements.read(make_row_name(number)) is None
+                if any(
+                    measurements.read(make_row_name(number, index)) is None
+                    for index in range(len(self._judges))
+                )
             ]
             # Mitsuba can't record renders of one scene while another one lives.
             layers = self._render_layers(selection, missing)
@@ -219,11 +302,18 @@ class Comparison:
                 )
             for number in numbers:
                 layer = layers.pop(number, None)
-                yield measurements.get_row(
-                    make_row_name(number),
-                    TwinRow,
-                    partial(self._compare_object, number, selection, layer, renderer),
+                # rendered once for all models, and not at all where all rows are stored
+                make_twin = cache(
+                    partial(self._make_twin, number, selection, layer, renderer)
                 )
+                for index, judge in enumerate(self._judges):
+                    yield measurements.get_row(
+                        make_row_name(number, index),
+                        TwinRow,
+                        partial(
+                            self._compare_object, number, selection, make_twin, judge
+                        ),
+                    )
                 context.progress.advance(1)
             renderer = None
             gc.collect()
@@ -235,13 +325,19 @@ class Comparison:
         if not numbers:
             return {}
         renderer = self._make_renderer(
-            rendering.LayerRenderer, self._config.light, selection, numbers
+            partial(rendering.LayerRenderer, is_matched=self._config.match),
+            self._config.light,
+            selection,
+            numbers,
         )
         layers = {}
         for number in numbers:
             item = selection.objects[number]
             window = selection.windows[number]
-            layers[number] = renderer.render(item, window, self._size, number)
+            photograph = self._load_photograph(item.photograph)
+            layers[number] = renderer.render(
+                item, photograph, window, self._size, number
+            )
             self.n_renders += 1
         return layers
 
@@ -265,26 +361,45 @@ class Comparison:
             seed=self._config.seed,
         )
 
-    def _compare_object(
+    def _make_twin(
         self,
         number: int,
         selection: Selection,
         layer: Any,
         renderer: Any,
-    ) -> TwinRow:
-        """Render an object's twin, and return what the model says of all images."""
+    ) -> rendering.Twin:
+        """Render an object in the environment, and return all images of it."""
         item = selection.objects[number]
         window = selection.windows[number]
         environment = self._config.environment_name
         surrounded = {environment: renderer.render(item, window, number)}
         self.n_renders += 1
         twin = rendering.make_twin(
-            item, self._load_photo(item), window, layer, surrounded, self._size
+            item,
+            self._load_photograph(item.photograph),
+            window,
+            layer,
+            surrounded,
+            self._size,
         )
-        facts = self._make_facts(item, twin)
         self._save_images(number, twin)
+        return twin
+
+    def _compare_object(
+        self,
+        number: int,
+        selection: Selection,
+        make_twin: Callable[[], rendering.Twin],
+        judge: ModelJudge,
+    ) -> TwinRow:
+        """Return what a model says of an object's photograph and of its twins."""
+        item = selection.objects[number]
+        window = selection.windows[number]
+        twin = make_twin()
+        facts = self._make_facts(item, twin)
         return TwinRow(
             number=number,
+            model=judge.model.name,
             photograph=item.photograph.name,
             frame=item.frame,
             object=item.object,
@@ -294,51 +409,11 @@ class Comparison:
             size=twin.size,
             brightness=twin.brightness,
             contrast=twin.contrast,
+            texture=twin.texture,
             visible=item.visible,
             overlap=rendering.measure_pose(item, twin, window),
-            predictions=list(
-                self._predict(
-                    self._model_of_frame.get(item.frame, self._model), twin, facts
-                )
-            ),
+            predictions=list(judge.predict(item.frame, twin, facts)),
         )
-
-    def _predict(
-        self, model: Model, twin: rendering.Twin, facts: Any
-    ) -> Iterator[TwinPrediction]:
-        """Yield the predictions about the photograph and its twins."""
-        truth = self._task.truth(facts)
-        self._calibrate_once(twin, truth)
-        for name, image in twin.images.items():
-            rounded = color.round_to_8_bit(image.clamp(0.0, 1.0))
-            output = model(rounded)
-            (judgement,) = workbench.judge_images(
-                self._task, output, rounded[None], [truth]
-            )
-            yield TwinPrediction(
-                surroundings=name,
-                label=judgement.prediction.label,
-                probability=judgement.prediction.probability,
-                right=judgement.right,
-                margin=judgement.margin,
-                payload=judgement.payload,
-            )
-
-    def _calibrate_once(self, twin: rendering.Twin, truth: Any) -> None:
-        """Let a task that needs it look at the first photograph.
-
-        Raises:
-            InputError: the user has to state how the outputs are read.
-        """
-        if self._is_calibrated:
-            return
-        self._is_calibrated = True
-        if self._task.calibrates:
-            photograph = twin.images[PHOTOGRAPH].clamp(0.0, 1.0)
-            output = self._model(color.round_to_8_bit(photograph))
-            self._task = self._task.after_calibration(output, truth)
-        if self._task.ambiguities:
-            raise InputError(f"task {self._task.name}: {self._task.ambiguities}")
 
     def _make_facts(
         self, item: PhotographedObject, twin: rendering.Twin | None = None
@@ -368,7 +443,7 @@ class Comparison:
         factors = []
         if rows:
             table = counting.make_table(
-                rows, self.surroundings, self._model.name, self._task.title
+                rows, self.surroundings, self._judges[0].task.title
             )
             factors = counting.explain_disagreement(rows, COMPOSED)
         overlaps = [row.overlap for row in rows if row.overlap is not None]
@@ -376,8 +451,8 @@ class Comparison:
         return self._context.result(
             TwinsResult,
             photographs=self._config.photographs,
-            model=self._model.name,
-            task=self._task.title,
+            model=",".join(judge.model.name for judge in self._judges),
+            task=self._judges[0].task.title,
             table=table,
             overlap=float(np.median(overlaps)) if overlaps else None,
             low_overlaps=sum(overlap < LOW_OVERLAP for overlap in overlaps),
@@ -439,9 +514,9 @@ def parse_frames(text: str | None) -> Any:
     return is_used
 
 
-def make_row_name(number: int) -> str:
-    """Return the key of a stored row."""
-    return f"twin {number}"
+def make_row_name(number: int, model_index: int) -> str:
+    """Return the key of a stored row: that of an object, for one of the models."""
+    return f"twin {number} {model_index}"
 
 
 def make_image_name(number: int, index: int) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +16,25 @@ IntArray = npt.NDArray[np.int64]
 
 N_PARTS = 3  # parts of equal size that a factor is cut into
 MIN_ROWS_PER_PART = 10
+MIN_BOX_OVERLAP = 0.5  # of boxes of a detector that agree, over their union
+Box = tuple[float, float, float, float]  # x, y, width and height
 
 
 def make_table(
+    rows: Sequence[TwinRow], surroundings: Sequence[str], task: str
+) -> list[results.TwinAgreement]:
+    """Return the agreement by model and surroundings: of all, by object, by condition."""
+    table = []
+    for model in dict.fromkeys(row.model for row in rows):
+        of_model = [row for row in rows if row.model == model]
+        table += _make_model_table(of_model, surroundings, model, task)
+    return table
+
+
+def _make_model_table(
     rows: Sequence[TwinRow], surroundings: Sequence[str], model: str, task: str
 ) -> list[results.TwinAgreement]:
-    """Return the agreement by surroundings: of all rows, by object and by condition."""
+    """Return the part of a table that is about one model."""
     objects = sorted({row.object for row in rows})
     conditions = sorted({row.condition for row in rows if row.condition})
     groups: list[tuple[str, str, Sequence[TwinRow]]] = [("", "", rows)]
@@ -83,6 +97,7 @@ def count_agreement(
         agreement=estimate_rate(agrees, units),
         kappa=estimate_kappa(photo_wrong, twin_wrong, units),
         margins=estimate_margin_correlation(photos, twins, units),
+        boxes=estimate_box_agreement(rows, surroundings),
         photo_wrong=estimate_rate(photo_wrong, units),
         wrong_where_twin_wrong=estimate_conditional(photo_wrong, twin_wrong, units),
     )
@@ -138,6 +153,50 @@ def estimate_margin_correlation(
     )
 
 
+def estimate_box_agreement(
+    rows: Sequence[TwinRow], surroundings: str
+) -> results.Estimate | None:
+    """Return how often boxes of a detector agree; None where there are no pairs.
+
+    Of photograph and twin the best box of the right class counts, where both have one;
+    they agree if their overlap over their union reaches `MIN_BOX_OVERLAP`.
+    """
+    agrees = []
+    used_rows = []
+    for row in rows:
+        first = find_box(row.photo.payload, row.label)
+        second = find_box(row.twin(surroundings).payload, row.label)
+        if first is not None and second is not None:
+            agrees.append(compute_box_iou(first, second) >= MIN_BOX_OVERLAP)
+            used_rows.append(row)
+    if not used_rows:
+        return None
+    return estimate_rate(np.array(agrees), number_units(used_rows))
+
+
+def find_box(payload: Any, label: str) -> Box | None:
+    """Return the best box of a class, x, y, width and height in pixels.
+
+    None if the payload of a prediction is not a detector's, or has no such box.
+    """
+    if not isinstance(payload, dict):
+        return None
+    for found in payload.get("found") or []:
+        if found["label"] == label:
+            left, top, right, bottom = found["box"]
+            return left, top, right - left, bottom - top
+    return None
+
+
+def compute_box_iou(first: Box, second: Box) -> float:
+    """Return the overlap of two boxes (x, y, width, height) over their union."""
+    width = min(first[0] + first[2], second[0] + second[2]) - max(first[0], second[0])
+    height = min(first[1] + first[3], second[1] + second[3]) - max(first[1], second[1])
+    overlap = max(width, 0.0) * max(height, 0.0)
+    union = first[2] * first[3] + second[2] * second[3] - overlap
+    return overlap / union if union > 0.0 else 0.0
+
+
 def _estimate_coefficient(
     statistic: Callable[..., float],
     first: npt.NDArray[np.generic],
@@ -156,6 +215,7 @@ FACTORS: dict[str, tuple[str, Callable[[TwinRow], float | None]]] = {
     "size of the object": ("pixels", lambda row: row.size),
     "twin brighter than the photograph": ("", lambda row: row.brightness),
     "contrast of the background": ("", lambda row: row.contrast),
+    "likeness of the texture": ("", lambda row: row.texture),
     "visible fraction": ("", lambda row: row.visible),
     "overlap of the silhouettes": ("", lambda row: row.overlap),
 }

@@ -152,7 +152,8 @@ def _read_bop(folder: Path) -> Listing:
     objects: list[PhotographedObject] = []
     n_missing = 0
     for scene in scenes:
-        listing = _read_scene(scene, models)
+        condition = scene.name if len(scenes) > 1 else ""
+        listing = _read_scene(scene, models, condition)
         objects += listing.objects
         n_missing += listing.n_missing
     return Listing(objects, n_missing)
@@ -170,8 +171,8 @@ def _find_models(folder: Path) -> Path:
     )
 
 
-def _read_scene(scene: Path, models: Path) -> Listing:
-    """Read one scene of a BOP data set."""
+def _read_scene(scene: Path, models: Path, condition: str) -> Listing:
+    """Read one scene of a BOP data set, whose photographs are of one condition."""
     truths = _read_json(scene / GROUND_TRUTH)
     cameras = _read_json(scene / "scene_camera.json")
     infos: Mapping[str, Any] = {}
@@ -199,6 +200,7 @@ def _read_scene(scene: Path, models: Path) -> Listing:
                     frame=f"{scene.name}/{image}",
                     camera=camera,
                     unit="mm",
+                    condition=condition,
                     mask=_find_mask(scene, "mask", image, index),
                     visible_mask=_find_mask(scene, "mask_visib", image, index),
                     visible=_get_fraction(info),

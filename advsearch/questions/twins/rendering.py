@@ -1,7 +1,8 @@
 """Render twins: objects as photographs show them, over the photograph or in a place.
 
 A twin is rendered by the pinhole that took the photograph, in a window: a rectangle of
-whole pixels of the photograph. Both are brought to the size that the model takes by the
+whole pixels of the photograph, and laid over it as over any backdrop
+(`advsearch.scene.backdrop`). Both are brought to the size that the model takes by the
 same function, so that they are as blurred.
 
 The scene has the coordinates of the mesh: the object stands as its file stands, with z
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +24,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.extend import InputError, assets, color, reading, seeds, workbench
+from advsearch.extend import InputError, assets, reading, seeds, workbench
+from advsearch.questions.twins import counting
 from advsearch.questions.twins.listing import PhotographedObject
 from advsearch.questions.twins.result import COMPOSED, HOLE, PHOTOGRAPH
 
@@ -58,6 +60,8 @@ class Twin:
         brightness: mean of the twin less that of the photograph where the twin covers
             it, in sRGB.
         contrast: standard deviation of the photograph around the object, in sRGB.
+        texture: correlation of twin and photograph where the twin covers it, by
+            luminance in sRGB; None where one of them is even.
     """
 
     images: Mapping[str, Tensor]
@@ -66,6 +70,7 @@ class Twin:
     size: float
     brightness: float
     contrast: float
+    texture: float | None
 
 
 def project_object(item: PhotographedObject, asset: assets.ObjectAsset) -> Float64Array:
@@ -128,21 +133,21 @@ def choose_window(
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """An object alone, as the camera of a photograph sees it in a window.
+    """An object that is rendered into a window of its photograph.
 
     Attributes:
-        radiance: (h, w, 3) display-linear, times its alpha, at the film's size.
-        alpha: (h, w) what the object covers.
-        sight: what is visible of it, at the model's size.
+        composed: (h, w, 3) sRGB in [0, 1], in the photograph's pixels.
+        alpha: (h, w) in [0, 1], what the object covers, whether it is hidden or not.
+        sight: what is visible of it, for tasks, at the model's size.
     """
 
-    radiance: Tensor
+    composed: Tensor
     alpha: Tensor
     sight: Any
 
 
 class LayerRenderer:
-    """Render layers of one object.
+    """Render one object into photographs.
 
     Args:
         asset: the object, with `up` z and `front` +x.
@@ -151,6 +156,8 @@ class LayerRenderer:
         film: (height, width) of renders in pixels.
         spp: samples per pixel.
         seed: of the noise.
+        is_matched: give the object the noise and the blur of the photograph, where
+            they can be measured.
     """
 
     def __init__(
@@ -162,25 +169,34 @@ class LayerRenderer:
         *,
         spp: int,
         seed: int,
+        is_matched: bool = True,
     ) -> None:
         self._asset = asset
         self._spp = spp
         self._seed = seed
-        self._renderer = workbench.load_scene(asset, light, unit=unit).renderer(
-            {"background": {"ground": "hide"}}, resolution=film, seed=seed
-        )
+        # The photograph shows the shadow of the object already.
+        settings = {"ground.size": 0.0}
+        scene = workbench.load_scene(asset, light, unit=unit, settings=settings)
+        self._renderer = scene.renderer({"background": {}}, resolution=film, seed=seed)
+        self._description = scene.description
+        if not is_matched:
+            self._description = self._description.with_values(
+                backdrop__noise=0.0, backdrop__blur=0.0
+            )
 
     def render(
         self,
         item: PhotographedObject,
+        photograph: reading.backdrop.BackdropPhotograph,
         window: PhotoWindow,
         model_size: tuple[int, int],
         number: int = 0,
     ) -> Layer:
-        """Render the object in a photograph.
+        """Render the object into a photograph.
 
         Args:
             item: the object; its mesh is that of this renderer.
+            photograph: that shows it.
             window: of the photograph.
             model_size: (height, width) of what is visible.
             number: of the row, which has noise of its own.
@@ -191,9 +207,33 @@ class LayerRenderer:
         with torch.no_grad():
             rendered = renderer.render_radiance(inputs, seed, self._spp, True)
             surfaces = renderer.scene.find_surfaces(inputs)
-        radiance = rendered[..., :3] * renderer.formation.gain
+            size = (window.height, window.width)
+            rendered = resize(rendered, size)
+            image_inputs = self._make_image_inputs(item, photograph, window)
+            composed = renderer.finish_image(rendered, image_inputs, renderer.start)
         sight = _make_sight(surfaces, self._asset.size_in_metres, model_size)
-        return Layer(radiance, rendered[..., 3], sight)
+        return Layer(composed, rendered[..., 3].clamp(0.0, 1.0), sight)
+
+    def _make_image_inputs(
+        self,
+        item: PhotographedObject,
+        photograph: reading.backdrop.BackdropPhotograph,
+        window: PhotoWindow,
+    ) -> dict[str, Tensor]:
+        """Return the inputs by which a render becomes a window of a photograph.
+
+        They are its pixels, noise and blur, what hides the object, and the exposure in
+        stops over that of the renderer.
+        """
+        front = read_front(item, photograph)
+        in_window = replace(photograph, crop=window, front=front)
+        description = self._description.with_backdrop(in_window)
+        size = (window.height, window.width)
+        stops = math.log2(description.gain / self._renderer.formation.gain)
+        return {
+            **reading.backdrop.make_image_inputs(description, size),
+            "camera.exposure": torch.tensor([stops]),
+        }
 
 
 class SurroundedRenderer:
@@ -233,44 +273,58 @@ class SurroundedRenderer:
 
 def make_twin(
     item: PhotographedObject,
-    photograph: Tensor,
+    photograph: reading.backdrop.BackdropPhotograph,
     window: PhotoWindow,
     layer: Layer,
     surrounded: Mapping[str, Tensor],
     model_size: tuple[int, int],
 ) -> Twin:
-    """Lay a render over its photograph, and bring all images to the model's size.
+    """Bring a photograph and its twins to the model's size.
 
     Args:
         item: the object.
-        photograph: (H, W, 3) sRGB in [0, 1].
+        photograph: that shows it.
         window: of the photograph.
-        layer: render of the object alone.
+        layer: the object in the photograph.
         surrounded: sRGB renders by environment.
         model_size: (height, width) in pixels.
     """
     size = (window.height, window.width)
-    alpha = resize(layer.alpha[..., None], size)[..., 0].clamp(0.0, 1.0)
-    coverage = alpha * _read_visibility(item, window)
-    crop = cut_window(photograph, window)
-    composed = compose(crop, resize(layer.radiance, size), alpha, coverage)
+    coverage = layer.alpha
+    front = read_front(item, photograph)
+    if front is not None:
+        hidden = cut_window(torch.from_numpy(front), window) / 255.0
+        coverage = coverage * (1.0 - hidden)
+    crop = cut_photograph(photograph, window)
     around = crop[coverage < 0.5]
     mean_around = around.mean(dim=0) if len(around) else crop.mean(dim=(0, 1))
-    difference = (composed - crop)[coverage >= 0.5]
+    difference = (layer.composed - crop)[coverage >= 0.5]
     images = {
         PHOTOGRAPH: crop,
-        COMPOSED: composed,
+        COMPOSED: layer.composed,
         **{name: resize(image, size) for name, image in surrounded.items()},
         HOLE: torch.lerp(crop, mean_around.expand_as(crop), coverage[..., None]),
     }
     return Twin(
         {name: resize(image, model_size) for name, image in images.items()},
         layer.sight,
-        alpha,
-        size=math.sqrt(float(alpha.sum())),
+        layer.alpha,
+        size=math.sqrt(float(layer.alpha.sum())),
         brightness=float(difference.mean()) if len(difference) else 0.0,
         contrast=float(around.std()) if len(around) > 1 else 0.0,
+        texture=correlate_luminance(
+            layer.composed[coverage >= 0.5], crop[coverage >= 0.5]
+        ),
     )
+
+
+def correlate_luminance(first: Tensor, second: Tensor) -> float | None:
+    """Return the correlation of the luminance of pixels (N, 3); None if one is even."""
+    weights = torch.from_numpy(reading.backdrop.LUMINANCE).to(first)
+    values = torch.stack([first @ weights, second @ weights])
+    if len(first) < 2 or bool((values.std(dim=1) < 1e-6).any()):
+        return None
+    return float(torch.corrcoef(values)[0, 1])
 
 
 def _make_sight(
@@ -340,26 +394,6 @@ def make_camera_inputs(
     }
 
 
-def compose(
-    photograph: Tensor, radiance: Tensor, alpha: Tensor, coverage: Tensor
-) -> Tensor:
-    """Lay a render over a photograph, in linear light.
-
-    Args:
-        photograph: (h, w, 3) sRGB.
-        radiance: (h, w, 3) display-linear, of what is rendered times its alpha.
-        alpha: (h, w) what the render covers.
-        coverage: (h, w) what is visible of that.
-
-    Returns:
-        (h, w, 3) sRGB in [0, 1].
-    """
-    visible = (coverage / alpha.clamp_min(1e-6)).clamp(0.0, 1.0)[..., None]
-    linear = color.srgb_to_linear(photograph)
-    mixed = radiance * visible + (1.0 - coverage[..., None]) * linear
-    return color.linear_to_srgb(mixed.clamp(0.0, 1.0)).clamp(0.0, 1.0)
-
-
 def resize(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize an image (H, W, C) to (height, width), averaging where it shrinks."""
     if tuple(image.shape[:2]) == size:
@@ -377,24 +411,40 @@ def cut_window(image: Tensor, window: PhotoWindow) -> Tensor:
     return image[rows, window.x : window.x + window.width]
 
 
-def load_photograph(path: Path) -> Tensor:
-    """Read a photograph as sRGB (H, W, 3) in [0, 1].
+def cut_photograph(
+    photograph: reading.backdrop.BackdropPhotograph, window: PhotoWindow
+) -> Tensor:
+    """Return a window (h, w, 3) of a photograph, sRGB in [0, 1]."""
+    rows = slice(window.y, window.y + window.height)
+    columns = slice(window.x, window.x + window.width)
+    levels = photograph.levels[rows, columns]
+    return torch.from_numpy(levels.astype(np.float32) / np.float32(255.0))
+
+
+def load_photograph(path: Path) -> reading.backdrop.BackdropPhotograph:
+    """Read a photograph.
 
     Raises:
         FileFormatError: it is no picture, or too large.
     """
-    return torch.from_numpy(reading.pictures.read_image(path, None))
+    return reading.backdrop.read_backdrop(path)
 
 
-def _read_visibility(item: PhotographedObject, window: PhotoWindow) -> Tensor:
-    """Return what of a window no other thing hides, (h, w); 1 without a mask.
+def read_front(
+    item: PhotographedObject, photograph: reading.backdrop.BackdropPhotograph
+) -> npt.NDArray[np.uint8] | None:
+    """Return levels (H, W), 255 where another thing hides the object; None if unknown.
 
-    The mask is widened by a pixel, since the edges of masks are not smooth.
+    The mask of what is visible is widened by a pixel, since the edges of masks are not
+    smooth.
     """
     if item.visible_mask is None:
-        return torch.ones(())
-    mask = load_mask(item.visible_mask, window).float()
-    return F.max_pool2d(mask[None, None], 3, 1, 1)[0, 0]
+        return None
+    full = PhotoWindow(0, 0, photograph.full_size[1], photograph.full_size[0])
+    visible = load_mask(item.visible_mask, full).float()
+    hidden = 1.0 - F.max_pool2d(visible[None, None], 3, 1, 1)[0, 0]
+    front: npt.NDArray[np.uint8] = (255.0 * hidden).to(torch.uint8).numpy()
+    return front
 
 
 def load_mask(path: Path, window: PhotoWindow) -> Tensor:
@@ -430,17 +480,7 @@ def measure_pose(
         float(columns[-1] - columns[0]) + 1,
         float(rows[-1] - rows[0]) + 1,
     )
-    return compute_box_iou(box, item.box)
-
-
-def compute_box_iou(
-    first: tuple[float, float, float, float], second: tuple[float, float, float, float]
-) -> float:
-    """Return the overlap of two boxes (x, y, width, height) over their union."""
-    width = min(first[0] + first[2], second[0] + second[2]) - max(first[0], second[0])
-    height = min(first[1] + first[3], second[1] + second[3]) - max(first[1], second[1])
-    overlap = max(width, 0.0) * max(height, 0.0)
-    return overlap / (first[2] * first[3] + second[2] * second[3] - overlap)
+    return counting.compute_box_iou(box, item.box)
 
 
 @lru_cache(maxsize=64)

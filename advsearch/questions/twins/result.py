@@ -81,6 +81,14 @@ class TwinsConfig(Config):
         ge=0.0,
         le=1.0,
     )
+    match: bool = setting(
+        True,
+        "twins",
+        "give twins the noise and the blur of their photographs, where they can be "
+        "measured",
+        flag="--no-match",
+        switched="leave twins without the noise and the blur of their photographs",
+    )
     frames: str | None = setting(
         None,
         "twins",
@@ -104,7 +112,12 @@ class TwinsConfig(Config):
         ge=1,
         le=65536,
     )
-    model: str = setting_as_in(SceneConfig, "model")
+    model: str = setting_as_in(
+        SceneConfig,
+        "model",
+        description="the model, or several that take pictures of one size, separated "
+        "by commas",
+    )
     labels: str | None = setting_as_in(SceneConfig, "labels")
     prompt: str | None = setting_as_in(SceneConfig, "prompt")
     value_range: tuple[float, float] | None = setting_as_in(SceneConfig, "value_range")
@@ -168,6 +181,7 @@ class TwinRow(results.Fields):
     """An object in a photograph, and its twins."""
 
     number: int
+    model: str
     photograph: str
     frame: str = Field(description="the independent unit that it is of")
     object: str
@@ -182,6 +196,10 @@ class TwinRow(results.Fields):
     )
     contrast: float = Field(
         description="standard deviation around the object in the photograph, sRGB"
+    )
+    texture: float | None = Field(
+        description="correlation of twin and photograph where the object is, by "
+        "luminance, from -1 to 1; null where one of them is even"
     )
     visible: float | None = Field(description="fraction; null where it is not known")
     overlap: float | None = Field(
@@ -285,11 +303,14 @@ HEADS = (
 
 
 def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
+    agreement = wording.format_estimate(row.agreement)
+    if row.boxes is not None:
+        agreement += f"; boxes {wording.format_estimate(row.boxes)}"
     return [
         name,
         str(row.pairs),
         wording.format_estimate(row.twin_right),
-        wording.format_estimate(row.agreement),
+        agreement,
         wording.format_estimate(row.kappa, "too few wrong"),
         wording.format_estimate(row.margins),
         format_conditional(row),
@@ -299,17 +320,24 @@ def _agreement_cells(row: results.TwinAgreement, name: str) -> list[str]:
 def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
     """Return the table of all objects and conditions."""
     total = [row for row in table if not row.object and not row.condition]
-    first = total[0]
-    photo = [
-        PHOTOGRAPH,
-        str(first.pairs),
-        wording.format_estimate(first.photo_right),
-        "",
-        "",
-        "",
-    ]
-    photo.append(f"wrong at all: {wording.format_estimate(first.photo_wrong)}")
-    rows = [photo, *(_agreement_cells(row, _name_surroundings(row)) for row in total)]
+    several = len({row.model for row in total}) > 1
+    rows = []
+    models = set()
+    for row in total:
+        prefix = f"{row.model}: " if several else ""
+        if row.model not in models:
+            models.add(row.model)
+            photo = [
+                f"{prefix}{PHOTOGRAPH}",
+                str(row.pairs),
+                wording.format_estimate(row.photo_right),
+                "",
+                "",
+                "",
+            ]
+            photo.append(f"wrong at all: {wording.format_estimate(row.photo_wrong)}")
+            rows.append(photo)
+        rows.append(_agreement_cells(row, f"{prefix}{_name_surroundings(row)}"))
     return ResultPart("How far twins hold", heads=HEADS, rows=rows, note=TABLE_NOTE)
 
 
@@ -322,13 +350,15 @@ def _name_surroundings(row: results.TwinAgreement) -> str:
 def _group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[ResultPart]:
     """Yield the tables by object and by condition."""
     surroundings = list(dict.fromkeys(row.surroundings for row in table))
+    several = len({row.model for row in table}) > 1
     for kind in ("object", "condition"):
         for name in surroundings:
-            rows = [
-                _agreement_cells(row, getattr(row, kind))
-                for row in table
-                if getattr(row, kind) and row.surroundings == name
-            ]
+            rows = []
+            for row in table:
+                group = getattr(row, kind)
+                if group and row.surroundings == name:
+                    group = f"{row.model}: {group}" if several else group
+                    rows.append(_agreement_cells(row, group))
             title = f"By {kind}: {name}"
             heads = (kind, *HEADS[1:])
             yield ResultPart(title, heads=heads, rows=rows, folded=True, only="page")
@@ -388,10 +418,17 @@ def _overlap_text(result: TwinsResult) -> str:
 
 
 def summarize_twins(table: Sequence[results.TwinAgreement]) -> str:
-    """Summarise how far twins hold in sentences."""
-    composed = find_row(table, COMPOSED)
-    if composed is None:
-        return "Nothing was compared."
+    """Summarise how far twins hold in sentences, model by model."""
+    total = [row for row in table if not row.object and not row.condition]
+    composed_rows = [row for row in total if row.surroundings == COMPOSED]
+    if len(composed_rows) == 1:
+        return summarize_composed(composed_rows[0])
+    texts = [f"{row.model}: {summarize_composed(row)}" for row in composed_rows]
+    return " ".join(texts) or "Nothing was compared."
+
+
+def summarize_composed(composed: results.TwinAgreement) -> str:
+    """Summarise how far twins in photographs hold for one model."""
     agreement = wording.format_estimate(composed.agreement)
     counts = (
         f"{wording.format_count(composed.pairs, 'pair')} of "
@@ -420,6 +457,8 @@ def _pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
     for pair in result.pairs:
         row = pair.row
         name = f"{row.object} in {row.frame}"
+        if "," in result.model:
+            name = f"{row.model}, {name}"
         texts = [
             f"{image.surroundings}: {_verdict(image)}" for image in row.predictions
         ]
@@ -463,7 +502,7 @@ def make_twins_claims(result: TwinsResult) -> Iterator[views.Claim]:
             f"{wording.format_count(row.frames, 'frame')}"
         )
         statement = (
-            f"{_name_surroundings(row)}: agrees with the photograph in "
+            f"{row.model}, {_name_surroundings(row)}: agrees with the photograph in "
             f"{wording.format_estimate(row.agreement)} of {counts}; photographs wrong "
             f"where it is wrong: {format_conditional(row)}."
         )

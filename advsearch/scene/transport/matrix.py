@@ -608,7 +608,8 @@ def _collect(
     fourth channel.
     """
     non_finite_before = renderer.non_finite
-    scene_inputs = dict(renderer.scene.assembly(renderer.space.inputs(u)))
+    inputs = renderer.scene.assembly(renderer.space.inputs(u))
+    scene_inputs = dict(renderer.find_front(inputs))
     image_inputs = {
         name: scene_inputs.pop(name)
         for name in list(scene_inputs)

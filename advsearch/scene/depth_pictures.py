@@ -1,0 +1,134 @@
+"""Pictures of depth: how far what a photograph shows is from its camera.
+
+Depth counts along the camera's axis, as depth cameras and BOP have it. 0, and what is no
+finite number, is unknown.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from advsearch.errors import FileFormatError
+from advsearch.pictures import MAX_PIXELS, check_decodable, check_pixels, open_image
+from advsearch.scene.assets import Float32Array
+from advsearch.scene.importing.hdr import read_exr
+from advsearch.trust.stored_files import LARGEST_FILE, read_bytes
+
+EXR_SUFFIX = ".exr"
+ARRAY_SUFFIX = ".npy"
+# a file, and the length of one of its levels in metres
+SCALED = re.compile(r"(?P<path>.+)#(?P<metres>\d+\.?\d*(e-?\d+)?|\.\d+)", re.IGNORECASE)
+LEVEL_BITS = ("I;16", "I;16B", "I;16L", "I")  # modes of pictures of 16 bits
+MAX_DEPTH = 1e5  # metres
+
+
+def is_depth(spec: str | Path) -> bool:
+    """Return whether an occluder is a picture of depth, by how it is asked for."""
+    text = str(spec)
+    suffix = Path(text).suffix.lower()
+    return suffix in (EXR_SUFFIX, ARRAY_SUFFIX) or SCALED.fullmatch(text) is not None
+
+
+def check_no_depth(mode: str, path: Path) -> None:
+    """Raise FileFormatError if a mask has the mode of a picture of depth."""
+    if mode in LEVEL_BITS:
+        raise FileFormatError(
+            f"{path}: expected a mask of 8 bits, got a picture of 16 bits; if it is one "
+            f"of depth, give the metres of a level behind its name, as in {path}#0.001"
+        )
+
+
+def read_depth(spec: str | Path) -> Float32Array:
+    """Read a picture of depth.
+
+    Args:
+        spec: an .exr or .npy file in metres; or a grey picture with the length of one
+            of its levels in metres behind its name, ``depth.png#0.001``.
+
+    Returns:
+        (H, W) metres along the camera's axis; infinite where it is not known.
+
+    Raises:
+        FileFormatError: the file is missing, too large, corrupt, has several different
+            channels, or depths below 0 or over `MAX_DEPTH`.
+    """
+    scaled = SCALED.fullmatch(str(spec))
+    path = Path(scaled["path"] if scaled else spec)
+    metres = float(scaled["metres"]) if scaled else 1.0
+    suffix = path.suffix.lower()
+    if suffix == EXR_SUFFIX:
+        planes, _ = read_exr(path, _read_file(path))
+        channels = np.stack(planes, axis=2)
+    elif suffix == ARRAY_SUFFIX:
+        channels = _read_array(path)[..., None]
+    else:
+        with open_image(path, LARGEST_FILE) as image:
+            check_decodable(image, path)
+            levels = np.asarray(image)
+        channels = levels if levels.ndim == 3 else levels[..., None]
+    # a grey picture may be stored as three equal channels
+    if (channels != channels[..., :1])[np.isfinite(channels)].any():
+        raise FileFormatError(
+            f"{path}: expected one depth for each pixel, got channels that differ; "
+            "save depth as grey"
+        )
+    depth = channels[..., 0].astype(np.float64) * metres
+    depth[~np.isfinite(depth) | (depth == 0.0)] = np.inf
+    known = depth[np.isfinite(depth)]
+    if known.size and not 0.0 < known.min() <= known.max() <= MAX_DEPTH:
+        raise FileFormatError(
+            f"{path}: expected depths of 0 to {MAX_DEPTH:g} metres, got "
+            f"{known.min():g} to {known.max():g}; check the metres of a level"
+        )
+    return depth.astype(np.float32)
+
+
+def _read_file(path: Path) -> bytes:
+    try:
+        return read_bytes(path, "a picture of depth", LARGEST_FILE)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise FileFormatError(
+            f"{path}: expected a picture of depth, got one that cannot be read "
+            f"({reason}); check the path"
+        ) from error
+
+
+def _read_array(path: Path) -> np.ndarray:
+    """Return the numbers (H, W) of an .npy file, whose size is checked before."""
+    data = _read_file(path)
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, is_by_columns, dtype = read_header(stream)
+        has_form = len(shape) == 2 and min(shape) > 0 and dtype.kind in "fiu"
+    except (ValueError, KeyError, EOFError, SyntaxError, RecursionError) as error:
+        raise FileFormatError(
+            f"{path}: expected an array of NumPy, got a file that is corrupt or of "
+            "another version; save it again"
+        ) from error
+    if not has_form:
+        raise FileFormatError(
+            f"{path}: expected an array (height, width) of numbers, got one of shape "
+            f"{str(shape)[:40]} of {str(dtype)[:40]}"
+        )
+    height, width = shape
+    check_pixels(path, width, height, MAX_PIXELS)
+    content = data[stream.tell() :]
+    if len(content) != height * width * dtype.itemsize:
+        raise FileFormatError(
+            f"{path}: expected {height} x {width} numbers, got a file of another "
+            "length; save it again"
+        )
+    order: Literal["F", "C"] = "F" if is_by_columns else "C"
+    numbers: np.ndarray = np.frombuffer(content, dtype)
+    return numbers.reshape((height, width), order=order)
