@@ -61,7 +61,7 @@ def make_unexpected_error(
 
     Args:
         function: its name.
-        keywords: of the call.
+        keywords: keywords of the call.
         known: the names of its parameters.
     """
     for name in keywords:

@@ -79,8 +79,8 @@ def hand_copies(kind: type, **argument_slices: slice) -> None:
 
     Args:
         kind: the class; one of this package is left as it is.
-        argument_slices: by the name of the method, which of its positional arguments
-            after `self` are copied. All keyword arguments are.
+        argument_slices: argument slices by the name of the method, which of its
+            positional arguments after `self` are copied. All keyword arguments are.
     """
     if is_ours(kind):
         return

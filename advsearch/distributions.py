@@ -25,7 +25,7 @@ class PythonQuantiles(dict[str, object]):
     """The setting of an inverse CDF from Python, with the function itself.
 
     Attributes:
-        function: from probabilities in [0, 1] to values.
+        function: function from probabilities in [0, 1] to values.
     """
 
     def __init__(self, name: str, function: Callable[[float], float]) -> None:

@@ -47,7 +47,7 @@ class UnknownNameError(InputError):
 
         Args:
             kind: what is named, such as "policy".
-            name: that was given.
+            name: name that was given.
             known: the names that there are.
             hint: the last sentence of the message.
         """
@@ -160,7 +160,7 @@ def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> flo
 
     Args:
         matcher: has what was asked for as its second sequence.
-        name: to compare.
+        name: name to compare.
     """
     best_ratio = 0.0
     for text, threshold in [

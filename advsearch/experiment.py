@@ -242,7 +242,7 @@ def run_part(
     continue it, or read its result if it has ended.
 
     Args:
-        folder: of the part; if it has begun, it goes on with its own settings.
+        folder: folder of the part; if it has begun, it goes on with its own settings.
         config: settings for a part that has not begun.
         progress: is told how far it is.
         run: runs the experiment with settings; None for `run_experiment`.

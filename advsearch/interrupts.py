@@ -113,7 +113,7 @@ def _hear(ours: socket.socket, theirs: socket.socket) -> None:
     signals.
 
     Args:
-        ours: from which the numbers of signals are read.
+        ours: ours from which the numbers of signals are read.
         theirs: the other end, to which they are written; it is only kept open here.
     """
     first: float | None = None
@@ -136,7 +136,7 @@ def _hear(ours: socket.socket, theirs: socket.socket) -> None:
 
 def unless_interrupted(unraisable: sys.UnraisableHookArgs) -> None:
     """Tell an exception that a destructor or a callback could not raise, but for an
-    interrupt: that is counted.
+    interrupt: interrupt that is counted.
     """
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)

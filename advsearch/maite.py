@@ -143,7 +143,7 @@ class Scenes:
     An item is rendered on access, and is the same every time.
 
     Args:
-        scene: from `load_scene`, or what that takes.
+        scene: scene from `load_scene`, or what that takes.
         controls: what varies, evenly within its ranges.
         count: how many pictures.
         labels: names of the classes, in the order of the model's outputs.
@@ -151,7 +151,7 @@ class Scenes:
         task: "classification" or "detection".
         resolution: side, or (height, width), in pixels.
         spp: samples a pixel.
-        seed: of configurations and noise.
+        seed: seed of configurations and noise.
 
     Raises:
         InputError: no class is called as the object, or an argument is out of range.

@@ -53,9 +53,9 @@ def check_pixels(
     """Check that a picture has not too many pixels, before it is decoded.
 
     Args:
-        path: of its file, for errors.
-        width: in pixels.
-        height: in pixels.
+        path: path of its file, for errors.
+        width: width in pixels.
+        height: height in pixels.
         limit: how many pixels it may have, before `scale_limit`.
 
     Raises:

@@ -79,7 +79,7 @@ class Stages:
         """End the current stage, and begin another.
 
         Args:
-            name: under which its seconds are counted; those of one name add up.
+            name: name under which its seconds are counted; those of one name add up.
             title: what the user reads; this and the rest as for `Progress.stage`.
             total: see there.
             hint: see there.

@@ -18,8 +18,8 @@ def stream(root: int, name: str, index: int = 0) -> int:
 
     Args:
         root: root seed, at least 0.
-        name: of the stream, such as "primal", "gradient" or "verification".
-        index: of the seed in the stream, at least 0.
+        name: name of the stream, such as "primal", "gradient" or "verification".
+        index: index of the seed in the stream, at least 0.
     """
     sequence = np.random.SeedSequence([root, zlib.crc32(name.encode()), index])
     return int(sequence.generate_state(1, dtype=np.uint32)[0])

@@ -44,14 +44,16 @@ def assert_right(
     Pictures are drawn until that is shown or refuted at the stated confidence.
 
     Args:
-        object: from `load_scene`, or the name of an object, or a file of one.
-        model: from `load_model`, or what that takes.
+        object: object from `load_scene`, or the name of an object, or a file of one.
+        model: model from `load_model`, or what that takes.
         at_least: the share, over 0 and under 1.
-        pictures: that are drawn, at most.
-        confidence: that an assertion that passes, or fails, is right to do so.
+        pictures: pictures that are drawn, at most.
+        confidence: confidence that an assertion that passes, or fails, is right to do
+            so.
         seed: root of all random numbers.
         run: where the run is kept.
-        **settings: of a scene and its pictures, as `sweep` takes them, and `controls`.
+        **settings: settings of a scene and its pictures, as `sweep` takes them, and
+            `controls`.
 
     Raises:
         AssertionError: the share is shown to be smaller, or so many pictures do not
@@ -129,7 +131,8 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
 
     Args:
         suite: a YAML file.
-        **settings: of `advsearch test`: `model`, `only`, `seed`, `fresh`, `seconds`, `run`, ...
+        **settings: settings of `advsearch test`: `model`, `only`, `seed`, `fresh`,
+            `seconds`, `run`, ...
 
     Raises:
         AssertionError: one failed, or is undecided.
@@ -165,11 +168,11 @@ def _assert_claim(
 
     Args:
         claim: as in a suite, without models.
-        object: of the scene, or the scene.
-        models: by the settings that name them.
-        settings: of the suite.
-        confidence: of the test.
-        seed: of the images.
+        object: object of the scene, or the scene.
+        models: models by the settings that name them.
+        settings: settings of the suite.
+        confidence: confidence of the test.
+        seed: seed of the images.
         run: where the run is stored.
 
     Raises:

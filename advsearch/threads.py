@@ -83,9 +83,9 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     imported yet they are set when it is.
 
     Args:
-        threads: for Dr.Jit, `MAX_THREADS_PER_CORE` for each core at most; None for what
-            OMP_NUM_THREADS said when this module was imported, and without it all cores
-            of this process.
+        threads: threads for Dr.Jit, `MAX_THREADS_PER_CORE` for each core at most; None
+            for what OMP_NUM_THREADS said when this module was imported, and without it
+            all cores of this process.
         rendering: something is rendered.
 
     Raises:

@@ -30,9 +30,10 @@ class Candidate:
 
     Attributes:
         u: (d,) the configuration.
-        objective: of the render that admitted it, biased upwards.
+        objective: objective of the render that admitted it, biased upwards.
         success: whether the model was wrong in that render.
-        repeat_objectives: of its renders since then; -inf if one is not finite.
+        repeat_objectives: repeat objectives of its renders since then; -inf if one is
+            not finite.
         successes: in how many of these the model was wrong.
     """
 
@@ -272,7 +273,7 @@ class FoundFailure:
 
     Attributes:
         u: (d,) the configuration.
-        objective: of its single render, biased upwards.
+        objective: objective of its single render, biased upwards.
         ranges: (low, high) of the failures that it stands for, by index in u.
     """
 
@@ -318,7 +319,7 @@ def select_diverse(
 
     Args:
         points: (n, k), in fractions of each range.
-        objectives: of the points; the larger the worse.
+        objectives: objectives of the points; the larger the worse.
         is_periodic: (k,) bool, ranges whose bounds are the same value.
         is_discrete: (k,) bool, discrete choices: different options lie 1 apart.
         limit: maximum number of indices.
@@ -453,7 +454,7 @@ def find_smallest_change(
     Args:
         search: finds the best configuration of a domain.
         passes: runs the trials of a configuration.
-        domain: with the full budgets.
+        domain: domain with the full budgets.
         likely: guesses where the bisection of 2 begins, which then goes on in growing
             steps; None to bisect from the full length.
 
@@ -547,7 +548,7 @@ def _shorten(
         u: (d,) the configuration that passes.
         length: its scale.
         passes: runs the trials of a configuration.
-        domain: with the full budgets.
+        domain: domain with the full budgets.
         likely: guesses whether a configuration passes, or None.
     """
     low = max(bracket.low, SMALLEST_SCALE * length)

@@ -51,7 +51,7 @@ class Block:
     """Whether `high` and `low` are the same place (an angle): projecting wraps around.
     Only for "box".
     """
-    name: str = ""  # of its parameter, e.g. "pose.yaw"
+    name: str = ""  # name of its parameter, e.g. "pose.yaw"
     options: int = 0
     """Number of options of a discrete choice; 0 for numbers. u means option
     floor(u * options). A choice has size 1, norm "box" and the bounds [0, 1]; it has no
@@ -491,7 +491,7 @@ def _solve_multiplier(
     Args:
         squares: v_i^2 in chunks.
         rooms: room_i^2 in chunks.
-        radius: of the ball.
+        radius: radius of the ball.
         s: where Newton's method begins, not above the solution.
     """
     for _ in range(_MAX_ITERATIONS):
@@ -632,8 +632,8 @@ class SampleSequence:
         Args:
             dimensions: numbers of a point; may be 0.
             sampler: one of `SAMPLERS`.
-            seed: of the points.
-            name: of the stream of random numbers; other names have other points.
+            seed: seed of the points.
+            name: name of the stream of random numbers; other names have other points.
 
         Raises:
             InputError: an unknown sampler, or too many dimensions for it.

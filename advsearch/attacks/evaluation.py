@@ -55,12 +55,13 @@ class Query:
     """
 
     u: Tensor  # (d,) float32 in [0, 1], the configuration; must not be written to
-    # of the noise, and of the conditions that are drawn; equal seeds mean equal noise
+    # Seed of the noise, and of the conditions that are drawn; equal seeds mean equal
+    # noise.
     seed: int
     # which rows the evaluation belongs to, such as "search" or "verification"
     kind: str = "search"
     index: int = 0  # its place among these
-    phase: Phase | None = None  # of a search; None for a trial
+    phase: Phase | None = None  # phase of a search; None for a trial
     # "free" only ever comes where the domain has `partial_gradients`
     gradient: WhichGradient = False
     samples: int = 1
@@ -68,9 +69,9 @@ class Query:
     The evaluation costs as many times its renders: samples * (1 + gradient_cost) with a
     gradient, samples without.
     """
-    spp: int = 1  # of a trial: samples a pixel
-    # of a trial: whether conditions are drawn; otherwise the scene has those it comes
-    # with
+    spp: int = 1  # samples per pixel of a trial: samples a pixel
+    # Draws conditions of a trial: whether conditions are drawn; otherwise the scene has
+    # those it comes with.
     draws_conditions: bool = True
     values: Mapping[str, Value] = field(default_factory=dict)
     """Of a trial: what its row says of the configuration, which trials of one kind may
@@ -120,9 +121,10 @@ class Evaluation:
     jpeg: bytes | None = None
     # ground truth by name, and notes, where kept
     layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None
-    # that it took; None where whoever asks has to look at the clock
+    # Seconds that it took; None where whoever asks has to look at the clock.
     seconds: float | None = None
-    # on which it was made, by its name among the workers'; None of one like this
+    # Machine on which it was made, by its name among the workers'; None of one like
+    # this.
     machine: str | None = None
     is_lost: bool = False  # whether every worker that tried it died
 

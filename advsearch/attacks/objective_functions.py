@@ -283,7 +283,7 @@ def cosine_distance(
     beyond a few `h` it is that of the distance.
 
     Args:
-        features: of the clean picture; called once, here.
+        features: features of the clean picture; called once, here.
         clean: as for `feature_distance`.
 
     Returns: An objective (features (N, F), images, labels) -> (N,), at least 0 but for

@@ -245,7 +245,7 @@ def _evaluate_each_image(
 
     Args:
         objective: returns a scalar.
-        output: of the model for N images.
+        output: output of the model for N images.
         images: (N, H, W, 3).
         truth: equal for all images.
         inputs: what the objective requests by name, for N images.
@@ -589,7 +589,7 @@ def get_objective(
         objective: a name, or a function of (output, images, truth) or of (output,
             labels), which may ask for more.
         task: judges the model; classification of any wrong prediction if None.
-        features: for an objective that `needs_features`:
+        features: features for an objective that `needs_features`:
             `advsearch.models.features.features_of(model)`.
         clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
 
@@ -629,8 +629,8 @@ def _make_feature_objective(
     """Return the objective of a kind that is made from the model's features.
 
     Args:
-        kind: with `of_features`.
-        features: from images (N, H, W, 3) to features (N, F).
+        kind: kind with `of_features`.
+        features: features from images (N, H, W, 3) to features (N, F).
         clean: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
 
     Raises:
@@ -705,7 +705,7 @@ def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -
     to maximise it leads away from the target.
 
     Args:
-        name: of the function.
+        name: name of the function.
         values: (N,) of it, with a graph.
         output: (N, classes) logits.
         target: indices of classes; anything else is not checked.
@@ -782,7 +782,7 @@ def _check_kind(
     sought.
 
     Args:
-        kind: of the objective.
+        kind: kind of the objective.
         task: name of the task.
         targeted: whether a target is sought.
         minimise: whether a right prediction is sought.

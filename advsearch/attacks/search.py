@@ -48,7 +48,7 @@ class StepRecord:
     """One evaluation, without its tensors."""
 
     step: int  # number of the evaluation, from 0; ranking goes on counting
-    seed: int  # that it was rendered with
+    seed: int  # seed that it was rendered with
     phase: Phase  # "search", or "ranking" for a candidate rendered again at the end
     objective: float  # raw; NaN where it was not finite
     # best raw objective of the search so far, biased upwards; NaN before there is one
@@ -58,7 +58,7 @@ class StepRecord:
     step_size: float
     gradient_norm: float  # l2 norm of the gradient after cleaning; NaN without one
     non_finite: int  # gradient elements that had to be set to zero
-    seconds: float  # that the evaluation took
+    seconds: float  # seconds that the evaluation took
     # renders that all evaluations so far took together, this one included
     renders: int = 0
     samples: int = 1  # as of `Proposal`
@@ -176,7 +176,7 @@ def search(
             on top. Policies still plan for `steps`.
         is_out_of_time: returns whether the time is over; in place of `seconds`, for a
             run that is resumed.
-        kind: of the queries.
+        kind: kind of the queries.
         render_seed: root seed of the noise of the renders, at least 0.
 
     Raises:
@@ -226,9 +226,9 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     interrupted search claims nothing, whatever it found.
 
     Args:
-        log: of the search.
+        log: log of the search.
         stopped: why it stopped.
-        seconds: that it took.
+        seconds: seconds that it took.
     """
     best = Candidate(log.domain.start, math.nan, False)
     if log.pool:  # else nothing could be evaluated
@@ -273,22 +273,22 @@ class _Log:
 
     Attributes:
         evaluate: answers queries.
-        domain: of the search.
+        domain: domain of the search.
         on_step: called after every evaluation.
         size: maximum number of candidates.
-        kind: of the queries.
+        kind: kind of the queries.
         render_seed: root seed of their noise.
         pool: the best candidates so far, the best first.
         last: the latest configuration with a finite objective.
         best: largest raw objective so far; NaN before there is one.
-        records: of all evaluations so far.
+        records: records of all evaluations so far.
         gradients: number of gradients that were requested.
         non_finite: number of objectives that were not finite.
-        renders: that all evaluations took.
+        renders: renders that all evaluations took.
         previous_gradient: (d,) the latest that is not zero.
         agreement: cosine similarities of each gradient with the one before.
-        policy: that proposes, wrapped in `Choices` if need be.
-        state: of the policy, after its latest proposals.
+        policy: policy that proposes, wrapped in `Choices` if need be.
+        state: state of the policy, after its latest proposals.
         evaluated_batch: evaluations of these that the policy has not got yet.
     """
 
@@ -319,10 +319,10 @@ class _Log:
         Evaluations come one by one, and the time of each is that since the one before.
 
         Args:
-            proposals: to evaluate.
-            indices: of the seed of each in the stream of the search; candidates that
-                are ranked share them.
-            phase: of the search.
+            proposals: proposals to evaluate.
+            indices: indices of the seed of each in the stream of the search; candidates
+                that are ranked share them.
+            phase: phase of the search.
         """
         queries = list[Query]()
         started = time.perf_counter()
@@ -357,7 +357,7 @@ class _Log:
         """Count the costs of an evaluation; one of the search may become a candidate.
 
         Args:
-            proposal: of the policy.
+            proposal: proposal of the policy.
             evaluation: sanitized.
             phase: "search" or "ranking".
         """
@@ -380,10 +380,10 @@ class _Log:
         """Return the record of an evaluation, which `_count` has counted already.
 
         Args:
-            proposal: of the policy.
-            query: that was made of it.
+            proposal: proposal of the policy.
+            query: query that was made of it.
             evaluation: sanitized.
-            seconds: that it took.
+            seconds: seconds that it took.
         """
         objective = math.nan
         if evaluation.is_finite:
@@ -436,8 +436,8 @@ def _explore(
     use them.
 
     Args:
-        log: of the search; it is changed.
-        policy: that proposes.
+        log: log of the search; it is changed.
+        policy: policy that proposes.
         steps: renders of the search.
         seed: root seed of the policy's randomness.
         is_out_of_time: returns whether the time is over.
@@ -480,9 +480,9 @@ def _limit_batch(
     """Return copies of the first proposals, as many and as costly as the renders allow.
 
     Args:
-        proposals: of the policy.
+        proposals: proposals of the policy.
         domain: states what gradients cost.
-        renders_left: of the budget.
+        renders_left: renders left of the budget.
     """
     batch = list[Proposal]()
     for proposal in proposals:
@@ -503,7 +503,7 @@ def _rank(log: _Log, first_seed: int, repeats: int, max_extra_repeats: int) -> N
     from the pool.
 
     Args:
-        log: of the search, whose pool changes.
+        log: log of the search, whose pool changes.
         first_seed: number of the first new seed.
         repeats: renders of every candidate.
         max_extra_repeats: renders of those that remain.
@@ -541,10 +541,10 @@ def _check_proposals(
     else than configurations of the domain, which is a bug.
 
     Args:
-        proposals: of the policy.
+        proposals: proposals of the policy.
         max_count: how many it may propose.
-        domain: of the search.
-        name: of the policy.
+        domain: domain of the search.
+        name: name of the policy.
     """
     if len(proposals) > max_count:
         raise RuntimeError(

@@ -30,10 +30,11 @@ from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 class Trials:
     """How often something happened in independent trials."""
 
-    successes: int  # from 0 to `trials`
-    trials: int  # at least 1
+    successes: int  # successes from 0 to `trials`
+    trials: int  # trials at least 1
     spp: int  # samples per pixel of every trial
-    # of the interval; larger than 95 % where trials might have ended at several looks
+    # Confidence of the interval; larger than 95 % where trials might have ended at
+    # several looks.
     confidence: float = CONFIDENCE
 
     @property
@@ -81,7 +82,7 @@ def make_margin_function(
 
     Args:
         evaluate: answers queries.
-        kind: of the queries, which are numbered across all sample counts.
+        kind: kind of the queries, which are numbered across all sample counts.
         u: (d,) the configuration.
         n_images: how many images of each sample count are requested, the first ones.
         draws_conditions: whether conditions are sampled by the seeds; else they are
@@ -122,12 +123,12 @@ class Rung:
     """The margins of one configuration at one sample count.
 
     Attributes:
-        name: of the configuration.
+        name: name of the configuration.
         spp: samples per pixel.
-        mean: of the margins.
-        half_width: of the one-sided 95 % interval of the mean (Student's t), all looks
-            together.
-        drift: of the mean from the rung below; NaN at the first.
+        mean: mean of the margins.
+        half_width: half width of the one-sided 95 % interval of the mean (Student's t),
+            all looks together.
+        drift: drift of the mean from the rung below; NaN at the first.
         is_settled: whether more samples would not change the sign of the mean; see
             `choose_spp`.
     """
@@ -149,7 +150,7 @@ class SampleCount:
         converged: whether all margins have settled; if not, `spp` is the last rung of
             the ladder.
         table: a row for each configuration and rung that was measured, in this order.
-        renders: that the measurement took.
+        renders: renders that the measurement took.
     """
 
     spp: int
@@ -198,9 +199,9 @@ def choose_spp(
         seed: root seed.
         ladder: sample counts, rising, at least one, or InputError. A single one is
             returned unmeasured.
-        trials: that will follow under the same conditions. So many renders are one more
-            look, the last one, at which only the mean and every single render have to
-            be on one side; 0 where other trials follow.
+        trials: trials that will follow under the same conditions. So many renders are
+            one more look, the last one, at which only the mean and every single render
+            have to be on one side; 0 where other trials follow.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
         raise InputError(
@@ -240,12 +241,12 @@ def _summarize_rung(
     """Return the row of a configuration at one sample count.
 
     Args:
-        name: of the configuration.
+        name: name of the configuration.
         spp: samples per pixel.
         at_rung: margins of the rung.
         below: margins of the rung below; empty at the first.
         looks: number of looks at a rung.
-        trials: that will follow; 0 if other trials follow.
+        trials: trials that will follow; 0 if other trials follow.
     """
     mean = fmean(at_rung)
     half_width = (
@@ -276,7 +277,7 @@ def _climb_ladder(
         seed: root seed.
         ladder: samples per pixel of the rungs, ascending.
         look_sizes: renders of a rung after which one looks, ascending.
-        trials: that will follow; 0 if other trials follow.
+        trials: trials that will follow; 0 if other trials follow.
     """
     margins_of_rungs: list[list[float]] = [[] for _ in ladder]
     n_looks = len(look_sizes)
@@ -315,7 +316,7 @@ def _is_settled(
         at_rung: margins of a rung.
         below: margins of the rung below.
         looks: number of looks, which share the 5 %.
-        trials: that will follow; 0 if other trials follow.
+        trials: trials that will follow; 0 if other trials follow.
     """
     mean = fmean(at_rung)
     count = min(len(at_rung), len(below))
@@ -502,7 +503,7 @@ def _summarize_conditions(
     """Return the row of a configuration under many conditions at one sample count.
 
     Args:
-        name: of the configuration.
+        name: name of the configuration.
         spp: samples per pixel.
         at_rung: (n,) margins of the rung, by condition.
         below: (n,) margins of the rung below; None at the first.

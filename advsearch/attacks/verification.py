@@ -106,7 +106,7 @@ often than not. So 6 trials are the fewest that can verify anything (54 to 100 %
 class Rule:
     """When a claim counts as verified."""
 
-    percent: int = PASS_PERCENT  # of the trials in which it must hold
+    percent: int = PASS_PERCENT  # percent of the trials in which it must hold
     has_control: bool = True
     """A success counts only where the clean configuration is right, which it has to be
     in as many per cent.
@@ -281,7 +281,7 @@ def run_trials(
         trials: number of trials, those that are done included.
         n_done: number of trials that are done already; they are not repeated.
         first_index: index k of the first trial.
-        kind: of the queries.
+        kind: kind of the queries.
         n_images: how many images are requested, those of the first trials.
         is_decided: called with the new trials after each of them; if it returns True,
             no more follow.
@@ -366,8 +366,8 @@ def verify(
             them with the same spp and seed (one control group serves the attack and its
             baseline); what is missing is run here.
         rule: what counts as a success, and which ending it is.
-        kind: of the queries of the adversarial configuration.
-        control_kind: of those of the clean configuration.
+        kind: kind of the queries of the adversarial configuration.
+        control_kind: control kind of those of the clean configuration.
         n_images: how many images of the adversarial trials are requested.
         curtailed: see above; for a claim of which only the verdict matters.
         first_index: index of the first trial; if the configuration was chosen by
@@ -478,8 +478,8 @@ def _is_found(
 
     Args:
         rule: says how many have to succeed.
-        trials: of the adversarial configuration.
-        clean_trials: of the same seeds, or more.
+        trials: trials of the adversarial configuration.
+        clean_trials: clean trials of the same seeds, or more.
         count: trials that are looked at, the first ones.
         spp: samples per pixel.
         is_early: whether more trials could follow.
@@ -528,10 +528,11 @@ def _summarize_trials(
         rule: says what a success is, and how many are needed.
         claim: the search's ending.
         u: (d,) the configuration.
-        clean_trials, trials: of both groups, in the order of their seeds.
+        clean_trials, trials: clean trials and trials of both groups, in the order of
+            their seeds.
         spp: samples per pixel.
-        confidence: of the interval of the success rate.
-        renders: that were spent.
+        confidence: confidence of the interval of the success rate.
+        renders: renders that were spent.
         stopped: why there are no more trials.
         is_early: whether the needed successes are those of an early look.
         begin: index of the first trial.

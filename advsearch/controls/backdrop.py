@@ -158,8 +158,8 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     """Return the inputs by which a scene is seen as in one of its photographs.
 
     Args:
-        scene: in the first photograph.
-        index: of the photograph.
+        scene: scene in the first photograph.
+        index: index of the photograph.
     """
     assert scene.photographs is not None
     view = list(scene.photographs.scenes.values())[index]
@@ -200,7 +200,7 @@ def _check_compatible(
     """Raise InputError if a photograph can not be shown in the scene of the first one.
 
     Args:
-        name: of the photograph.
+        name: name of the photograph.
         view: the scene in it.
         first: the scene in the first one.
     """

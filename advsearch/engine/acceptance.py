@@ -166,7 +166,7 @@ def compare_with_traced(
         renderer: traces images.
         predicted: (H, W, 3) image.
         u: (d,) full configuration.
-        seed: of the noise of the traced images.
+        seed: seed of the noise of the traced images.
         spp: samples per pixel of the search.
         measure_margin: from an image and a configuration to the model's margin.
         predicted_start: (H, W, 3) image that is predicted for the start of the search
@@ -222,9 +222,9 @@ def compute_level_errors(
 
     Args:
         renderer: traces the images that they are compared with.
-        images: of one configuration.
+        images: images of one configuration.
         u: (d,) the configuration.
-        seed: of the noise of the traced images.
+        seed: seed of the noise of the traced images.
         spp: samples per pixel of each of the two traced images.
     """
     halves = renderer.render_halves(u, seed, spp)[:2]

@@ -106,8 +106,8 @@ class Bank(PredictedSearch):
     Attributes:
         trace: collects the light of conditions, on workers where there are some.
         growth_steps: evaluations whose comparison let the bank go on growing.
-        gaps: of each comparison, by how much the objective was larger under conditions
-            of the bank than under unseen ones.
+        gaps: gaps of each comparison, by how much the objective was larger under
+            conditions of the bank than under unseen ones.
     """
 
     trace: Evaluate

@@ -308,7 +308,7 @@ class Journal:
     Attributes:
         run: directory whose store has the rows; None to hold them in `rows`.
         evaluator: evaluates queries that nothing predicts.
-        rows: of a journal without a run directory.
+        rows: rows of a journal without a run directory.
         n_lost: queries whose workers all died.
         machines: description of the machines that are not like this one, by the names
             in rows.
@@ -348,7 +348,7 @@ class Journal:
         New evaluations are stored before they are yielded.
 
         Args:
-            queries: in order.
+            queries: queries in order.
             evaluate: evaluates those that are not stored; None for the journal's own
                 evaluator.
             on_replay: called with every query of a search that is read from the store.
@@ -576,7 +576,7 @@ class Journal:
         ranking already, the search had ended by then, and ends there again.
 
         Args:
-            kind: of the search.
+            kind: kind of the search.
             seconds: its limit; None for none, and then the result is None.
         """
         if seconds is None:

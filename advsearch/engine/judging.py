@@ -196,7 +196,7 @@ def judge_images(
 
     Args:
         task: judges the output.
-        output: of the model for all N images.
+        output: output of the model for all N images.
         images: (N, H, W, 3) sRGB in [0, 1].
         truths: N, or one that holds for all images.
         metrics: user functions by name.
@@ -246,11 +246,11 @@ def add_metrics(
     Metrics get copies: no function of a user can change what a run computes with.
 
     Args:
-        judgement: of the image.
+        judgement: judgement of the image.
         metrics: functions by name.
         image: (H, W, 3) sRGB in [0, 1].
-        output: of the model, for a batch of this one image.
-        truth: of the image; a metric gets it as an objective does.
+        output: output of the model, for a batch of this one image.
+        truth: truth of the image; a metric gets it as an objective does.
 
     Raises:
         InputError: a metric returns no number and no mapping of numbers.
@@ -337,9 +337,9 @@ def calibrate_task(
     that does not calibrate is returned as it is.
 
     Args:
-        task: of the model.
+        task: task of the model.
         model: whose predictions are read.
-        scenes: in order.
+        scenes: scenes in order.
         label: what is right; None for the label of each object.
         judge: the thing that is judged.
         image_settings: keywords of `render` for the images that the model sees, see
@@ -418,7 +418,7 @@ def find_label_warnings(
     """Return a warning if a label for all objects is another class than that of some.
 
     Args:
-        models: with names of classes.
+        models: models with names of classes.
         label: stated for all objects; None if each has its own.
         objects: label of each object, by name.
     """
@@ -464,7 +464,7 @@ def make_domain(
     """Return the domain of a search over some controls: a block for each group.
 
     Args:
-        controls: in the order of u.
+        controls: controls in the order of u.
         start: (d,); None for that of the controls, which leaves the scene unchanged.
         **more: fields of `Domain`.
     """
@@ -722,10 +722,10 @@ def make_objective(
 
     Args:
         requested: name of an objective, or a function.
-        task: of the model.
+        task: task of the model.
         model: whose output is maximised.
         renderer: renders the clean image for an objective that compares features.
-        seed: of the noise of that image.
+        seed: seed of the noise of that image.
         ensemble: how the objectives of several models become one. None for their mean;
             of several tasks, whose units differ, for the smallest.
 

@@ -270,12 +270,12 @@ def load_scene(
         facing: the axis of a mesh file that its front faces, "+x", "-x", "+y", "-y",
             "+z" or "-z"; by default what its format states: +z of glTF and VRM 1, -z of
             VRM 0, and +x of others. It is rotated towards +x.
-        size: of the object, its longest side in metres, 1e-4 to 1e4. Distances of the
-            camera, paths of files and the height of a photograph are in metres where
-            the size of the object is known, and in object sizes elsewhere.
-        unit: of the coordinates of the object's file, "mm", "cm", "m" or "in", which
-            gives it its size; by default bundled objects and glTF have one, and of
-            other files it is not known.
+        size: size of the object, its longest side in metres, 1e-4 to 1e4. Distances of
+            the camera, paths of files and the height of a photograph are in metres
+            where the size of the object is known, and in object sizes elsewhere.
+        unit: unit of the coordinates of the object's file, "mm", "cm", "m" or "in",
+            which gives it its size; by default bundled objects and glTF have one, and
+            of other files it is not known.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a
             picture belongs to none of them but to what makes it: `resolution` of
             `attack`, `sweep`, `render` and `Scene.renderer`.
@@ -284,8 +284,9 @@ def load_scene(
             images.txt or a transforms.json, which names it; "dashcam" or "robot", mounted at
             its height above the ground; the name of a camera of a scene file; "orbit"
             or None for a pinhole.
-        texture: of the object in place of its own: a picture file, or (h, w, 3) sRGB in
-            [0, 1] or of 8 bits, row 0 on top; `result.artifacts["texture"]`, say.
+        texture: texture of the object in place of its own: a picture file, or (h, w, 3)
+            sRGB in [0, 1] or of 8 bits, row 0 on top; `result.artifacts["texture"]`,
+            say.
         things: what stands beside the object, in metres from it, x forwards and y to
             its left: a text such as "car@12,3.5,heading=180; person@6,-2", or a list of
             such texts or of mappings, {"object": "car", "x": 12, "y": 3.5, "heading":
@@ -640,7 +641,7 @@ def choose_moments(
         space: whose controls state the exposure.
         motion: projects points of the scene into the image.
         assembly: turns the inputs of the space into those of the scene.
-        height: of the image in pixels.
+        height: height of the image in pixels.
     """
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)

@@ -107,8 +107,8 @@ def load_models(
 
     Args:
         models: names, or models that a Python caller passed.
-        task: of the models. Several tasks (`EnsembleTask`) are for one model each, and
-            these models are joined into one.
+        task: task of the models. Several tasks (`EnsembleTask`) are for one model each,
+            and these models are joined into one.
         config: has their labels, prompt, range of values, camera and number of threads.
 
     Returns:
@@ -380,7 +380,7 @@ def select_run_settings(
     """Return the run's settings for a run over a single one of its controls.
 
     Args:
-        config: of the run over all controls.
+        config: config of the run over all controls.
         qualified_name: kind and name of the control, as the configuration has it.
         control_settings: settings of the control.
 

@@ -234,7 +234,7 @@ class Problem:
 
         Args:
             u: (d,) the configuration.
-            seed: of the noise and, if they are drawn, of the conditions.
+            seed: seed of the noise and, if they are drawn, of the conditions.
             spp: samples per pixel.
             with_conditions: whether conditions are drawn; else they leave the scene
                 unchanged.
@@ -340,7 +340,7 @@ class Problem:
         Args:
             predict: from a full configuration to an image (H, W, 3).
             full_u: the full configuration.
-            seed: of the noise of the traced images.
+            seed: seed of the noise of the traced images.
             spp: samples per pixel of a rendered image.
             is_random: (d,) bool, the searched coordinates that are random here: the
                 search has not moved them.
@@ -600,7 +600,7 @@ class Problem:
 
         Args:
             full_u: the full configuration.
-            seed: of the noise.
+            seed: seed of the noise.
             spp: samples per pixel.
             collected_light: light that was collected there; None to collect it now.
         """
@@ -630,9 +630,9 @@ class Problem:
         """Evaluate a query of a search by one image of a full configuration.
 
         Args:
-            query: of a search.
+            query: query of a search.
             full_u: the full configuration.
-            seed: of the noise.
+            seed: seed of the noise.
             renderer: another one than that of the problem, such as a predictor.
 
         Returns:
@@ -704,7 +704,7 @@ class Problem:
         """Evaluate several images of one u in one batch of the model.
 
         Args:
-            render: from u (d,) to images (N, H, W, 3), with a graph.
+            render: render from u (d,) to images (N, H, W, 3), with a graph.
             full_configurations: full configuration of each image.
             u: (d,) the searched coordinates, equal in all of them.
             gradient: whether a derivative is computed.
@@ -774,8 +774,8 @@ class Problem:
         """Evaluate the mean over conditions whose images are predicted.
 
         Args:
-            render: from a slice of the conditions and u to images (N, H, W, 3), with a
-                graph.
+            render: render from a slice of the conditions and u to images (N, H, W, 3),
+                with a graph.
             full_configurations: full configuration of each condition.
             u: (d,) the searched coordinates.
             gradient: whether a derivative is computed.

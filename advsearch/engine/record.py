@@ -43,23 +43,24 @@ class RunState:
     clean_trials: tuple[Judgement, ...] = ()  # the control group's trials
     verification: Verification | None = None
     baseline_verification: Verification | None = None
-    # of the policy without print terms, where the search has them
+    # Unprinted of the policy without print terms, where the search has them.
     unprinted: SearchResult | None = None
     unprinted_verification: Verification | None = None
-    # of what the policy found, where the random search's is worse for the model and the
-    # run's adversarial scene instead
+    # Outdone verification of what the policy found, where the random search's is worse
+    # for the model and the run's adversarial scene instead.
     outdone_verification: Verification | None = None
-    # of the first of the different failures that the policy found
+    # Failure verifications of the first of the different failures that the policy
+    # found.
     failure_verifications: tuple[Verification, ...] = ()
-    # of a projector's picture in other light, by lux
+    # Ambient verifications of a projector's picture in other light, by lux.
     ambient_verifications: dict[float, Verification] = field(default_factory=dict)
     # trials of configurations drawn from the whole space
     random_trials: tuple[Judgement, ...] = ()
     bracket: Bracket | None = None
-    # of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of
-    # a run that goes on only its own
+    # Trial images of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind
+    # and number; of a run that goes on only its own.
     trial_images: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-    # of the search, (H, W, 3) 8-bit values in [0, 1], numpy
+    # Frames of the search, (H, W, 3) 8-bit values in [0, 1], numpy.
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
     # what predicted the pictures of the searches, if anything did
@@ -123,12 +124,12 @@ def make_trial_row(
     """Return the row of a trial in the store.
 
     Args:
-        kind: of the row.
-        number: of the trial among those of the kind.
-        seed: of the noise; None for a predicted image.
+        kind: kind of the row.
+        number: number of the trial among those of the kind.
+        seed: seed of the noise; None for a predicted image.
         spp: samples per pixel.
-        judgement: of its image.
-        values: of the configuration.
+        judgement: judgement of its image.
+        values: values of the configuration.
         has_success: whether a search seeks some prediction; else the row has no
             success.
     """

@@ -56,18 +56,18 @@ class View:
     """A scene from one direction.
 
     Attributes:
-        azimuth: of the camera, degrees.
+        azimuth: azimuth of the camera, degrees.
         picture: (H, W, 3) display-referred sRGB in [0, 1], rounded to 8 bits: what the
             model sees.
         linear: (H, W, 3) linear radiance times the gain, before controls change the
             finished image.
-        predictions: of the model, the most probable first.
+        predictions: predictions of the model, the most probable first.
         marks: boxes and masks of the prediction and of the truth; empty where the task
             draws nothing.
         surfaces: what each pixel shows; None if it was not requested.
-        output: of the model, for its task.
-        truth: of the scene; None where the task does not depend on what is visible, or
-            where it is unknown.
+        output: output of the model, for its task.
+        truth: truth of the scene; None where the task does not depend on what is
+            visible, or where it is unknown.
         things: visible parts of the object and each thing beside it, see
             `find_visible_things`.
     """
@@ -269,8 +269,8 @@ class _RenderedView(NamedTuple):
     Attributes:
         view: the view.
         task: after it was calibrated by the view.
-        space: of the controls in the scene of the view.
-        formation: of the image.
+        space: space of the controls in the scene of the view.
+        formation: formation of the image.
         truth_error: why the truth of the view is unknown; "" where it is known or not
             needed.
     """
@@ -305,8 +305,8 @@ def render(
     """Render a scene and predict with a model what it shows.
 
     Args:
-        scene: from `load_scene`, or what that takes.
-        model: from `load_model`, or what that takes.
+        scene: scene from `load_scene`, or what that takes.
+        model: model from `load_model`, or what that takes.
         task: reads the model's predictions: a name, a mapping with a `name` and
             options, an instance, or a function.
         label: the right labels, for a task that draws what is true; None for the
@@ -317,7 +317,7 @@ def render(
             to settings. A parameter with a range stays where a search would start.
         around: number of views, from azimuths all around the object; None for one, from
             the scene's own camera.
-        texture: of the object in place of its own, as `load_scene` takes it.
+        texture: texture of the object in place of its own, as `load_scene` takes it.
         resolution: side, or (height, width), in pixels; None for what the model takes.
         spp: samples per pixel.
         denoise: "oidn" or "none".
@@ -547,7 +547,7 @@ def make_facts(
 
     Args:
         description: the scene.
-        name: of its object.
+        name: name of its object.
         label: what is right, of the thing that is judged, or of the object where all
             are.
         describe: describes the configuration; other parameters have the values of the

@@ -64,9 +64,9 @@ def find_surface_light_refusal(
     None does not say how good its predictions are, which is measured later.
 
     Args:
-        problem: of the search.
+        problem: problem of the search.
         steps: evaluations of the search.
-        policy: by which it searches.
+        policy: policy by which it searches.
         specialise: whether anything may be left out or predicted at all.
     """
     if not specialise:

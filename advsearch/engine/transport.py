@@ -74,7 +74,7 @@ def find_matrix_refusal(
     """Return why a search is not predicted by matrices; None if it is.
 
     Args:
-        problem: of the search.
+        problem: problem of the search.
         steps: its evaluations; None for any number.
         specialise: the setting of this name.
     """
@@ -125,17 +125,17 @@ class PredictedSearch(ABC):
         title: what its preparation does, for the progress.
         what_it_renders: what the search renders afterwards, for the progress.
         is_exact: whether equal configurations have equal objectives.
-        problem: of the searches.
+        problem: problem of the searches.
         steps: evaluations of a search; those after them belong to the ranking, and are
             traced.
         draws_conditions: whether each evaluation draws conditions; see
             `Domain.draws_conditions`.
-        deviations: from traced images, of each comparison.
+        deviations: deviations from traced images, of each comparison.
         n_traced: images that were traced, for the predictor and to compare it.
         seconds: spent on both.
         n_renewals: how often the predictor was computed again; None where it never is.
-        first_traced: by kind of search, the evaluation from which on images are traced,
-            as predictions were too far off.
+        first_traced: first traced by kind of search, the evaluation from which on
+            images are traced, as predictions were too far off.
         tracing_reason: why images are traced, as a sentence; None while they are
             predicted.
         window: the window of the image that is traced; None for all of it.
@@ -307,7 +307,8 @@ class Transport(PredictedSearch):
 
     is_exact: ClassVar[bool] = True
     clean_matrix: CleanMatrix = field(default_factory=CleanMatrix)
-    # by how much predicted scores are above the lower end of those of trials
+    # Score bias by how much predicted scores are above the lower end of those of
+    # trials.
     _score_bias: float = 0.0
     # the latest matrix of each kind of search
     _current: dict[str, Predictor] = field(default_factory=dict)

@@ -74,7 +74,7 @@ class Verifier:
     Attributes:
         journal: evaluates and stores the trials.
         ladder: sample counts to choose from, ascending; a single one is not tested.
-        stages: of the progress of the run.
+        stages: stages of the progress of the run.
         state: results, images and the count of renders.
         looks: numbers of trials, ascending, after which the verdict of a group may
             stand; the last is the size of a group.
@@ -248,7 +248,7 @@ class Verifier:
         If the control group has too few trials it gets more, which are kept.
 
         Args:
-            kind: of the rows.
+            kind: kind of the rows.
             result: result of the search.
             curtailed: whether only the verdict matters, and not the rate.
             with_new_trials: whether both groups get new trials, numbered after all
@@ -285,8 +285,8 @@ class Verifier:
         """Try configurations (d,) once each, every one with a seed of its own.
 
         Args:
-            kind: of the rows.
-            configurations: by their numbers among those of the kind.
+            kind: kind of the rows.
+            configurations: configurations by their numbers among those of the kind.
             has_success: whether rows have a success.
             predictor: as for `evaluate_all`.
         """
@@ -360,9 +360,9 @@ class Verifier:
         """Begin a stage of the progress that renders trials.
 
         Args:
-            title: for the progress bar.
+            title: title for the progress bar.
             n_trials: how many there will be.
-            name: of the stage.
+            name: name of the stage.
             flags: settings that shorten it, for the hint.
             at_most: whether there may be fewer.
         """
@@ -377,7 +377,7 @@ class RetrialCondition:
     """A condition under which configurations are tried again.
 
     Attributes:
-        name: of the condition.
+        name: name of the condition.
         problem: judges its images.
         spp: samples per pixel.
         image_key: conditions of equal source share the rendered image of a trial, (H,
@@ -405,10 +405,10 @@ class Retrials:
     conditions.
 
     Args:
-        conditions: that are tried.
+        conditions: conditions that are tried.
         run: stores the trials.
         progress: counts them.
-        trials: of each configuration under each condition.
+        trials: trials of each configuration under each condition.
         seed: root seed that nothing else uses.
         executor: workers that hold the problems by the names of their conditions; None
             to render in this process.

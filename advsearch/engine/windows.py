@@ -68,9 +68,9 @@ class Windowing:
     """A window, and how far images of the ends of the budget are off outside of it.
 
     Attributes:
-        window: of the pixels that are traced.
+        window: window of the pixels that are traced.
         start: the whole image at the start.
-        deviation: of images with its surroundings.
+        deviation: deviation of images with its surroundings.
     """
 
     window: Window
@@ -186,7 +186,7 @@ def measure_outside(
     """Measure by how much images differ outside of a window, the mean over several.
 
     Args:
-        problem: of the search.
+        problem: problem of the search.
         window: the pixels that are traced.
         before: the image whose surroundings are pasted.
         others: the images that are compared with it.

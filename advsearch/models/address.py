@@ -231,7 +231,7 @@ class _TrackingHandler(urllib.request.AbstractHTTPHandler):
     off.
 
     Args:
-        deadline: of each connection, as `time.monotonic` counts.
+        deadline: deadline of each connection, as `time.monotonic` counts.
         connections: list to add to.
     """
 

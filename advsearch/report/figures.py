@@ -109,11 +109,11 @@ def draw_fractions(
     """Draw the fractions of several series, with their intervals, as dots on rows.
 
     Args:
-        axes: of matplotlib, on which it is drawn.
-        rows: by their labels, from the top; of each series a fraction in [0, 1] and
-            both bounds of its interval, or None, which is left out.
+        axes: axes of matplotlib, on which it is drawn.
+        rows: rows by their labels, from the top; of each series a fraction in [0, 1]
+            and both bounds of its interval, or None, which is left out.
         series: their names, for the legend.
-        colours: of the series; they repeat.
+        colours: colours of the series; they repeat.
     """
     # the dots of a row are spread over at most 0.8 of its height
     spacing = min(0.22, 0.8 / len(series))
@@ -146,10 +146,10 @@ def draw_searches(
     far, and a faint dot for each single evaluation.
 
     Args:
-        objectives: of each evaluation of each search, by the search's name; None where
-            it was not a number.
+        objectives: objectives of each evaluation of each search, by the search's name;
+            None where it was not a number.
         meaning: the label of the vertical axis.
-        axes: of matplotlib, on which it is drawn.
+        axes: axes of matplotlib, on which it is drawn.
         zero_means: the text at the zero line, which is left out if this is empty.
     """
     styles = cycle(((BLUE, "-"), (RED, (0.0, (4.0, 1.5))), (GREY, "-")))
@@ -186,10 +186,10 @@ def _draw_search(
     """Draw the evaluations of one search, and a line for the best so far.
 
     Args:
-        axes: of matplotlib, on which it is drawn.
-        name: of the search, for the legend.
+        axes: axes of matplotlib, on which it is drawn.
+        name: name of the search, for the legend.
         values: objective of each evaluation; None where it was not a number.
-        colour: of dots and line.
+        colour: colour of dots and line.
         dashes: matplotlib's style of the line.
     """
     objective = np.array(values, dtype=float)  # None is NaN
@@ -244,11 +244,11 @@ def draw_heat_map(
     """Draw a table of values as a map of colours, with a colour bar.
 
     Args:
-        axes: of matplotlib, on which it is drawn.
+        axes: axes of matplotlib, on which it is drawn.
         values: rows of the map, the lowest first.
         extent: (left, right, bottom, top) of the map on the axes.
-        meaning: of the colours, the label of their bar; `ACCURACY` has the range 0 to
-            1.
+        meaning: meaning of the colours, the label of their bar; `ACCURACY` has the
+            range 0 to 1.
         x_label: the name of the horizontal axis.
         y_label: the name of the vertical axis.
     """
@@ -419,7 +419,7 @@ def _to_pixel_corners(
 
     Args:
         box: (x0, y0, x1, y1) in pixels of the image before it was magnified.
-        factor: by which the image was magnified.
+        factor: factor by which the image was magnified.
         size: (width, height) of the magnified image.
     """
     x0, y0, x1, y1 = (round(bound * factor) for bound in box)
@@ -453,7 +453,7 @@ def _write_label(
         shape: has the text.
         corners: (left, top, right, bottom) of the shape.
         size: (width, height) of the image.
-        font: of the text.
+        font: font of the text.
         text_boxes: the boxes of texts written before.
     """
     text = f"true: {shape.text}" if shape.true else shape.text

@@ -126,9 +126,9 @@ def write_sheets(
     follow.
 
     Args:
-        path: of the PDF.
+        path: path of the PDF.
         pieces: what is printed, at least one.
-        title: of the whole.
+        title: title of the whole.
         paper: a name in `PAPERS`.
         profile: the ICC profile of an RGB printer, to which colours are converted; None
             leaves them sRGB.
@@ -191,7 +191,7 @@ def _make_sheet(
     """Return a page with parts of pieces, a ruler, and a text at its lower right corner.
 
     Args:
-        parts: with their places on the page.
+        parts: parts with their places on the page.
         heading: the text.
         paper: (width, height) in millimetres.
         convert: converts colours from sRGB to those of the printer; None leaves them.
@@ -420,7 +420,7 @@ def _draw_cut_marks(
     argument is a pair of edges in millimetres: left and right, or top and bottom.
 
     Args:
-        axes: of the page.
+        axes: axes of the page.
         trim_x: left and right edge of the trimmed part.
         trim_y: its top and bottom edge.
         outer_x: left and right edge with bleed.

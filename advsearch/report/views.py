@@ -99,25 +99,25 @@ class ResultPart:
     """A part of a result; what is empty is left out.
 
     Attributes:
-        title: of the part.
+        title: title of the part.
         text: paragraphs.
-        heads: of the columns.
+        heads: heads of the columns.
         rows: texts, the first of which is the row's name.
         note: how the table is to be read, for a page.
         figure: file of a figure of the numbers in the run's folder, for a page.
         pictures: groups, each of which stands side by side.
         draw: draws a chart of the numbers on matplotlib's axes, for a page; `title` and
             `text` say what is on it.
-        height: of the chart, CSS pixels.
-        size: of the figure that is kept of it, width and height in inches; None: as
-            high as the chart.
+        height: height of the chart, CSS pixels.
+        size: size of the figure that is kept of it, width and height in inches; None:
+            as high as the chart.
         parts: the run among the parts that each row is of.
-        shares: in [0, 1], by row and column: the larger, the stronger the colour of the
-            cell.
+        shares: shares in [0, 1], by row and column: the larger, the stronger the colour
+            of the cell.
         bars: drawn beside each row on a page, decoration: from, to and a mark, in [0,
             1]; None for no bar.
-        layout: of the pictures on a page: `pair`, `small`, `large`, `rows`, or as many
-            as they are.
+        layout: layout of the pictures on a page: `pair`, `small`, `large`, `rows`, or
+            as many as they are.
         live: name of what a script of the page fills; without the script the part is
             hidden.
         folded: whether a page shows it only when asked to.
@@ -150,8 +150,8 @@ class ResultPart:
 
         Args:
             rows: the values.
-            columns: by the head of each column, what makes its cell from a value: a
-                function, or a text for `str.format`.
+            columns: columns by the head of each column, what makes its cell from a
+                value: a function, or a text for `str.format`.
             more: other attributes of the part.
         """
         cells = [
@@ -403,7 +403,7 @@ class Claim(Fields):
         Args:
             name: what the scene is called.
             ending: how its search, or its trials, ended.
-            rate: of its trials.
+            rate: rate of its trials.
             spent: what was searched; None for a scene that was only tried again.
         """
         return make_case_claim(name, ending, rate, spent)
@@ -432,7 +432,7 @@ def make_case_claim(
     Args:
         name: what the scene is called.
         ending: how its search, or its trials, ended.
-        rate: of its trials.
+        rate: rate of its trials.
         spent: what was searched; None where nothing was searched, and a known scene was
             only tried again.
     """
@@ -486,7 +486,7 @@ def format_searches(renders: Mapping[str, int], policy: str, random: bool) -> st
     Args:
         renders: numbers of renders by purpose; "products" counts images that were
             predicted instead of rendered.
-        policy: of the search.
+        policy: policy of the search.
         random: random search ran too, for comparison.
     """
     n_renders = renders.get("search", 0) + renders.get("gradient", 0)
@@ -578,7 +578,7 @@ class InNotebook:
         drawn where it has none.
 
         Args:
-            axes: to draw on; None makes new ones.
+            axes: axes to draw on; None makes new ones.
         """
         if axes is None:
             axes = new_axes()
@@ -743,8 +743,8 @@ def make_chart_svg(
     Args:
         draw: draws on the axes that it is given.
         description: the text for readers who cannot see the chart.
-        width: in CSS pixels.
-        height: in CSS pixels.
+        width: width in CSS pixels.
+        height: height in CSS pixels.
     """
 
     def on_figure(figure: Figure) -> None:

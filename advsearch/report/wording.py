@@ -161,7 +161,7 @@ def explain_repeats(name: str, repeats: int, units: int) -> str:
 
     Args:
         name: what a unit is called.
-        repeats: of each unit.
+        repeats: repeats of each unit.
         units: how many there are.
     """
     if units == 1:
@@ -339,7 +339,7 @@ def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
     distance.
 
     Args:
-        things: by name, each a `runs.results.ThingSeen` as a mapping.
+        things: things by name, each a `runs.results.ThingSeen` as a mapping.
     """
     rows = []
     for name, thing in things.items():
@@ -387,9 +387,9 @@ def format_mistake(
     vase``, ``finds no cup``.
 
     Args:
-        task: of the model.
+        task: task of the model.
         thing: what it is called in the clause, such as "this mug".
-        label: that the model predicts.
+        label: label that the model predicts.
         outcome: what became of the thing; None where the task has no outcomes.
     """
     if label == NOT_A_NUMBER:
@@ -577,7 +577,7 @@ def format_formation(
 
     Args:
         formation: the settings of it.
-        gains: of several scenes, by their names, where each has its own.
+        gains: gains of several scenes, by their names, where each has its own.
     """
     height, width = formation.resolution
     denoised = "not denoised"

@@ -420,11 +420,11 @@ class Extent(Fields):
         """Return a count with the interval of its share.
 
         Args:
-            what: is counted.
-            count: how many there were.
-            total: of how many.
+            what: name of what is counted.
+            count: number of cases in which it happened.
+            total: number of all cases.
             interval: interval of the share; None is the whole of [0, 1].
-            share: kept only where it is not count over total.
+            share: an estimate of the share, if it is not count over total.
         """
         stated_share = share if total and share != count / total else None
         return cls(

@@ -57,7 +57,8 @@ class Units:
     # pictures after which the draws come again; 0 for never
     again: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS)] = 0
     noise: Count = 1  # pictures of each draw that differ in noise alone
-    # of a folder, in which the scenes are in turn; 1 where there is no folder
+    # Photographs of a folder, in which the scenes are in turn; 1 where there is no
+    # folder.
     photographs: Count = 1
     scene: Count = 1  # pictures of a scene, where there is a folder
 

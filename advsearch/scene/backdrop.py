@@ -403,7 +403,7 @@ def compute_front(
         surfaces: what is seen first at n x n points of each pixel.
         photograph_depth: (H n, W n) at the same points, in the unit of `surfaces`.
         n_points: n.
-        radius: of the surroundings, pixels.
+        radius: radius of the surroundings, pixels.
 
     Returns:
         (H, W, 2) float32 in [0, 1].

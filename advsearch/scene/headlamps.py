@@ -230,7 +230,7 @@ def _make_lamps(
         carrier: the mesh that carries them, or `CAMERA`.
         kind: beam, "low" or "high".
         radiance_unit: luminance of a radiance of 1, cd/m2.
-        weight: of each beam, see `BeamLamp`.
+        weight: weight of each beam, see `BeamLamp`.
     """
     if carrier == CAMERA:
         # in the coordinates of the camera's car, see `compute_car_pose`

@@ -599,7 +599,7 @@ def _correct_heights(
 
     Args:
         lowest: height of the lowest point of each foot, "l" and "r".
-        contact: of each foot with the ground, 0 to 1.
+        contact: contact of each foot with the ground, 0 to 1.
         amount: () fraction of the correction that is made.
     """
     ground_height = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (

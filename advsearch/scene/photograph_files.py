@@ -50,7 +50,7 @@ class PhotographView:
         spec: the photograph, and perhaps the part of it, ``desk.jpg#X,Y,WIDTH,HEIGHT``.
         file: its camera file; "" if there is none.
         camera: the camera file, if it has a lens; else None.
-        settings: of the scene.
+        settings: settings of the scene.
         object_to_camera: pose (4, 4) of the object; None if it is not stated.
         up: direction (3,) in the camera's coordinates; None if it is not stated.
         occluder: mask of what is before the object; None if there is none.
@@ -89,9 +89,9 @@ class PhotographFolder:
     """A folder of photographs, and the scene as it is rendered into each of them.
 
     Attributes:
-        path: of the folder, as it was stated.
-        camera: that the user stated for all of them; None if each has its own.
-        scenes: by the name of the photograph's file, in alphabetical order.
+        path: path of the folder, as it was stated.
+        camera: camera that the user stated for all of them; None if each has its own.
+        scenes: scenes by the name of the photograph's file, in alphabetical order.
     """
 
     path: str

@@ -209,8 +209,8 @@ def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> s
     """Return the name of the entry whose file is a photograph.
 
     Args:
-        path: of the camera file, for messages.
-        files: of the entries, by name.
+        path: path of the camera file, for messages.
+        files: files of the entries, by name.
         photograph: the file.
 
     Raises:
@@ -408,7 +408,7 @@ def _read_frame_pose(path: str, data: Mapping[str, Any], name: str) -> Float64Ar
     scale that the file has applied.
 
     Args:
-        path: of the transforms.json.
+        path: path of the transforms.json.
         data: what is in it.
         name: index of the frame.
     """

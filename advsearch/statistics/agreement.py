@@ -74,7 +74,7 @@ def correlation_interval(
     """Return the 95 % interval of a coefficient in [-1, 1], by units.
 
     Args:
-        statistic: of both measurements of some rows: `compute_kappa` or
+        statistic: statistic of both measurements of some rows: `compute_kappa` or
             `compute_rank_correlation`.
         first, second: (n,) measurements.
         units: (n,) unit of each row.

@@ -62,7 +62,8 @@ class ConfidenceSequence:
     betting", with stakes that are fixed (`benchmarks/sequential.py`).
 
     Attributes:
-        confidence: of the interval, at all times together; over 0 and under 1.
+        confidence: confidence of the interval, at all times together; over 0 and under
+            1.
         sides: 2 for the interval; 1 for each bound by itself, to decide a claim "the
             mean is at least m": if it is true only `is_under` can be wrong, and if not
             only `is_over`, so that each may be wrong as often as the confidence allows.
@@ -120,8 +121,8 @@ class ConfidenceSequence:
         bring it down again.
 
         Args:
-            mean: that the bets are on, in (0, 1).
-            counts: of the samples, by their value.
+            mean: mean that the bets are on, in (0, 1).
+            counts: counts of the samples, by their value.
         """
         threshold = np.log(self.sides / (1.0 - self.confidence))
         return bool(log_capital_of_counts(mean, counts) >= threshold)
@@ -135,8 +136,8 @@ def count_needed_samples(mean: float, *, confidence: float, value: float = 1.0) 
 
     Args:
         mean: the number, in (0, 1).
-        confidence: of the sequence.
-        value: of all samples, over `mean`.
+        confidence: confidence of the sequence.
+        value: value of all samples, over `mean`.
     """
 
     def is_enough(count: int) -> bool:
@@ -166,7 +167,7 @@ def log_capital(
     """Return the logarithm of the capital; see `log_capital_of_counts`.
 
     Args:
-        mean: that the bets are on.
+        mean: mean that the bets are on.
         values: (n,) distinct samples in [0, 1].
         counts: (n,) how often each occurs.
     """

@@ -37,9 +37,9 @@ class Prediction:
     """One prediction of a model about an image.
 
     Attributes:
-        label: in words.
-        index: of the class; None if there are no classes.
-        probability: in [0, 1]; None if the model gives none.
+        label: label in words.
+        index: index of the class; None if there are no classes.
+        probability: probability in [0, 1]; None if the model gives none.
     """
 
     label: str
@@ -57,11 +57,11 @@ class Judgement:
     """The evaluation of a model's output for one image.
 
     Attributes:
-        score: over 0 if the output is a success of the search. NaN is no success.
+        score: score over 0 if the output is a success of the search. NaN is no success.
         margin: the task's loss with its sign reversed, whatever is sought: below 0
             exactly if the prediction is not right.
         right: whether the prediction is right. NaN is not right.
-        prediction: of the model.
+        prediction: prediction of the model.
         payload: what else is stored in the run's rows, as JSON values (boxes, masks);
             None if there is nothing.
         objective: what the search maximises for this image; None without a search.
@@ -142,8 +142,8 @@ class Sight:
         mask: (H, W) bool, where it is the object.
         depth: (H, W) float, its distance, see `Facts.depth`.
         z_depth: (H, W) float, see `Facts.z_depth`.
-        size_in_metres: of the object's longest side; None if it is unknown, and distances are
-            in object sizes.
+        size_in_metres: size in metres of the object's longest side; None if it is
+            unknown, and distances are in object sizes.
     """
 
     mask: Tensor
@@ -270,7 +270,7 @@ class Task(ABC):
             recognise.
         target: what is sought instead of any wrong prediction, in the form of a truth;
             None for any.
-        name: on the command line.
+        name: name on the command line.
         objective: name of the default objective; "score" is the task's own score.
         reads_logits: whether its models return logits (N, classes). Then their outputs
             are checked as such, and the objectives of classification accept them.
@@ -325,7 +325,7 @@ class Task(ABC):
         Args:
             fits: whether a value is in range.
             expected: the range in words.
-            *names: of the options.
+            *names: names of the options.
 
         Raises:
             InputError: a value is not a number, or does not fit.
@@ -397,8 +397,8 @@ class Task(ABC):
         """Return the task with what the output for a clean image of the scene shows.
 
         Args:
-            output: for one image.
-            truth: of the scene; None if it is unknown.
+            output: output for one image.
+            truth: truth of the scene; None if it is unknown.
         """
         return self
 

@@ -158,7 +158,7 @@ def suppress(detections: Detections, min_score: float, iou: float) -> Detections
     with labels stay as they are.
 
     Args:
-        detections: of one image, with a score of every class.
+        detections: detections of one image, with a score of every class.
         min_score: minimum score of a box that takes part.
         iou: intersection over union from which boxes are duplicates; 1 disables
             suppression.
@@ -185,7 +185,7 @@ def list_boxes(
     """List the best boxes of an image after suppression, by falling score.
 
     Args:
-        detections: of one image, boxes in fractions of width and height.
+        detections: detections of one image, boxes in fractions of width and height.
         count: maximum number of boxes.
         min_score: minimum score.
         iou: intersection over union from which boxes of a class are duplicates.
@@ -304,7 +304,7 @@ class BoxFormat:
     Attributes:
         form: one of `FORMS`.
         unit: one of `UNITS`.
-        input_size: of the model's input, (height, width) in pixels.
+        input_size: input size of the model's input, (height, width) in pixels.
     """
 
     form: str

@@ -49,9 +49,9 @@ class Command(Task):
             name, or a JSON file of such.
         envelope: maximum deviation of an element in its unit: a number, or one for each
             element.
-        names: of the elements, a list or a string with commas; "action 1" and so on
-            without it.
-        units: of the elements, likewise, or one for all.
+        names: names of the elements, a list or a string with commas; "action 1" and so
+            on without it.
+        units: units of the elements, likewise, or one for all.
 
     Raises:
         InputError: a value of another type, or out of range.

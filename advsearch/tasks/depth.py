@@ -143,9 +143,10 @@ class Depth(Task):
     Args:
         tolerance: 0.25 for a factor of 1.25, the first threshold of Eigen et al. 2014
             (arXiv 1406.2283).
-        kind: of the model's values, one of `KINDS`; "" for what the network states.
-        size: of the real object, its longest side in metres, for a model that predicts
-            metres; without it the scene's.
+        kind: kind of the model's values, one of `KINDS`; "" for what the network
+            states.
+        size: size of the real object, its longest side in metres, for a model that
+            predicts metres; without it the scene's.
         seek: what an attack seeks, one of `GOALS`; "" for any wrong distance.
 
     Raises:
@@ -250,8 +251,8 @@ class Depth(Task):
         nothing.
 
         Args:
-            kind: of the model's values, one of `KINDS`, or "" if it is unknown.
-            truth: of the scene; None if it is not known yet.
+            kind: kind of the model's values, one of `KINDS`, or "" if it is unknown.
+            truth: truth of the scene; None if it is not known yet.
         """
         if not kind:
             return (

@@ -87,7 +87,7 @@ class ObjectMatch:
     Attributes:
         outcome: None if the object is out of view and nothing is detected.
         index: class of the deciding box, or the first right class if there is none.
-        score: of the deciding box; None if it is not finite.
+        score: score of the deciding box; None if it is not finite.
         iou: intersection over union of that box with the true one; None if there is
             no such box, or no true one.
     """
@@ -112,15 +112,15 @@ class Detection(ClassTask):
         boxes: format of a box, one of `FORMS`; "" for xyxy, or cxcywh for YOLO heads.
         suppression: intersection over union from which two boxes of a class are
             duplicates, of which the better one stays; 1 disables suppression.
-        unit: of box coordinates: "fractions" of the image's width and height, or
+        unit: unit of box coordinates: "fractions" of the image's width and height, or
             "pixels" of the model's input; "" to infer it from the boxes in an image of
             noise, or in a clean image of the scene if none are found in noise.
-        order: of outputs without names, or of the columns of rows: "boxes labels
-            scores", say, with "batch" for the index of the image; for YOLO heads
-            "boxes scores" or "boxes objectness scores", optionally followed by
-            "channels first" or "channels last"; for DETR "boxes logits", or "boxes
-            logits nothing" if the last class means no object; "" to infer it from
-            types and values.
+        order: order of outputs without names, or of the columns of rows: "boxes labels
+            scores", say, with "batch" for the index of the image; for YOLO heads "boxes
+            scores" or "boxes objectness scores", optionally followed by "channels
+            first" or "channels last"; for DETR "boxes logits", or "boxes logits
+            nothing" if the last class means no object; "" to infer it from types and
+            values.
         seek: what an attack seeks, one of `GOALS`.
 
     Raises:
@@ -137,7 +137,7 @@ class Detection(ClassTask):
     unit: str = ""
     order: str = ""
     seek: str = "vanish"
-    # of the model, (height, width) in pixels
+    # Input size of the model, (height, width) in pixels.
     input_size: tuple[int, int] = field(default=(1, 1), metadata=FROM_RUN)
     # Inferred from the model's outputs; "" as long as they leave it open.
     inferred_unit: str = field(default="", metadata=FROM_RUN)
@@ -333,7 +333,7 @@ class Detection(ClassTask):
         more channels than the box and the scores take.
 
         Args:
-            output: of N images.
+            output: output of N images.
             order: one of `HEADS` with a layout, if there are grids.
         """
         for detections in output:
@@ -504,9 +504,9 @@ class Detection(ClassTask):
         out of view, unless boxes where nothing is are sought.
 
         Args:
-            output: of N images.
-            truth: of the scene.
-            function: from the detections of an image to its value.
+            output: output of N images.
+            truth: truth of the scene.
+            function: function from the detections of an image to its value.
         """
         is_out_of_view = truth.box is None and self.seek != "create"
         values = []
@@ -887,11 +887,11 @@ class Detection(ClassTask):
         """Return an outcome with the best box among the candidates.
 
         Args:
-            outcome: that the candidates stand for.
-            detections: of the image.
+            outcome: outcome that the candidates stand for.
+            detections: detections of the image.
             scores: (D,) of each box for this outcome.
             is_candidate: (D,) bool.
-            truth: of the scene.
+            truth: truth of the scene.
         """
         # scores are at least 0, so that other boxes come last
         row = int(torch.where(is_candidate, scores, -1.0).argmax())

@@ -146,7 +146,7 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
     Args:
         returned: by the network, in one of the forms of `EXPECTED`.
         count: number of images.
-        order: of components without names, see `parse_order`; "" to infer it.
+        order: order of components without names, see `parse_order`; "" to infer it.
 
     Raises:
         ValueError: it has another form, or scores are not in [0, 1].
@@ -275,7 +275,7 @@ def _split_batch_rows(
     is padding.
 
     Args:
-        rows: of all images.
+        rows: rows of all images.
         count: number of images.
         order_names: the order that the user stated, or none.
 
@@ -629,7 +629,7 @@ def _without_padding(
     """Remove rows of padding, and count those that are all NaN as `blank`.
 
     Args:
-        components: of one image, with a row for each box.
+        components: components of one image, with a row for each box.
         is_padding: (D,) bool.
         values: (D, K) the numbers of each box beside its coordinates.
     """
@@ -652,7 +652,7 @@ def resolve_detections(
     """Return the detections of an image with boxes, scores and labels identified.
 
     Args:
-        detections: of one image, see the module.
+        detections: detections of one image, see the module.
         order: one of `ORDERS` or `QUERIES`, or of `HEADS` with a layout; "" to infer
             it from the values.
         classes: number of classes; None if it is unknown.
@@ -677,9 +677,10 @@ def _split_by_class_count(
     """Return boxes (D, 4) and scores (D, C) of a YOLO grid ("raw") or of DETR logits.
 
     Args:
-        detections: of one image.
+        detections: detections of one image.
         classes: number of classes, C.
-        order: of the grid one of `HEADS` with a layout, of logits one of `QUERIES`.
+        order: order of the grid one of `HEADS` with a layout, of logits one of
+            `QUERIES`.
     """
     if "raw" in detections:
         boxes, scores = split_grid(detections["raw"], classes, order)
@@ -697,7 +698,7 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
     with these as scores and labels.
 
     Args:
-        detections: of one image.
+        detections: detections of one image.
         order: what the numbers are: one of `ORDERS`, or of `HEADS` with a layout if
             both are scores; "" if that is unknown.
 
@@ -964,7 +965,7 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
     the channels beyond boxes and scores seem to be; it follows on a message.
 
     Args:
-        n_channels: of a box.
+        n_channels: number of channels of a box.
         classes: number of classes.
         may_be_rows: whether boxes are rows, which may begin with six numbers.
     """

@@ -29,7 +29,7 @@ class Rig(tasks.JointTask):
     that more than half of them are at or below.
 
     Args:
-        task: of each image: a name, or a mapping with a `name` and options.
+        task: task of each image: a name, or a mapping with a `name` and options.
         rule: one of `RULES`.
 
     Raises:

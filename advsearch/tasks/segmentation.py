@@ -158,7 +158,7 @@ class Segmentation(tasks.ClassTask):
 
         Args:
             output: logits (N, classes, h, w).
-            truth: of the scene.
+            truth: truth of the scene.
             compute_margin: returns the margins of pixels from their logits (N * P,
                 classes) and the labels.
             labels: classes that the margin is about.
@@ -255,7 +255,7 @@ class Segmentation(tasks.ClassTask):
 
         Args:
             counts: pixels by class, (classes,).
-            n_pixels: in all.
+            n_pixels: number of pixels in all.
         """
         return {
             self.get_class_name(class_id): round(class_count / n_pixels, 4)
@@ -275,7 +275,7 @@ class Segmentation(tasks.ClassTask):
 
         Args:
             counts: the object's pixels by class, (classes,).
-            truth: of the image.
+            truth: truth of the image.
             accuracy: fraction of the object's pixels that are right.
             is_right: whether enough of them are.
         """

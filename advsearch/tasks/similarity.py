@@ -35,12 +35,12 @@ class Gallery:
     """Embedded reference images.
 
     Attributes:
-        names: of the folders, in order.
+        names: names of the folders, in order.
         name_index: (R,) int64, the index of each image's name.
-        paths: of each image, relative to the folder.
+        paths: paths of each image, relative to the folder.
         features: (R, D), of length 1.
         embedder: the network that embedded them, and its preprocessing.
-        head: of `linear`: weights (names, D) and biases (names,).
+        head: head of `linear`: weights (names, D) and biases (names,).
     """
 
     names: tuple[str, ...]
@@ -84,8 +84,8 @@ def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
     and then preprocessed like a rendered one. The result is deterministic.
 
     Args:
-        folder: with the folders.
-        model: that returns features.
+        folder: folder with the folders.
+        model: model that returns features.
         linear: fit a linear head on the features.
 
     Raises:
@@ -462,7 +462,7 @@ def _rank_references(
     """Rank the right reference images and the right name for each of N images.
 
     Args:
-        gallery: of R references.
+        gallery: gallery of R references.
         features: (N, D), of length 1.
         logits: (N, names).
         truth: indices of the right names.

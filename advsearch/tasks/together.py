@@ -59,7 +59,7 @@ def join_models(models: Sequence[Model], size: tuple[int, int] | None = None) ->
 
     Args:
         models: at least one.
-        size: of the images, (height, width) in pixels; None for the maximum of the
+        size: size of the images, (height, width) in pixels; None for the maximum of the
             models' input sizes.
 
     Returns:

@@ -88,7 +88,7 @@ class ConnectionPool:
         listening_socket: the socket that listens.
         handle: serves a connection in a worker's thread; calls `report_waiting` when it
             begins or ends to wait for the client.
-        context: for HTTPS; without it, HTTP.
+        context: context for HTTPS; without it, HTTP.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class ConnectionPool:
         no longer.
 
         Args:
-            seconds: that it will wait at most; None where it no longer waits.
+            seconds: seconds that it will wait at most; None where it no longer waits.
         """
         client = self._connections[threading.get_ident()]
         if seconds is None:

@@ -69,8 +69,8 @@ def make_part(run: Path, part: ResultPart, description: str) -> Html:
 
     Args:
         run: directory of the run.
-        part: of its result.
-        description: of the chart, where the part has no text of its own.
+        part: part of its result.
+        description: description of the chart, where the part has no text of its own.
     """
     content = _part_content(run, part, description)
     title = make_element("h2", part.title) if part.title else None

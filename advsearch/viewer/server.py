@@ -216,7 +216,7 @@ def make_progress_page(name: str, run: Path) -> str:
     the request.
 
     Args:
-        name: of the run in the dashboard.
+        name: name of the run in the dashboard.
         run: its directory.
     """
     listed = listing.read_listed_run(run)
@@ -366,9 +366,9 @@ class PhotographServer(Protocol):
 
         Args:
             run: directory of the run.
-            name: of the rendering that it shows.
-            headers: of the request.
-            key: that the page has and the request needs.
+            name: name of the rendering that it shows.
+            headers: headers of the request.
+            key: key that the page has and the request needs.
             read_data: reads the photograph's file from the request.
 
         Raises:
@@ -798,7 +798,7 @@ def _make_source(name: str, run: Path, base: str) -> SweepSource:
     """Return where the page of a sweep gets rows and images from.
 
     Args:
-        name: of the run.
+        name: name of the run.
         run: its directory.
         base: address of the run, relative to the page.
     """

@@ -141,7 +141,7 @@ class Thumbnails:
         """Return the image of a configuration as a PNG; None if it was not stored.
 
         Args:
-            step: of the row; several rows may be of one image.
+            step: step of the row; several rows may be of one image.
 
         Raises:
             FileFormatError: the file is no JPEG.

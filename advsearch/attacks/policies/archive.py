@@ -50,11 +50,11 @@ class ArchiveState:
     """State of the search.
 
     Attributes:
-        domain: of the search.
-        seed: of random numbers.
+        domain: domain of the search.
+        seed: seed of random numbers.
         measure_indices: (k,) indices in u of the parameters that span the archive.
         half_widths: (d,) half of the range of each element of u.
-        archive: of ribs; never written to again.
+        archive: archive of ribs; never written to again.
         generation: index of the present generation.
         points: (n, d) its configurations.
         values: objectives of the first of them.
@@ -102,7 +102,7 @@ class ArchiveState:
 
         Args:
             samples: (n, d) configurations that are sampled anew.
-            rng: of the noise, the steps and what is sampled anew.
+            rng: generator of the noise, the steps and what is sampled anew.
         """
         count, dim = samples.shape
         first, second = self._sample_parents(count)
@@ -205,8 +205,9 @@ def _find_cell_ranges(
     """Return the range (low, high) of each parameter of the archive in a cell.
 
     Args:
-        measure_indices: of the parameters in u; they are the keys of the result.
-        boundaries: of the cells on each axis, ascending.
+        measure_indices: measure indices of the parameters in u; they are the keys of
+            the result.
+        boundaries: boundaries of the cells on each axis, ascending.
         grid_index: index of the cell on each axis.
     """
     ranges = {}
@@ -229,9 +230,9 @@ def _make_candidates(
     they may lie in any cell.
 
     Args:
-        state: of the search.
+        state: state of the search.
         observations: have the box.
-        rng: of the samples.
+        rng: generator of the samples.
     """
     box = observations.box
     uniform = torch.rand(N_CANDIDATES, box.count, generator=rng)
@@ -251,10 +252,10 @@ def _make_archive(
     """Return an empty archive of ribs: a grid over the ranges of some parameters.
 
     Args:
-        domain: of the search.
+        domain: domain of the search.
         measure_indices: (k,) indices in u of the parameters.
         dims: number of cells along the axis of each.
-        seed: of the search.
+        seed: seed of the search.
     """
     from ribs import archives  # an extra, and it takes seconds
 

@@ -150,16 +150,16 @@ class AutoState:
     """State of the search.
 
     Attributes:
-        domain: of the search.
+        domain: domain of the search.
         observations: evaluations of the screen and the surrogate, with norm balls at
             their start.
         plan: how the renders are divided.
-        seed: of random numbers.
+        seed: seed of random numbers.
         screen: (m, k) box coordinates of the screen's points after the initial one.
-        renders_spent: by the evaluations so far.
+        renders_spent: renders spent by the evaluations so far.
         ascent: state of PGD, once it has begun.
         is_climbing: whether the latest proposal was the ascent's.
-        latest_objective: of the ascent.
+        latest_objective: latest objective of the ascent.
         box_before_trial: (k,) box coordinates before the latest proposal moved them at
             random; None if it did not.
     """
@@ -293,8 +293,8 @@ class Auto(Policy[AutoState]):
         coordinates at random besides.
 
         Args:
-            state: of the search.
-            proposal: of PGD.
+            state: state of the search.
+            proposal: proposal of PGD.
             count: evaluations of the ascent so far.
         """
         proposal = replace(proposal, gradient=state.plan.gradient)

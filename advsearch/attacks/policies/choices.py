@@ -36,10 +36,10 @@ class Runner:
     """One search in a race.
 
     Attributes:
-        policy: that searches.
-        domain: that it searches.
-        state: of the policy.
-        renders_left: that it may still use in this round.
+        policy: policy that searches.
+        domain: domain that it searches.
+        state: state of the policy.
+        renders_left: renders left that it may still use in this round.
         best_objective: the largest so far.
         is_over: whether it has nothing more to propose.
     """
@@ -62,7 +62,7 @@ class Race:
     Attributes:
         runners: the searches.
         steps: renders of the race.
-        n_rounds: of the race.
+        n_rounds: number of rounds of the race.
         active_runners: indices of the searches in this round, the best first.
         round: index of the present round.
         spent: renders that the evaluations so far took.
@@ -223,7 +223,7 @@ def start_race(
     Args:
         searches: policies, each with the domain that it searches.
         steps: renders of the race.
-        seed: of random numbers.
+        seed: seed of random numbers.
         rounds: by default `count_rounds`.
     """
     steps = max(1, steps)
@@ -337,7 +337,7 @@ class ChoicesState(Race):
     """State of the search: a race over the numbers alone.
 
     Attributes:
-        domain: of numbers and choices.
+        domain: domain of numbers and choices.
         numbers: (k,) indices of the numbers in u.
         choices: (c,) indices of the discrete choices in u.
         combinations: (n, c) elements of u at the choices, for each search of the race.
@@ -502,10 +502,10 @@ def _select_combinations(
     ones are sampled, in ascending order.
 
     Args:
-        n_options: of each of the c choices.
+        n_options: number of options of each of the c choices.
         initial_point: (c,) elements of u.
         max_combinations: number of combinations, or fewer if there are fewer.
-        generator: of random numbers.
+        generator: generator of random numbers.
     """
     sizes = torch.tensor(n_options)
     # index of the option of each choice; u = 1 belongs to the last
@@ -543,11 +543,11 @@ def _sample_combinations(
     ascending order.
 
     Args:
-        n_options: of each of the c choices; there are far more combinations than are
-            sampled.
+        n_options: number of options of each of the c choices; there are far more
+            combinations than are sampled.
         initial: the combination that is not sampled.
         count: number of combinations.
-        generator: of random numbers.
+        generator: generator of random numbers.
     """
     sampled = set[tuple[int, ...]]()
     while len(sampled) < count:

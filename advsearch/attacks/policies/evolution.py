@@ -81,8 +81,8 @@ class NESState:
     """State of the search. Samples are not stored but drawn again from their seeds.
 
     Attributes:
-        domain: of the search.
-        seed: of random numbers.
+        domain: domain of the search.
+        seed: seed of random numbers.
         half_widths: (d,) half of the range of each element of u.
         mean: (d,) of the distribution, in u.
         deviation: (d,) its standard deviation, in half ranges.
@@ -260,8 +260,8 @@ class CMAESState:
     """State of the search. u = P(origin + half_widths * x) for coordinates x of pycma.
 
     Attributes:
-        domain: of the search.
-        seed: of random numbers.
+        domain: domain of the search.
+        seed: seed of random numbers.
         origin: (d,) configuration at x = 0, where the present run began.
         half_widths: (d,) half of the range of each element of u.
         is_periodic: (d,) which elements wrap, and so are never out of the domain.
@@ -269,7 +269,8 @@ class CMAESState:
         generation: index of the present generation.
         points: (n, d) its points, in x.
         values: objectives of its first points.
-        violations: of the same points, mean squared distance from the domain.
+        violations: violations of the same points, mean squared distance from the
+            domain.
         best: largest objective of the present run.
         best_run: largest objective of the runs before and the distribution at the end
             of the run that met it; None in the first run.

@@ -178,7 +178,7 @@ class Components:
         Args:
             x: (n, d) samples, in fractions of each range.
             weights: (n,) of the samples.
-            ranges: of the elements.
+            ranges: ranges of the elements.
             uniform_probs: (k, d, m) uniform probabilities of options, the prior.
         """
         log_densities = self.compute_log_densities(x, ranges)
@@ -217,7 +217,7 @@ class Components:
             mean_offset: (k, d) from the old means to those of the samples.
             variance: (k, d) of the samples.
             counts: (k, 1) samples of each component.
-            ranges: of the elements.
+            ranges: ranges of the elements.
         """
         # averaged with the uniform variance, the prior; below it, so that the precision
         # stays positive
@@ -269,9 +269,9 @@ class MixtureState:
     Points are in fractions of each range.
 
     Attributes:
-        domain: of the search.
-        seed: of its random numbers.
-        ranges: of the elements of u.
+        domain: domain of the search.
+        seed: seed of its random numbers.
+        ranges: ranges of the elements of u.
         generation: index of the present generation.
         mixtures: mixtures of the generations in the window; None of a uniform one.
         points: (n, d) samples of the present generation.
@@ -369,7 +369,7 @@ class Mixture(Policy[MixtureState]):
     search's samples. In an l2 ball no share is told.
 
     Attributes:
-        components: of the mixture, 1 to 20.
+        components: components of the mixture, 1 to 20.
         even: share of the draws that is even, 0.05 to 1; weights are 1 / even at most.
         population: draws a generation, at least 2.
     """

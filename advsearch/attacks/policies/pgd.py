@@ -50,9 +50,9 @@ def clip_gradient(
     - In a domain that is `exact`, or `draws_conditions`, nothing is an outlier.
 
     Args:
-        domain: of the gradient.
+        domain: domain of the gradient.
         gradient: (d,), finite.
-        lengths: of the latest gradients, before this.
+        lengths: lengths of the latest gradients, before this.
 
     Returns:
         The clipped gradient; the lengths with this one's, before it was scaled down;
@@ -123,7 +123,7 @@ class Peak(NamedTuple):
     """The best evaluation so far.
 
     Attributes:
-        objective: of that evaluation, with its noise.
+        objective: objective of that evaluation, with its noise.
         u: (d,) its configuration.
         direction: (d,) the accumulated gradient after it.
     """
@@ -214,9 +214,9 @@ class Ascent:
     """The state of an ascent.
 
     Attributes:
-        domain: of the search.
+        domain: domain of the search.
         steps: evaluations that are planned.
-        seed: of random numbers.
+        seed: seed of random numbers.
         u: (d,) to propose next.
         direction: (d,) accumulated gradient; of Adam, the mean of gradients.
         step_size: before it is decayed, in units of each block's radius.
@@ -225,11 +225,13 @@ class Ascent:
         count: evaluations so far.
         n_updates: gradients that were accumulated.
         n_flat: gradients of zero in a row.
-        lengths: of the latest gradients, see `clip_gradient`.
+        lengths: lengths of the latest gradients, see `clip_gradient`.
         counts: outliers and rejected steps.
-        window: of PGD, the present window.
-        start_objective: of PGD, the objective of its first evaluation; NaN before it.
-        n_idle_windows: of PGD without noise, windows in a row that added nothing.
+        window: window of PGD, the present window.
+        start_objective: start objective of PGD, the objective of its first evaluation;
+            NaN before it.
+        n_idle_windows: number of idle windows of PGD without noise, windows in a row
+            that added nothing.
     """
 
     domain: Domain
@@ -543,7 +545,7 @@ class Adam(AscentPolicy):
 
     Attributes:
         step_size: the first rate, over 0, at most 2.
-        beta1, beta2: in [0, 1).
+        beta1, beta2: beta1 and beta2 in [0, 1).
     """
 
     step_size: float = 0.3

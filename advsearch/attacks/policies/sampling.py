@@ -32,8 +32,8 @@ class PointsState:
     """State of a search that does not look at evaluations.
 
     Attributes:
-        domain: of the search.
-        seed: of random numbers.
+        domain: domain of the search.
+        seed: seed of random numbers.
         points: (n, k) that the next configurations come from: the full grid, or the
             present chunk of a sequence. Empty if they come from the seed alone.
         n_proposed: configurations that were proposed so far.
@@ -150,7 +150,7 @@ def sample_sobol_points(size: int, seed: int, begin: int, count: int) -> Tensor:
 
     Args:
         size: dimensions.
-        seed: of the scrambling.
+        seed: seed of the scrambling.
         begin: number of the first point.
         count: number of points; a power of two, which keeps them balanced.
     """
@@ -267,7 +267,7 @@ def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Ten
     these. The last axis of the grid runs fastest.
 
     Args:
-        blocks: of each axis.
+        blocks: blocks of each axis.
         counts: number of values of each axis.
     """
     # of all points of the grid over the axes so far
@@ -289,7 +289,7 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
     fit, at least 2; then each in turn takes one more as long as the grid fits.
 
     Args:
-        domain: to search.
+        domain: domain to search.
         steps: renders that the grid may take.
         points: values of each number; 0 for as many as fit.
 
@@ -324,7 +324,7 @@ def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
     """Return how many values each element of u takes so that the grid just fits.
 
     Args:
-        options: of each element; 0 of a number, which takes at least 2 values.
+        options: options of each element; 0 of a number, which takes at least 2 values.
         steps: points of the grid, at most.
     """
     n_combinations = math.prod(count for count in options if count)

@@ -197,8 +197,8 @@ class Surrogate:
         factor: (n, n) Cholesky factor of the kernel matrix with noise, for a signal of
             variance 1.
         weights: (n,) the inverse of that matrix, times the values without their mean.
-        mean: of the signal.
-        variance: of the signal.
+        mean: mean of the signal.
+        variance: variance of the signal.
         likelihood: log-likelihood, up to a constant.
     """
 

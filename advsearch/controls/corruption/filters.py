@@ -181,7 +181,7 @@ def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
     below the quantile.
 
     Args:
-        mean: of each count, 0 to about 80.
+        mean: mean of each count, 0 to about 80.
         quantile: quantile of each count in [0, 1), of the same shape.
     """
     probability = torch.exp(-mean.double())

@@ -77,7 +77,7 @@ class Bench:
 
     Attributes:
         renderer: renders the image.
-        loss: of the image.
+        loss: loss of the image.
         u: (d,) configuration.
         seed: root seed of the noise.
         spp: samples per pixel.
@@ -110,7 +110,7 @@ class Bench:
 
         Args:
             plan: how derivatives are computed.
-            stream: of seeds; each gradient has the seed of its index.
+            stream: stream of seeds; each gradient has the seed of its index.
             repeats: how many gradients.
             label: name under which each is stored; None to store none.
 

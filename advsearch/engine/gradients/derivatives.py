@@ -137,10 +137,10 @@ def compare_with_reference(
     nothing about the size of errors that matter.
 
     Args:
-        estimate: to rate.
-        reference: of the same probe.
+        estimate: estimate to rate.
+        reference: reference of the same probe.
         others: references of the other probes of its control.
-        probe: for the names in the row; None leaves them empty.
+        probe: probe for the names in the row; None leaves them empty.
         spp: samples per pixel of the estimate, for the row.
     """
     min_sizes = [MIN_SIZE_FRACTION * abs(other.value) for other in others]
@@ -355,11 +355,11 @@ def measure_estimates(
     """Measure one estimator of one control's groups along some probes of them.
 
     Args:
-        bench: of the renderer.
-        estimator: of the groups.
-        probes: of these groups only.
+        bench: bench of the renderer.
+        estimator: estimator of the groups.
+        probes: probes of these groups only.
         repeats: number of gradients, each with its own seed.
-        factor: on the planned step of differences.
+        factor: factor on the planned step of differences.
     """
     names = {probe.group.name for probe in probes}
     plan = restrict_plan(bench.renderer.plan.scale_steps(factor), names, estimator)
@@ -391,7 +391,7 @@ def measure_derivatives(
     of many samples.
 
     Args:
-        bench: of the renderer.
+        bench: bench of the renderer.
         reference_spp: samples per pixel of the references, if more than the bench's.
         reference_repeats: as `repeats` of `measure_reference`.
         reference_factors: as `factors` of `measure_reference`.
@@ -453,9 +453,9 @@ def _try_estimators(
     """Yield how estimators agree with references along probes.
 
     Args:
-        bench: of the renderer.
-        probes: of one control, which share their estimators.
-        references: by the names of all the control's probes.
+        bench: bench of the renderer.
+        probes: probes of one control, which share their estimators.
+        references: references by the names of all the control's probes.
         tries: estimators with factors on the step; one with a factor other than 1 is
             tried along probes along which none was `ok` before.
         repeats: number of gradients with the factor 1, and with another one.

@@ -464,7 +464,7 @@ def measure_path_length(
     Args:
         renderer: renders the images.
         configurations: full configurations (d,).
-        seed: of the noise.
+        seed: seed of the noise.
         spp: samples per pixel.
         bound: accepted change of the image, see `MAX_CHANGE`.
         tick: called after each image of a configuration.

@@ -406,7 +406,7 @@ class _NameClassifier(nn.Module):
 
         Args:
             reader: the network.
-            tokens: of each name, at least one.
+            tokens: tokens of each name, at least one.
         """
         super().__init__()
         self.reader = reader

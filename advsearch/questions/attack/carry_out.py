@@ -183,8 +183,8 @@ def move_to_photographs(
     pose and ground. Controls that vary by chance what a photograph fixes are left out.
 
     Args:
-        parts: of the attack.
-        folder: of photographs.
+        parts: parts of the attack.
+        folder: folder of photographs.
 
     Returns:
         The parts by the name of the photograph's file: in photographs that the attack

@@ -94,7 +94,7 @@ class PairImages:
         Args:
             rows: indices of the pairs.
             sides: those with images of their own, by the letter in the file's name.
-            files: of each row, one for each of these sides.
+            files: files of each row, one for each of these sides.
             run: the run directory.
         """
         missing = []

@@ -77,9 +77,9 @@ def _is_clearer_than_noise(seed: int, points: FloatArray, silhouette: float) -> 
     A cloud has as many points, normal with the same deviation in each dimension.
 
     Args:
-        seed: of the references.
-        points: that were clustered.
-        silhouette: of their clusters.
+        seed: seed of the references.
+        points: points that were clustered.
+        silhouette: silhouette of their clusters.
     """
     generator = np.random.default_rng(seed)
     spread = points.std(axis=0)

@@ -40,7 +40,7 @@ def find_envelope(
     Args:
         choosing: rows that choose the box.
         counting: rows that test it, once.
-        accuracy: in (0, 1), the lower bound of a 95 % interval.
+        accuracy: accuracy in (0, 1), the lower bound of a 95 % interval.
     """
     if choosing.empty:
         return None
@@ -121,7 +121,7 @@ def list_factor_peels(
     without its lowest or its highest numbers.
 
     Args:
-        condition: on the factor, of the box.
+        condition: condition on the factor, of the box.
         column: values of the factor in the rows inside the box.
     """
     if column.dtype == "category":

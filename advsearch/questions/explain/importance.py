@@ -140,9 +140,9 @@ class ClusteredPredictions:
         cluster: the number of the cluster of each (n,): its drive, say.
         n_clusters: how many there are.
         is_independent: whether each prediction is a cluster by itself.
-        weight: of each prediction (n,), 1 on average.
+        weight: weight of each prediction (n,), 1 on average.
         mean: weighted fraction of right predictions.
-        variance: of the predictions.
+        variance: variance of the predictions.
     """
 
     def __init__(self, table: pd.DataFrame) -> None:
@@ -398,11 +398,12 @@ def find_noncentrality(
     already without any.
 
     Args:
-        statistic: of a noncentral chi-squared distribution, or `degrees` times one of
-            F.
-        degrees: of freedom.
-        error_degrees: of freedom of F's denominator; infinity for chi-squared.
-        probability: of a value up to the statistic.
+        statistic: statistic of a noncentral chi-squared distribution, or `degrees`
+            times one of F.
+        degrees: degrees of freedom.
+        error_degrees: error degrees of freedom of F's denominator; infinity for
+            chi-squared.
+        probability: probability of a value up to the statistic.
     """
 
     def excess_probability(noncentrality: float) -> float:

@@ -58,9 +58,9 @@ class Renders:
     """Runs sweeps in the directory of the run, until it is interrupted.
 
     Attributes:
-        context: of the experiment.
+        context: context of the experiment.
         sweeps: whose rows are explained.
-        rows: of these.
+        rows: rows of these.
         table: what varies among the rows (`rules`).
         n_renders: images that were rendered.
         interrupted: whether Ctrl-C has ended the renders.
@@ -124,7 +124,7 @@ class Renders:
 
         Args:
             counted_rules: all of them, in their order.
-            index: of the rule.
+            index: index of the rule.
         """
         if not self.config.confirm:
             return None
@@ -161,10 +161,11 @@ class Renders:
         Where a condition on an angle has two arcs, each has a sweep of its own.
 
         Args:
-            index: of the rule.
+            index: index of the rule.
             rule: the rule.
-            uncovered_fraction: of its rows, that no earlier rule covers.
-            earlier_conditions: of the rules before it.
+            uncovered_fraction: uncovered fraction of its rows, that no earlier rule
+                covers.
+            earlier_conditions: earlier conditions of the rules before it.
 
         Returns:
             A frame for each sweep, whose units are distinct from those of others.
@@ -255,8 +256,8 @@ class Renders:
         rendered.
 
         Args:
-            name: of the pair.
-            index: of the failure among the rows.
+            name: name of the pair.
+            index: index of the failure among the rows.
             factor: which is varied; everything else is as in the failure.
         """
         config = self.sweeps[self.rows["sweep"][index]].config
@@ -321,7 +322,7 @@ class Renders:
         All names are equally near, so of names it is the first that is right.
 
         Args:
-            factor: that has the values.
+            factor: factor that has the values.
             is_right: whether each value is predicted right.
             values: numbers or names.
             wrong_value: one of them.

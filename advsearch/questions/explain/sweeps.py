@@ -38,8 +38,8 @@ def make_sweep_inside(
         table: the rows that the conditions are of.
         conditions: all of which hold.
         samples: configurations, about.
-        seed: of the draws.
-        arc: of an angle that may lie on either side, the index of the side.
+        seed: seed of the draws.
+        arc: arc of an angle that may lie on either side, the index of the side.
     """
     inside = table[rules.find_covered(conditions, table)]
     values_inside = {
@@ -120,7 +120,7 @@ def cut_controls(
         config: settings of the sweep.
         table: its rows.
         conditions: those of names, and of what was not sampled, are skipped.
-        arc: of an angle that may lie on either side, the index of the side.
+        arc: arc of an angle that may lie on either side, the index of the side.
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
@@ -182,7 +182,7 @@ def make_sweep_along(
         row: the values of the row.
         factor: which varies.
         table: the rows, whose values the factor has.
-        seed: of the noise.
+        seed: seed of the noise.
     """
     values = list_values_along(table[factor], row[factor])
     grid: dict[str, object] = {

@@ -190,7 +190,7 @@ class Trainer(ABC):
 
         Args:
             n_steps: steps so far, this one included.
-            average: of each parameter; changed in place.
+            average: average of each parameter; changed in place.
             parameters: after the step.
         """
         decay = min(self.average_decay, n_steps / (n_steps + 5))

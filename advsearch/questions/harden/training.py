@@ -422,8 +422,8 @@ class GradientComputer:
         Args:
             student: the network.
             part: the lessons, textures first.
-            plain_weight: of each plain image.
-            worst_weight: of each worst image.
+            plain_weight: plain weight of each plain image.
+            worst_weight: worst weight of each worst image.
             seed: seed of the augmentation and the mixing.
         """
         # of each image: first all plain ones, then the worst ones

@@ -118,7 +118,7 @@ def _draw_stacked_bar(
     Args:
         axes: axes of matplotlib.
         position: position of the bar on the vertical axis.
-        counts: of each prediction its tally, and how often it is right.
+        counts: counts of each prediction its tally, and how often it is right.
     """
     left = 0.0
     for tally, n_right in counts:

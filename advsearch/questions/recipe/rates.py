@@ -588,7 +588,7 @@ def _describe_series(
 
     Args:
         cells: for each row a tally for each series.
-        totals: of each series over all rows.
+        totals: totals of each series over all rows.
         series: their names.
         options: options of the figure.
     """

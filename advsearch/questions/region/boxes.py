@@ -88,7 +88,7 @@ def grow_box(
         is_same: whether a point has the prediction of the centre.
         center: center in [0, 1] (d,).
         seed: seed of the random points.
-        samples: of each check.
+        samples: samples of each check.
         on_check: called at the beginning of each check.
 
     Raises:

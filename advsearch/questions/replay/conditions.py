@@ -325,8 +325,8 @@ def photograph_conditions(
     If the run used a single one of them, that is left out: it is tried as verified.
 
     Args:
-        parts: of the attack.
-        folder: of photographs.
+        parts: parts of the attack.
+        folder: folder of photographs.
         spp: samples per pixel.
         threads: other settings of the problems.
     """

@@ -260,7 +260,7 @@ def describe_transfer(transfer: PhotographTransfer, kind: str = "other") -> str:
 
     Args:
         transfer: the counts.
-        kind: of the photographs, an adjective.
+        kind: kind of the photographs, an adjective.
     """
     clean = f"the clean scene is right in {transfer.clean_right} of them"
     photographs = wording.format_count(transfer.photographs, f"{kind} photograph")

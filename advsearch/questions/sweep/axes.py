@@ -532,7 +532,8 @@ class Points:
         repeat_after_scenes: after so many scenes the draws repeat, so that scenes that
             are compared have the same ones; 0 for never.
         n_scenes: scenes of the sweep.
-        n_photographs: of a folder, in which the scenes are in turn; 1 without one.
+        n_photographs: number of photographs of a folder, in which the scenes are in
+            turn; 1 without one.
 
     Attributes:
         count: images of the scene.

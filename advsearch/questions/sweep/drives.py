@@ -480,7 +480,7 @@ def _compute_lost_loosely(
     Args:
         task: task of the model; a track is on the object from its `iou` on.
         tracker: makes the tracker.
-        frames: of each of n drives.
+        frames: frames of each of n drives.
     """
     loose_iou = min(MIN_OVERLAP, task.iou)
     return np.array(

@@ -479,7 +479,7 @@ class Sweep:
         is made again.
 
         Args:
-            predictions: of all rows.
+            predictions: predictions of all rows.
             verify: also renders it again, and saves its image.
         """
         row_number = predictions.worst_row
@@ -563,7 +563,7 @@ class Sweep:
         """Return what `summary.json` holds.
 
         Args:
-            predictions: of all rows so far.
+            predictions: predictions of all rows so far.
             ending: how the sweep ended.
             worst: the configuration with the smallest margin; None without one.
         """

@@ -538,7 +538,7 @@ class SweepPredictor:
         The images and the noise of the traced ones follow from `seed`.
 
         Args:
-            predictor: of the group.
+            predictor: predictor of the group.
             number: number of an image of the group, in the scene.
             seed: selects the images that are compared.
         """
@@ -616,7 +616,7 @@ def combine_transport(
     """Combine the summaries of the predicted images of several scenes.
 
     Args:
-        all_summaries: of each scene; None where nothing moves.
+        all_summaries: all summaries of each scene; None where nothing moves.
 
     Returns:
         The worst error, the largest memory, all seconds and the first reason, of the

@@ -77,7 +77,7 @@ class _PictureSample:
     """What the pictures show that a claim was tested with.
 
     Attributes:
-        scores: of each picture that counts, from 0 to 1; see `score_picture`.
+        scores: scores of each picture that counts, from 0 to 1; see `score_picture`.
         wrong_payloads: what the task recorded of wrong predictions.
         n_hidden: pictures without the object in view, which do not count.
         verdict: what they decide.

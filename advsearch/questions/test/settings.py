@@ -277,7 +277,7 @@ class Suite(_YamlModel):
         settings: settings of all claims, as for `attack`; those of a claim override
             them.
         seed: root of all random numbers.
-        confidence: of each claim that sampled pictures decide.
+        confidence: confidence of each claim that sampled pictures decide.
         seconds: after which nothing more begins, None for no limit.
         claims: claims by name.
     """

@@ -52,9 +52,9 @@ class Selection:
     """The objects in photographs that a run compares.
 
     Attributes:
-        windows: of the rows that are used, by their number.
-        objects: of all rows.
-        warnings: about what was left out.
+        windows: windows of the rows that are used, by their number.
+        objects: objects of all rows.
+        warnings: warnings about what was left out.
     """
 
     objects: Sequence[PhotographedObject]
@@ -66,7 +66,7 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
     """Compare photographs with their twins.
 
     Args:
-        context: of the run.
+        context: context of the run.
         network: the model, where a Python caller passes one; or a mapping from the
             names of frames to models, each of which has not seen its frames.
     """
@@ -102,7 +102,7 @@ class ModelJudge:
         model_of_frame: models that predict some frames instead.
 
     Attributes:
-        task: for this model, and calibrated if it needs that.
+        task: task for this model, and calibrated if it needs that.
         model: as above.
     """
 
@@ -159,7 +159,7 @@ def load_judges(
     """Load the models, and return a judge for each, and warnings.
 
     Args:
-        config: of the run.
+        config: config of the run.
         network: as for `run_twins`.
 
     Raises:
@@ -193,8 +193,8 @@ class Comparison:
     """Compares photographs with their twins.
 
     Args:
-        context: of the run.
-        judges: of the models, at least one.
+        context: context of the run.
+        judges: judges of the models, at least one.
     """
 
     def __init__(

@@ -71,9 +71,9 @@ def count_agreement(
 
     Args:
         rows: at least one.
-        surroundings: of the twins.
+        surroundings: surroundings of the twins.
         model, task: as in results.
-        object_name, condition: of the rows; empty for all.
+        object_name, condition: object name and condition of the rows; empty for all.
     """
     units = number_units(rows)
     photos = [row.photo for row in rows]

@@ -73,11 +73,12 @@ class PhotographedObject:
         frame: name of the independent unit that it is of: a photograph, or a scene.
         object: its name.
         mesh: its file.
-        unit: of the coordinates of the mesh and of the pose.
+        unit: unit of the coordinates of the mesh and of the pose.
         pose: (4, 4) from the coordinates of the mesh's file to the camera's.
-        camera: that took the photograph.
+        camera: camera that took the photograph.
         label: the right label; empty: the object's name.
-        condition: of the photograph, such as "dim"; empty where there is none.
+        condition: condition of the photograph, such as "dim"; empty where there is
+            none.
         mask: file of the full silhouette; None without.
         visible_mask: file of what is visible of it; None without.
         visible: fraction of the silhouette that is visible; None if it is not known.
@@ -104,7 +105,7 @@ class Listing:
     """What was read of a folder or a list.
 
     Attributes:
-        objects: in photographs, in the order of the files.
+        objects: objects in photographs, in the order of the files.
         n_missing: entries whose photograph is not there.
     """
 

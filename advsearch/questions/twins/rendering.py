@@ -151,11 +151,11 @@ class LayerRenderer:
 
     Args:
         asset: the object, with `up` z and `front` +x.
-        unit: of its file.
+        unit: unit of its file.
         light: environment that lights it.
         film: (height, width) of renders in pixels.
         spp: samples per pixel.
-        seed: of the noise.
+        seed: seed of the noise.
         is_matched: give the object the noise and the blur of the photograph, where
             they can be measured.
     """
@@ -196,10 +196,10 @@ class LayerRenderer:
 
         Args:
             item: the object; its mesh is that of this renderer.
-            photograph: that shows it.
-            window: of the photograph.
+            photograph: photograph that shows it.
+            window: window of the photograph.
             model_size: (height, width) of what is visible.
-            number: of the row, which has noise of its own.
+            number: number of the row, which has noise of its own.
         """
         renderer = self._renderer
         inputs = renderer.scene.assembly(make_camera_inputs(item, self._asset, window))
@@ -283,8 +283,8 @@ def make_twin(
 
     Args:
         item: the object.
-        photograph: that shows it.
-        window: of the photograph.
+        photograph: photograph that shows it.
+        window: window of the photograph.
         layer: the object in the photograph.
         surrounded: sRGB renders by environment.
         model_size: (height, width) in pixels.

@@ -194,7 +194,7 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
     Args:
         plugin: the dictionary, which is changed.
         key_parts: Mitsuba's key, cut at its dots.
-        value: of the input.
+        value: value of the input.
 
     Returns:
         Whether the dictionary has such an entry.

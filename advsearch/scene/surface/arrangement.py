@@ -198,7 +198,7 @@ class Arrangement:
             its own, and the ground.
         n_sides: sides of the object that have light of their own, 1 or 2.
         fine_shape: rows and columns of the fine grid.
-        lobes: of each surface.
+        lobes: lobes of each surface.
         world_to_map: (3, 3) rotation to the axes of the environment's map.
     """
 

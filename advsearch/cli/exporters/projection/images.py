@@ -139,8 +139,8 @@ def describe_marks(
 
     Args:
         control: the projector.
-        marked_texels: of each mark row, column, and x and y as fractions of the picture
-            from its upper left.
+        marked_texels: marked texels of each mark row, column, and x and y as fractions
+            of the picture from its upper left.
     """
     half_width = math.tan(math.radians(control.part.fov) / 2.0)
     lines = []

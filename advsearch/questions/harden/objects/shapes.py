@@ -1068,7 +1068,7 @@ def _split_faces(
 
     Args:
         patch: before its new vertices are added.
-        value: of its vertices (V,), positive inside.
+        value: value of its vertices (V,), positive inside.
         cut_of_edge: number of the new vertex of each edge that is cut, by the numbers
             of its ends, the smaller one first.
     """
