@@ -63,8 +63,6 @@ ATTACK: dict[str, Any] = {
     "non_finite": {"objectives": 0, "gradient_elements": 0},
     "seconds": {"setup": 3.1, "search": 9.0, "verification": 2.2, "total": 14.6},
 }  # fmt: skip
-BRACKET = {"epsilon": {"texture": 0.01234}, "not_found_at": {"texture": 0.0118}, "closed": True, "confirmed": True,
-           "searches": 7, "checks": 40}  # fmt: skip
 TARGET: dict[str, Any] = {"goal": "a target answer", "target": ["vase"]}
 EASIER: dict[str, Any] = {"goal": "a right answer", "target": None}
 SWEEP: dict[str, Any] = {
