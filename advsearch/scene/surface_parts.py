@@ -167,22 +167,40 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     neighbour = right // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
     plane = find_components(count, face[is_flush], neighbour[is_flush])
-    is_whole = _are_straight(normals, plane) and count <= _FACES_PER_ATLAS
     patch = np.zeros(count, dtype=np.int64)
     is_same = np.ones(len(face), np.bool_)
-    if not is_whole:
-        smoothed = _smooth_normals(normals, face, neighbour)
-        # (F,) index of the nearest of the 14 directions
-        direction = (smoothed @ _make_cut_directions().T).argmax(axis=1)
+    if count > _FACES_PER_ATLAS or not _are_straight(normals, plane):
+        direction = _find_directions(normals, face, neighbour)
         is_same = direction[face] == direction[neighbour]
         patch = find_components(count, face[is_same], neighbour[is_same])
+    cell = _find_cells(soup, patch)
+    if cell is None:
+        return patch
+    is_same &= cell[face] == cell[neighbour]
+    return find_components(count, face[is_same], neighbour[is_same])
+
+
+def _find_directions(
+    normals: Float64Array, face: IntArray, neighbour: IntArray
+) -> IntArray:
+    """Return the index (F,) of the nearest of the 14 directions to each face's normal.
+
+    The normals are smoothed before; arguments are those of `_smooth_normals`.
+    """
+    smoothed = _smooth_normals(normals, face, neighbour)
+    return np.asarray((smoothed @ _make_cut_directions().T).argmax(axis=1))
+
+
+def _find_cells(soup: TriangleSoup, patch: IntArray) -> IntArray | None:
+    """Return the piece (F,) of each face where patches (F,) are cut for speed.
+
+    None where the mesh is too small for that.
+    """
     for min_faces, max_faces in _CELL_FACES:
-        if count > min_faces:
+        if len(patch) > min_faces:
             centers = soup.points[soup.faces].mean(axis=1)
-            cell = _halve_patches(centers, patch, max_faces)
-            is_same &= cell[face] == cell[neighbour]
-            return find_components(count, face[is_same], neighbour[is_same])
-    return patch
+            return _halve_patches(centers, patch, max_faces)
+    return None
 
 
 def _smooth_normals(

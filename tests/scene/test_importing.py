@@ -19,8 +19,9 @@ from trimesh.visual.material import PBRMaterial
 import conftest
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene import library, surface_parts
-from advsearch.scene.assets import Material, Mesh, ObjectAsset
+from advsearch.scene.assets import Material, Mesh, ObjectAsset, compute_lengths, multiply_rows
 from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.importing.geometry import find_unique_rows, find_used
 from advsearch.scene.importing.objects import guess_up, import_object
 from advsearch.scene.importing.pictures import load_display_image
 from advsearch.scene.importing.texture import sample_colors, sample_texture
@@ -313,6 +314,25 @@ def test_repeating_texture_is_unwrapped_and_resampled(tmp_path: Path) -> None:
     assert overlap(asset.mesh) == 0
     assert len(asset.warnings) == 1 and "unwrapped" in asset.warnings[0]
     assert texture_error(asset, pixels, (0.0, 0.0), (3.0, 2.0)) < RESAMPLED
+
+
+def test_many_rows_are_multiplied_exactly() -> None:
+    rng = np.random.default_rng(0)
+    rows = rng.integers(-99, 99, (9001, 3))
+    matrix = rng.integers(-99, 99, (3, 3))
+    # whole numbers, which numpy multiplies in another way
+    assert (multiply_rows(rows.astype(np.float64), matrix.astype(np.float64)) == rows @ matrix).all()
+    assert compute_lengths(np.array([[3.0, 4.0, 12.0], [0.0, 0.0, 0.0]])).tolist() == [[13.0], [0.0]]
+
+
+def test_distinct_rows_and_used_vertices_are_found() -> None:
+    rows = [(2, 1), (1, 3), (2, 1), (1, 2), (1, 3)]
+    first, unique_of_row = find_unique_rows(np.array(rows))
+    distinct = sorted(set(rows))
+    assert [rows[index] for index in first] == distinct
+    assert first.tolist() == [rows.index(row) for row in distinct]
+    assert unique_of_row.tolist() == [distinct.index(row) for row in rows]
+    assert find_used(np.array([[4, 0, 2], [2, 0, 4]]), 6).tolist() == [0, 2, 4]
 
 
 @pytest.mark.parametrize("piece", [1500, 30])
