@@ -17,7 +17,7 @@ from test_architecture import ROOT, imports, python_files
 
 CORE = {
     "experiment": {"attack", "sweep", "render"},
-    "control": {"pose", "camera", "texture", "material", "light", "environment", "geometry"},
+    "control": {"pose", "camera", "texture", "material", "light", "environment", "backdrop", "geometry"},
     "policy": {"auto", "cmaes", "nes", "grid", "random", "sobol", "pgd", "adam", "portfolio", "restarts"},
     "task": {"classification", "detection"},
     "model source": set[str](),
