@@ -30,10 +30,10 @@ from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
 from advsearch.scene.backdrop import (
-    BackdropPhotograph,
     find_photographed_light,
     fit_to_photograph,
 )
+from advsearch.scene.backdrop_photograph import BackdropPhotograph
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
@@ -420,7 +420,10 @@ def fit_camera(
     aspect = width / height
     if description.backdrop_photograph is not None:
         return fit_to_photograph(
-            description, description.backdrop_photograph, (height, width)
+            description,
+            description.backdrop_photograph,
+            (height, width),
+            description.gain,
         )
     camera_model = description.camera_model
     remarks = description.remarks
