@@ -141,7 +141,7 @@ def check_options(
 
     Args:
         what: kind of what has the options, such as "policy", for messages.
-        name: of the policy.
+        name: name of the policy.
         kind: the dataclass.
         options: values by name.
 
@@ -232,9 +232,9 @@ def check_takes(what: str, function: Callable[..., object], *names: str) -> None
     """Check that a user's function takes arguments of these names by position.
 
     Args:
-        what: of the function, for messages ("metrics: f").
-        function: to check.
-        *names: of the arguments.
+        what: what of the function, for messages ("metrics: f").
+        function: function to check.
+        *names: names of the arguments.
 
     Raises:
         InputError: it does not.

@@ -33,7 +33,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     other.
     """
 
-    group: str  # of entry points: "advsearch.policies"
+    group: str  # group of entry points: "advsearch.policies"
     # The built-in entries; those of the catalog are imported on access.
     built_ins: Mapping[str, Entry | BuiltIn]
     # Description of an entry for messages: "a subclass of Policy whose name is that of

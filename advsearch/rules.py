@@ -88,9 +88,10 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     units.
 
     Args:
-        rows: of a sweep (`runs.tables.make_sweep_frame`); a prediction that was not
-            judged counts as not right.
-        names: of parameters; those that vary, and that all rows have, become factors.
+        rows: rows of a sweep (`runs.tables.make_sweep_frame`); a prediction that was
+            not judged counts as not right.
+        names: names of parameters; those that vary, and that all rows have, become
+            factors.
     """
     columns = dict[str, pd.Series]()
     units = dict[str, str]()
@@ -225,7 +226,7 @@ class RuleCondition:
 
     Attributes:
         factor: its name.
-        unit: of the factor.
+        unit: unit of the factor.
         low, high: bounds of numbers.
         options: names; None for numbers.
         turn: 360 or 180 degrees after which values of an angle repeat; then, where
@@ -397,7 +398,7 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
     Args:
         choosing: rows to choose rules on.
         counting: rows to test rules on.
-        seed: of the trees.
+        seed: seed of the trees.
 
     Raises:
         InputError: scikit-learn is missing.
@@ -546,9 +547,9 @@ class TreeColumn(NamedTuple):
     """What a column of the trees' data is of.
 
     Attributes:
-        full_condition: of the factor, without bounds.
-        name: that the column is 1 of; None for numbers.
-        zero: of an angle, degrees.
+        full_condition: full condition of the factor, without bounds.
+        name: name that the column is 1 of; None for numbers.
+        zero: zero of an angle, degrees.
     """
 
     full_condition: RuleCondition
@@ -670,7 +671,7 @@ def walk_tree(
 
     Args:
         tree: `tree_` of scikit-learn.
-        columns: of its data, by index.
+        columns: columns of its data, by index.
     """
     open_nodes: list[tuple[int, dict[TreeColumn, RuleCondition]]] = [(0, {})]
     while open_nodes:

@@ -90,7 +90,7 @@ def gap(
         def evaluate(query: Query) -> Evaluation:
             key = [
                 seed,
-                query.number,
+                query.index,
                 zlib.crc32(query.u.numpy().tobytes()),
                 zlib.crc32(by.name.encode()),
             ]

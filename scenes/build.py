@@ -62,7 +62,7 @@ def object_files(family: ObjectFamily) -> dict[str, bytes]:
         if asset.mesh.rig is None
         else "scenes/person.py, of MakeHuman's data (CC0 1.0)",
         "triangles": len(asset.mesh.faces),
-        "metres": asset.metres,
+        "metres": asset.size_in_metres,
     }
     if asset.drives:
         facts["drives"] = True

@@ -122,7 +122,7 @@ FAULTS = (
     Fault(
         "controls: the exposure counts twice",
         "advsearch/controls/camera.py",
-        'values["exposure"] - scene.number(\n                "camera.exposure"\n       '
+        'values["exposure"] - scene.get_number(\n                "camera.exposure"\n       '
         "     )",
         'values["exposure"]',
         ("tests/controls/test_clean.py",),
@@ -209,7 +209,7 @@ FAULTS = (
     Fault(
         "engine: a run that goes on evaluates again",
         "advsearch/engine/journal.py",
-        "return self._trials_of(query.kind).get(query.number)",
+        "return self._trials_of(query.kind).get(query.index)",
         "return None",
         ("tests/engine/test_resume.py",),
     ),

@@ -119,9 +119,10 @@ def random_scene(
     # as far away as the object just fits into a square picture
     offsets = scene.object.mesh.vertices.astype(np.float64) - compute_center(scene)
     left, up, outwards = (
-        compute_camera_axes(*(scene.number(name) for name in DEFAULT_VIEW)) @ offsets.T
+        compute_camera_axes(*(scene.get_number(name) for name in DEFAULT_VIEW))
+        @ offsets.T
     )
-    tangent = FRAME_FILL * math.tan(math.radians(scene.number("camera.fov")) / 2.0)
+    tangent = FRAME_FILL * math.tan(math.radians(scene.get_number("camera.fov")) / 2.0)
     distance = (outwards + np.maximum(np.abs(left), np.abs(up)) / tangent).max()
     return scene.with_values(camera__distance=float(distance))
 

@@ -64,7 +64,7 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
     """Draw the colour chart on a page, centered from left to right, for `write_sheets`.
 
     Args:
-        title: of the run.
+        title: title of the run.
         paper: (width, height) of the page in millimetres.
         convert: the colour transform of PIL to the printer's profile; None for none.
     """

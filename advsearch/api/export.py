@@ -46,7 +46,7 @@ class AdversarialRun:
     """A run with its problem and its adversarial configuration.
 
     Attributes:
-        folder: of the run.
+        folder: folder of the run.
         problem: as the run had it.
         u: (d,), the configuration in the full space; what varies by chance is as in the
             clean scene.
@@ -109,8 +109,8 @@ class AdversarialRun:
         """Render the scene with some inputs as the run does.
 
         Args:
-            inputs: of the scene and of the finished image, by name.
-            seed: of the render.
+            inputs: inputs of the scene and of the finished image, by name.
+            seed: seed of the render.
             spp: samples per pixel.
 
         Returns:
@@ -167,7 +167,7 @@ def get_real_size(run: str | Path) -> float | None:
     load_attack_summary(folder)  # raises for runs of other commands
     metres = _load_object_scene(
         AttackConfig.from_yaml(folder / CONFIG)
-    ).description.object.metres
+    ).description.object.size_in_metres
     return None if metres is None else metres * 1000.0
 
 
@@ -237,8 +237,8 @@ def _make_texture_pieces(
     """Return a piece for each connected part of the unwrapped surface of a texture.
 
     Args:
-        control: of the texture.
-        description: of the scene.
+        control: control of the texture.
+        description: description of the scene.
         texture_file: PNG file of the texture.
         size: longest side of the real object in millimetres.
     """
@@ -282,9 +282,9 @@ def _find_charts(
     the largest first.
 
     Args:
-        name: of the texture.
+        name: name of the texture.
         texture: (h, w, 3).
-        mesh: with the texture coordinates.
+        mesh: mesh with the texture coordinates.
         faces: indices of the faces whose parts are printed; None for all.
         scale: millimetres per mesh unit.
     """
@@ -372,7 +372,7 @@ def _make_piece(
     margin of bleed.
 
     Args:
-        name: of the piece.
+        name: name of the piece.
         image: (h, w, 3), sRGB in [0, 1].
         pixel_size: (width, height) of a pixel in millimetres.
         inside: (h, w) bool, what is cut out; None for the full image.

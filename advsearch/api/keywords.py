@@ -208,10 +208,10 @@ def _check_call(
     """Check the arguments of a call, and allow the code that they name.
 
     Args:
-        name: of the function.
-        signature: with all settings.
-        args: by position.
-        keywords: by name.
+        name: name of the function.
+        signature: signature with all settings.
+        args: arguments by position.
+        keywords: keywords by name.
 
     Raises:
         TypeError: there is no such argument, or one is missing.
@@ -305,8 +305,8 @@ def _make_docstring(
     Args:
         text: its own docstring: what it does, and arguments that `SHARED_ARGUMENTS`
             does not have.
-        names: of its own arguments.
-        command: of the experiment.
+        names: names of its own arguments.
+        command: command of the experiment.
         settings: a line for each setting.
     """
     summary, _, own_arguments = inspect.cleandoc(text).partition("\n\nArgs:\n")

@@ -190,7 +190,7 @@ def _check_words(
 
     Args:
         kind: what is named, for messages.
-        names: to check.
+        names: names to check.
         known: the names that there are; or the suffix of a group of entry points, to
             whose built-in names other packages add theirs.
         hint: the end of the message.

@@ -44,13 +44,13 @@ class RenderedRow:
     """An image of a run, rendered again.
 
     Attributes:
-        name: of its file without a suffix.
+        name: name of its file without a suffix.
         picture: (H, W, 3), sRGB in [0, 1], rounded to 8 bits as the model sees it.
-        task: of the first model.
+        task: task of the first model.
         facts: the ground truth of the object.
-        renderer: of the scene.
+        renderer: renderer of the scene.
         u: (d,), the configuration.
-        rows: of the run's models.
+        rows: rows of the run's models.
         values: the configuration by parameter.
         is_reproduced: whether the first model is right, or wrong, as in its row.
     """
@@ -154,7 +154,7 @@ def _render_sweep_image(
     """Render one image of a sweep.
 
     Args:
-        scenes: of the sweep.
+        scenes: scenes of the sweep.
         image: the index of the image.
         rows: the predictions of all models for it.
     """

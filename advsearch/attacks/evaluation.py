@@ -58,7 +58,7 @@ class Query:
     seed: int
     # which rows the evaluation belongs to, such as "search" or "verification"
     kind: str = "search"
-    number: int = 0  # its place among these
+    index: int = 0  # its place among these
     phase: Phase | None = None  # of a search; None for a trial
     # "free" only ever comes where the domain has `partial_gradients`
     gradient: WhichGradient = False

@@ -330,7 +330,7 @@ class _Log:
                 proposal.u.clone(),
                 seed=stream(self.render_seed, self.kind, index),
                 kind=self.kind,
-                number=number,
+                index=number,
                 phase=phase,
                 gradient=proposal.gradient,
                 samples=proposal.samples,
@@ -390,7 +390,7 @@ class _Log:
             gradient_norm = float(evaluation.gradient.norm())
         assert query.phase is not None
         return StepRecord(
-            step=query.number,
+            step=query.index,
             seed=query.seed,
             phase=query.phase,
             objective=objective,

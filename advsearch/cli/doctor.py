@@ -134,8 +134,8 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
     """Try the parts that load native code in another process, which they may crash.
 
     Args:
-        command: of that process, which prints a line of JSON for each part that it has
-            tried.
+        command: command of that process, which prints a line of JSON for each part that
+            it has tried.
 
     Returns:
         By name, whether the part worked, with a detail or the error. The part that

@@ -121,7 +121,7 @@ def _choose_format(
     """Return the format that is asked for by name, or else by the suffix of the file.
 
     Args:
-        args: of the command.
+        args: arguments of the command.
         by_name: the suffix of the file.
         usable: exporters by the name of their format.
 

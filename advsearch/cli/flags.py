@@ -50,7 +50,7 @@ def add_settings(
     their groups.
 
     Args:
-        parser: of a command.
+        parser: parser of a command.
         config: the class of the configuration.
         only: fields of settings to add; empty for all.
     """
@@ -79,7 +79,7 @@ def make_config(
     """Return the configuration that flags describe.
 
     Args:
-        args: of the command line.
+        args: arguments of the command line.
         config: the class of the configuration.
         otherwise: values of settings that were not given as flags.
 
@@ -120,7 +120,7 @@ def read_file_config(
     """Return the configuration that a file describes.
 
     Args:
-        command: that the file names.
+        command: command that the file names.
         file: YAML with settings.
         changes: values by name that replace those of the file.
 

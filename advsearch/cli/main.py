@@ -518,7 +518,7 @@ def add_command(
 
     Args:
         subparsers: what `without_commands` returns.
-        name: of the command.
+        name: name of the command.
         with_arguments: make its arguments and help; without, it only has a name.
     """
     if not with_arguments:

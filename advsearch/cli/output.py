@@ -187,7 +187,7 @@ def print_answer(
         as_json: print the facts as JSON on standard output, else the text.
         facts: the answer for programs.
         text: the answer for people.
-        stream: for the text; None is standard output.
+        stream: stream for the text; None is standard output.
     """
     if as_json:
         print_json({"schema": 1, **facts})

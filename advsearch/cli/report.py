@@ -158,9 +158,9 @@ def _add_photographs(folder: str, name: str) -> None:
     """Let the model of a run judge photographs, and add them to the run.
 
     Args:
-        folder: with photographs; their names, or the file `POSES` beside them, say
-            which rendering of the run each one shows.
-        name: of the run.
+        folder: folder with photographs; their names, or the file `POSES` beside them,
+            say which rendering of the run each one shows.
+        name: name of the run.
 
     Raises:
         InputError: there are none, or they do not say it.

@@ -77,7 +77,7 @@ def run_file(
     """Run what a YAML file describes, and return the exit status.
 
     Args:
-        file: with settings.
+        file: file with settings.
         changes: values by name that replace those of the file.
         args: has `json` and `quiet`.
         resumed: folder of the run to go on with, if the file is its own; None for a new

@@ -98,7 +98,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     exit status.
 
     Args:
-        name: of the run, or its path.
+        name: name of the run, or its path.
         as_json: print it as JSON.
         picture: draw its pictures in the terminal, too.
     """

@@ -35,7 +35,7 @@ class WorkerTask:
     settings: JsonObject
     # settings that may hold paths, separated by commas, whose files are sent along
     files: tuple[str, ...] = ()
-    threads: int = 1  # for rendering, of a worker
+    threads: int = 1  # threads for rendering, of a worker
     # seconds that a batch may always take; None: by the median of earlier ones
     seconds: float | None = None
     # modules of users that a worker may import, as this process
@@ -75,10 +75,10 @@ class WorkerStats:
 
     workers: int = 0  # connected now
     most: int = 0  # maximum that computed at once
-    lost: int = 0  # that died
-    refused: int = 0  # that do not suit the task
+    lost: int = 0  # lost that died
+    refused: int = 0  # refused that do not suit the task
     retried: int = 0  # batches that were submitted again
-    batches: int = 0  # that are finished
+    batches: int = 0  # batches that are finished
     busy: float = 0.0  # seconds that workers computed batches
     loading: float = 0.0  # seconds that they loaded scenes and models
     alive: float = 0.0  # seconds that they were connected, without loading

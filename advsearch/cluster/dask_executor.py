@@ -102,7 +102,7 @@ def make_file_plugin(contents: Mapping[str, bytes]) -> Any:
     the files of a task.
 
     Args:
-        contents: of the files, by path.
+        contents: contents of the files, by path.
     """
     # comes with the extra `dask`
     from distributed import WorkerPlugin
@@ -140,7 +140,7 @@ class DaskExecutor(WorkerExecutor):
 
         Args:
             site: where the workers run.
-            contents: of the task's files, by path, for workers that lack them.
+            contents: contents of the task's files, by path, for workers that lack them.
             tell: takes messages for the user.
 
         Raises:
@@ -447,8 +447,8 @@ class DaskExecutor(WorkerExecutor):
         were sent.
 
         Args:
-            client: of the connection that was used.
-            address: of the worker.
+            client: client of the connection that was used.
+            address: address of the worker.
             value: what it returned, a `Reply` for batches.
         """
         failure = value.failure if isinstance(value, Reply) else None

@@ -258,7 +258,7 @@ class Reply:
     """The reply of a worker to a batch."""
 
     value: Any = None
-    seconds: float = 0.0  # that the batch took, and that loading took before it
+    seconds: float = 0.0  # seconds that the batch took, and that loading took before it
     loading: float = 0.0
     machine: MachineInfo = field(default_factory=dict)
     worker: str = ""

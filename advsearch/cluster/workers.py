@@ -155,7 +155,7 @@ class PoolWorkers:
         ends itself.
 
         Args:
-            n_items: of the batch.
+            n_items: number of items of the batch.
             item_seconds: seconds per item of the last batches; a few are needed for an
                 estimate.
         """

@@ -112,7 +112,7 @@ class BackgroundControl(Control):
         return scene.without_ground() if self.chosen["ground"] == "hide" else scene
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the linear color (3,) of the backdrop; nothing where the environment
         is shown.
@@ -126,7 +126,7 @@ class BackgroundControl(Control):
         }
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the sRGB levels of the color, which is searched as hue, saturation and
         value.

@@ -16,7 +16,7 @@ to the scene (docs/controls/writing.md):
             ),
         )
 
-        def scene_inputs(self, values, so_far):
+        def scene_inputs(self, values, earlier_inputs):
             return {"camera.exposure": values["stops"]}
 """
 
@@ -80,9 +80,9 @@ class AdjustedDefault:
 
     Attributes:
         control: name of the control.
-        parameter: that was adjusted (``pose.yaw``, ``ground.size``,
+        parameter: parameter that was adjusted (``pose.yaw``, ``ground.size``,
             ``environment``).
-        unit: of the values; "name" of names.
+        unit: unit of the values; "name" of names.
         scene: the value that the scene was described with.
         used: the value that is used instead.
     """
@@ -662,7 +662,7 @@ class Control:
         """Return how a setting of the scene is written, with its value."""
         if setting == ENVIRONMENT:
             return f"`environment={self.scene.environment_spec}`"
-        return f"`set` {setting}={format_value(self.scene.number(setting))}"
+        return f"`set` {setting}={format_value(self.scene.get_number(setting))}"
 
     def _group(self, slot: Slot) -> Group:
         """Return the group of coordinates of a searched parameter.
@@ -755,7 +755,7 @@ class Control:
         return values
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return what the values do to the scene, by differentiable torch operations.
 
@@ -764,7 +764,7 @@ class Control:
         return {}
 
     def inputs(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         """Map a slice of u to scene inputs by name.
 
@@ -772,10 +772,10 @@ class Control:
 
         Args:
             u: (d,) in [0, 1].
-            so_far: inputs of the controls before this one; only names in `refines`
+            earlier_inputs: inputs of the controls before this one; only names in `refines`
                 may be returned again.
         """
-        return self.scene_inputs(self.values(u), so_far)
+        return self.scene_inputs(self.values(u), earlier_inputs)
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
         """Return what the values make of the finished image; see `apply_to_image`."""
@@ -792,13 +792,13 @@ class Control:
         return self.on_picture(self.values(u), image)
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return further values to store, by name without the instance's."""
         return {}
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Describe a configuration by a few named values with units.
 
@@ -822,7 +822,7 @@ class Control:
             else:
                 for index, number in enumerate(value):
                     described[f"{name}.{index}"] = make_value(number, parameter.unit)
-        for name, measurement in self.measured(values, so_far).items():
+        for name, measurement in self.measured(values, earlier_inputs).items():
             described[f"{self.name}.{name}"] = measurement
         return described
 
@@ -849,34 +849,34 @@ class Control:
         return None
 
     def kept_pictures(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return images worth storing; see `get_artifact_images`."""
         return {}
 
     def get_artifact_images(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         """Return images worth storing, by file stem.
 
         Each is (h, w, 3), display-referred sRGB in [0, 1]. Arguments as for `describe`.
         """
-        return self.kept_pictures(self.values(u.detach()), so_far)
+        return self.kept_pictures(self.values(u.detach()), earlier_inputs)
 
     def kept_files(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, bytes]:
         """Return other files worth storing; see `get_artifact_files`."""
         return {}
 
     def get_artifact_files(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
         """Return other files worth storing, by name with suffix, such as a mesh as PLY.
 
         Arguments as for `describe`.
         """
-        return self.kept_files(self.values(u.detach()), so_far)
+        return self.kept_files(self.values(u.detach()), earlier_inputs)
 
 
 NumberControl = Control  # its name in packages that add controls
@@ -926,7 +926,7 @@ def describe_color_change(name: str, change: Tensor) -> dict[str, Value]:
     """Describe a change of searched colors: the largest, and the root mean square.
 
     Args:
-        name: of the control.
+        name: name of the control.
         change: any shape, display-referred.
     """
     root_mean_square = change.square().mean().sqrt()

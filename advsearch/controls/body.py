@@ -133,11 +133,11 @@ class BodyControl(Control):
         return replace(parameter, default=default)
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         return {f"{self.mesh}.offsets": self.rig.offsets(values, self.clip)}
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         return dict(self.rig.get_measurements(values, self.clip))

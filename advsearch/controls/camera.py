@@ -11,7 +11,7 @@ to where the camera would enter the sphere around the object: see
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Control, Values
-from advsearch.controls.ranges import Fixed
+from advsearch.controls.ranges import Fixed, ParameterValue
 from advsearch.errors import InputError
 from advsearch.scene.assets import is_road_vehicle
 from advsearch.scene.camera_entries import PRESETS
@@ -145,6 +145,33 @@ class CameraControl(Control):
             InputError: the scene has another camera, two settings are the same thing,
                 or its lens does not support one.
         """
+        self._check_can_orbit(scene)
+        needs_thin_lens = "aperture" in self.specs or "focus" in self.specs
+        if needs_thin_lens and self._is_shifted:
+            raise InputError(
+                f"`controls` {self.name}: a shifted picture together with an aperture "
+                "is not supported; leave one out"
+            )
+        if "azimuth" in self.specs and self._drives_against_traffic(scene):
+            scene = replace(scene, remarks=(*scene.remarks, make_traffic_remark(scene)))
+
+        distortion_names = [name for name in COEFFICIENTS if name in self.specs]
+        if distortion_names and scene.camera_model is None:
+            pinhole = make_pinhole(scene.get_number("camera.fov"), scene.aspect)
+            scene = replace(scene, camera_model=pinhole)
+        if scene.camera_model is not None:
+            self._check_lens(scene.camera_model, distortion_names)
+        elif needs_thin_lens:
+            scene = replace(scene, thin_lens=True)
+        return scene
+
+    def _check_can_orbit(self, scene: SceneDescription) -> None:
+        """Check that the scene's camera orbits, and that no two settings are one.
+
+        Raises:
+            InputError: the camera is fixed by the scene, or two settings that stand for
+                the same thing (such as `distance` and `sizes`) are both set.
+        """
         if scene.camera != ORBIT_CAMERA:
             raise InputError(
                 f"`controls` {self.name}: moves along an orbit around the object, and "
@@ -158,47 +185,39 @@ class CameraControl(Control):
                     f"`controls` {self.name}: {first} and {second} say the same thing; "
                     "leave one of them out"
                 )
-        if "azimuth" in self.specs and self._drives_against_traffic(scene):
-            scene = replace(scene, remarks=(*scene.remarks, make_traffic_remark(scene)))
-        has_thin_lens = "aperture" in self.specs or "focus" in self.specs
-        if has_thin_lens and self._is_shifted:
-            raise InputError(
-                f"`controls` {self.name}: a shifted picture together with an aperture "
-                "is not supported; leave one out"
-            )
-        # coefficients of the distortion that were set
-        bent_coefficients = [name for name in COEFFICIENTS if name in self.specs]
-        if bent_coefficients and scene.camera_model is None:
-            scene = replace(
-                scene,
-                camera_model=make_pinhole(scene.number("camera.fov"), scene.aspect),
-            )
-        model = scene.camera_model
-        if model is None:
-            return replace(scene, thin_lens=True) if has_thin_lens else scene
-        for name in bent_coefficients:
-            if name not in COEFFICIENTS_OF_KIND[model.kind]:
-                coefficients = ", ".join(COEFFICIENTS_OF_KIND[model.kind]) or "none"
+
+    def _check_lens(self, model: CameraModel, distortion_names: Sequence[str]) -> None:
+        """Check that a camera model has what the settings change.
+
+        Args:
+            model: the lens, from a camera file or a pinhole with distortion.
+            distortion_names: the distortion coefficients that were set.
+
+        Raises:
+            InputError: a setting is none of this kind of lens.
+        """
+        supported_names = COEFFICIENTS_OF_KIND[model.kind]
+        for name in distortion_names:
+            if name not in supported_names:
+                coefficients = ", ".join(supported_names) or "none"
                 raise InputError(
                     f"`controls` {self.name}: a {model.kind} lens has the "
                     f"coefficients {coefficients}, not {name}"
                 )
-        lens_parameters = ("fov", "focal_length") if model.name else ()
-        shift_parameters = (
-            () if COEFFICIENTS_OF_KIND[model.kind] else ("shift_x", "shift_y")
-        )
-        for name in (*lens_parameters, *shift_parameters, "aperture", "focus"):
+        unsupported_names = ["aperture", "focus"]
+        if model.name:  # a calibrated lens has its focal length already
+            unsupported_names += ["fov", "focal_length"]
+        if not supported_names:
+            unsupported_names += ["shift_x", "shift_y"]
+        lens = "a lens with distortion, or raindrops"
+        if model.name:
+            lens = f"the lens of `camera={model.name}`"
+        for name in unsupported_names:
             if name in self.specs:
-                lens = (
-                    f"the lens of `camera={model.name}`"
-                    if model.name
-                    else "a lens with distortion, or raindrops"
-                )
                 raise InputError(
                     f"`controls` {self.name}: {name} is not supported "
                     f"with {lens}; leave one of them out"
                 )
-        return scene
 
     def _drives_against_traffic(self, scene: SceneDescription) -> bool:
         """Return whether the camera always drives against the traffic.
@@ -222,75 +241,79 @@ class CameraControl(Control):
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with the default and the range of the scene's own camera.
 
-        Defaults are those of the scene's lens and pose. The range is the preset's, if
-        the scene has one; around a road vehicle it is that of heights of road users in
-        place of the elevation; a distance has a multiple of its default.
+        Lengths are in metres if the size of the object is known, else in object sizes.
         """
-        parameter = adapt_length_unit(
-            super().resolve_parameter(parameter), self.scene.object.metres is not None
-        )
+        has_metres = self.scene.object.size_in_metres is not None
+        parameter = adapt_length_unit(super().resolve_parameter(parameter), has_metres)
+        default = self._find_default(parameter)
+        search = self._find_search_range(parameter, default)
+        return replace(parameter, default=default, search=search)
+
+    def _find_default(self, parameter: Parameter) -> ParameterValue:
+        """Return the value of a parameter that the scene's lens and pose have."""
         scene = self.scene
         name = parameter.name
-        default = parameter.default
-        search = parameter.search
         if name in COEFFICIENTS and scene.camera_model is not None:
-            default = scene.camera_model.values[name]
-        elif name in ("distance", "focus", "sizes"):
+            return scene.camera_model.values[name]
+        if name in ("distance", "focus", "sizes"):
             fixed_lens_scene = self._with_fixed_lens()
             camera_position = camera_to_world(fixed_lens_scene)[:3, 3]
             offset = camera_position - compute_center(fixed_lens_scene)
-            distance = float(np.linalg.norm(offset))
-            default = distance * (1.0 if name == "sizes" else scene.metres)
-        elif name == "height":
+            distance = float(np.linalg.norm(offset))  # in object sizes
+            return distance if name == "sizes" else distance * scene.size_in_metres
+        if name == "height":
             camera_height = float(camera_to_world(self._with_fixed_lens())[2, 3])
-            default = camera_height * scene.metres
-        elif name == "focal_length":
-            half_fov = math.radians(scene.number("camera.fov")) / 2.0
-            default = SENSOR_WIDTH / 2.0 / math.tan(half_fov)
+            return camera_height * scene.size_in_metres
+        if name == "focal_length":
+            half_fov = math.radians(scene.get_number("camera.fov")) / 2.0
+            return SENSOR_WIDTH / 2.0 / math.tan(half_fov)
+        return parameter.default
+
+    def _find_search_range(
+        self, parameter: Parameter, default: ParameterValue
+    ) -> tuple[float, float] | None:
+        """Return the range that a parameter is searched over if the user sets none.
+
+        It is the preset's, if the scene has one. Around a road vehicle the height is
+        searched (the heights of road users' eyes) and the elevation is not. A distance
+        is searched over multiples of its default.
+        """
+        scene = self.scene
+        name = parameter.name
+        search = parameter.search
         preset = PRESETS.get(scene.preset)
         if preset is not None and name == "azimuth":
-            reach = preset.search_azimuth
-            scene_azimuth = scene.number("camera.azimuth")
-            search = (scene_azimuth - reach, scene_azimuth + reach)
-            if reach >= 180.0:
-                search = (0.0, 360.0)
-        elif preset is not None:
-            search = preset.search_ranges.get(name)
-        elif is_road_vehicle(scene.object) and name == "elevation":
-            search = None
-        elif is_road_vehicle(scene.object) and name == "height":
-            search = ROAD_USER_HEIGHTS[0], max(ROAD_USER_HEIGHTS[1], float(default))
-        elif name == "distance" and search is not None:
-            search = search[0] * float(default), search[1] * float(default)
-        return replace(parameter, default=default, search=search)
+            max_turn = preset.search_azimuth
+            if max_turn >= 180.0:
+                return 0.0, 360.0
+            scene_azimuth = scene.get_number("camera.azimuth")
+            return scene_azimuth - max_turn, scene_azimuth + max_turn
+        if preset is not None:
+            return preset.search_ranges.get(name)
+        if is_road_vehicle(scene.object) and name == "elevation":
+            return None
+        if is_road_vehicle(scene.object) and name == "height":
+            return ROAD_USER_HEIGHTS[0], max(ROAD_USER_HEIGHTS[1], float(default))
+        if name == "distance" and search is not None:
+            return search[0] * float(default), search[1] * float(default)
+        return search
 
     def setting_name(self, parameter: Parameter) -> str:
         equivalent_settings = {"focal_length": "camera.fov", "sizes": "camera.distance"}
         return equivalent_settings.get(parameter.name, super().setting_name(parameter))
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the camera's pose, lens, focus, shift and exposure.
 
-        The distance is that of `sizes` or `distance`, if the user set one of them, or
-        the scene's setting; else the object is framed as the field of view requires. A
-        camera model has its own numbers in place of the field of view and the shift.
+        A camera model has its own numbers in place of the field of view and the shift.
         """
         scene = self.scene
         fov = values["fov"]
         if "focal_length" in self.specs:
             fov = _compute_fov(values["focal_length"])
-        if "sizes" in self.specs:
-            distance = values["sizes"]
-        elif (
-            "distance" in self.specs
-            or not self.has_requested_search
-            or scene.values.get("camera.distance") is not None
-        ):
-            distance = values["distance"] / scene.metres
-        else:
-            distance = compute_framing_distance(scene, fov, scene.aspect).float()
+        distance = self._compute_distance(values, fov)
         inputs = {"camera.to_world": self._compute_pose(values, distance)}
         if scene.camera_model is not None:
             inputs["camera.lens"] = self._compute_model_numbers(
@@ -301,13 +324,15 @@ class CameraControl(Control):
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
             focus = (
-                values["focus"] / scene.metres if "focus" in self.specs else distance
+                values["focus"] / scene.size_in_metres
+                if "focus" in self.specs
+                else distance
             )
             inputs["camera.focus"] = focus.reshape(1)
         if scene.camera_model is None and self._is_shifted:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
-            inputs["camera.exposure"] = values["exposure"] - scene.number(
+            inputs["camera.exposure"] = values["exposure"] - scene.get_number(
                 "camera.exposure"
             )
         return inputs
@@ -359,35 +384,58 @@ class CameraControl(Control):
             )
         return self.scene
 
-    def _compute_pose(self, values: Values, distance: Tensor) -> Tensor:
-        """Return the pose (4, 4) on the orbit, at a distance () in object sizes.
+    def _compute_distance(self, values: Values, fov: Tensor) -> Tensor:
+        """Return the camera's distance () from the object's center, in object sizes.
 
-        The elevation follows from the height in two cases: the user set the height; or
-        set neither of the two, and the scene states a height or the height is searched.
+        It is `sizes` or `distance`, if the user set one of them, or the scene's
+        setting; else the distance at which a field of view of `fov` degrees frames the
+        object.
         """
-        azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
-        elevation = torch.deg2rad(values["elevation"])
-        roll = torch.deg2rad(values["roll"])
-        keeps_height = "height" in self.specs
+        scene = self.scene
+        if "sizes" in self.specs:
+            return values["sizes"]
+        if (
+            "distance" in self.specs
+            or not self.has_requested_search
+            or scene.values.get("camera.distance") is not None
+        ):
+            return values["distance"] / scene.size_in_metres
+        return compute_framing_distance(scene, fov, scene.aspect).float()
+
+    def _compute_elevation(self, values: Values, distance: Tensor) -> Tensor:
+        """Return the elevation () of the camera over the object's center, radians.
+
+        It follows from the height in two cases: the user set the height; or set neither
+        of the two, and the scene states a height or the height is searched.
+        """
+        has_height = "height" in self.specs
         if not {"elevation", "height"} & self.specs.keys():
             is_height_searched = any(
                 slot.n_coordinates
                 for slot in self.slots
                 if slot.parameter.name == "height"
             )
-            keeps_height = (
-                self.scene.values.get("camera.height") is not None or is_height_searched
-            )
-        if keeps_height:
-            height_above_center = values["height"] / self.scene.metres - float(
-                compute_center(self.scene)[2]
-            )
-            elevation = torch.asin(
-                (height_above_center / distance).clamp(
-                    -MAX_ELEVATION_SINE, MAX_ELEVATION_SINE
-                )
-            )
+            scene_height = self.scene.values.get("camera.height")
+            has_height = scene_height is not None or is_height_searched
+        if not has_height:
+            return torch.deg2rad(values["elevation"])
+        center_height = float(compute_center(self.scene)[2])
+        height_over_center = (
+            values["height"] / self.scene.size_in_metres - center_height
+        )
+        sine = height_over_center / distance
+        return torch.asin(sine.clamp(-MAX_ELEVATION_SINE, MAX_ELEVATION_SINE))
+
+    def _compute_pose(self, values: Values, distance: Tensor) -> Tensor:
+        """Return the pose (4, 4) on the orbit, at a distance () in object sizes.
+
+        The columns of its rotation are the camera's left, up and forward directions.
+        """
+        azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
+        elevation = self._compute_elevation(values, distance)
+        roll = torch.deg2rad(values["roll"])
         zero = torch.zeros_like(azimuth)
+        # from the object's center to the camera
         outwards = torch.stack(
             [
                 elevation.cos() * azimuth.cos(),
@@ -397,13 +445,11 @@ class CameraControl(Control):
         )
         level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
         level_up = torch.linalg.cross(-outwards, level_left)
-        # turned by the roll about the direction of view
+        # The roll turns the camera about its direction of view.
         left = roll.cos() * level_left + roll.sin() * level_up
         up = roll.cos() * level_up - roll.sin() * level_left
-        position = (
-            torch.from_numpy(compute_center(self.scene)).to(distance)
-            + distance * outwards
-        )
+        center = torch.from_numpy(compute_center(self.scene)).to(distance)
+        position = center + distance * outwards
         return make_affine(torch.stack([left, up, -outwards], dim=1), position)
 
 

@@ -470,14 +470,14 @@ class ContentsControl(Control):
         return {**values, **self.cut_proportions(values)}
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         return {
             name: Value(value=float(values[name]), unit="1") for name in INGREDIENTS
         }
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the offsets, the pose and the color of the liquid's surface."""
         vessel = find_interior(self.scene.object)
@@ -485,8 +485,8 @@ class ContentsControl(Control):
         base = _liquid_surface(vessel, torch.full_like(values["level"], 0.5))
         surface = _liquid_surface(vessel, values["level"])
         inputs = {f"{self.name}.offsets": surface - base}
-        if "object.to_world" in so_far:
-            inputs[f"{self.name}.to_world"] = so_far["object.to_world"]
+        if "object.to_world" in earlier_inputs:
+            inputs[f"{self.name}.to_world"] = earlier_inputs["object.to_world"]
         proportions = torch.stack([values[name] for name in INGREDIENTS])
         vessel_color = torch.from_numpy(vessel.color).to(proportions)
         inputs[f"{self.name}.base_color"] = mix_liquid_color(
@@ -554,7 +554,7 @@ class ContentsControl(Control):
         the rest.
 
         Args:
-            name: of the ingredient.
+            name: name of the ingredient.
             left: () what the ingredients before it have left of 1.
         """
         index = INGREDIENTS.index(name)

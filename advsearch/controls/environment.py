@@ -154,7 +154,7 @@ class EnvironmentControl(Control):
         else:
             environment = scene.require_environment(f"`controls` {self.name}")
             shows_photograph = scene.photograph is not None or environment.photographed
-            if maps and not shows_photograph and scene.number("ground.size") > 0.0:
+            if maps and not shows_photograph and scene.get_number("ground.size") > 0.0:
                 names = ", ".join(Path(name).name for name in maps)
                 notes.append(
                     f"{names}: the object stands on the scene's table there, too; "
@@ -216,7 +216,7 @@ class EnvironmentControl(Control):
         return Budget("l2", float(self.chosen["epsilon"]) / width)
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the map (H, W, 3) of linear radiance.
 
@@ -232,10 +232,10 @@ class EnvironmentControl(Control):
             None if is_scene_map else _load_environment(name), self.scene
         ).to(device)
         rotated = rotate_map(
-            base, values["rotation"] - self.scene.number("environment.rotation")
+            base, values["rotation"] - self.scene.get_number("environment.rotation")
         )
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
-        stops = values["exposure"] - self.scene.number("environment.exposure")
+        stops = values["exposure"] - self.scene.get_number("environment.exposure")
         lit = rotated * tint * torch.exp2(stops)
         if "harmonics" in self.specs:
             lit = (lit + compute_harmonic_light(values["harmonics"], base)).clamp_min(

@@ -137,9 +137,9 @@ def _compute_landmark_weights(
     """Return the normalized weights (P, N) of landmarks (N, 3) at positions (P, 3).
 
     Args:
-        positions: of a mesh.
+        positions: positions of a mesh.
         points: the landmarks.
-        width: of the kernel.
+        width: width of the kernel.
         density: (N,) of the landmarks, which the kernel is divided by.
     """
     exponent = -cdist(positions, points, "sqeuclidean") / (2.0 * width**2)
@@ -155,7 +155,7 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     extended to all positions (Nystrom). The result is cached.
 
     Args:
-        mesh: in object sizes.
+        mesh: mesh in object sizes.
         count: number of fields.
 
     Returns:
@@ -302,7 +302,7 @@ class Preconditioner:
     Jakob 2021, "Large steps in inverse rendering of geometry").
 
     Attributes:
-        _factor: of the sparse matrix I + lambda L.
+        _factor: factor of the sparse matrix I + lambda L.
         _rigid: (3 P, 6) orthonormal basis of the rigid motions.
     """
 
@@ -523,10 +523,10 @@ class GeometryControl(Control):
 
     Attributes:
         form: one of `FORMS`, what the coordinates are.
-        _mesh: that is changed.
+        _mesh: mesh that is changed.
         _offsets_input: name of the scene input with the offsets of its vertices.
         _index: (V,) position of each vertex, see `WeldedMesh`.
-        _limits: of the displacement.
+        _limits: limits of the displacement.
         _field: map from coordinates in [-1, 1] to a displacement (P, 3), not limited.
     """
 
@@ -604,7 +604,7 @@ class GeometryControl(Control):
         self.start = torch.full((group.size,), 0.5)
 
     def inputs(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         """Return the offset of each vertex, (V, 3)."""
         offsets = self.compute_offsets(u).index_select(0, self._index.to(u.device))
@@ -615,7 +615,7 @@ class GeometryControl(Control):
         return self._limits.limit(self._field(2.0 * u.double() - 1.0))
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how far vertices move, and how much the thinnest wall has lost."""
         offsets = self.compute_offsets(u.detach())
@@ -631,7 +631,7 @@ class GeometryControl(Control):
         }
 
     def get_artifact_files(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
         """Return the displaced mesh as an OBJ file."""
         moving = MovingMesh(self._mesh, np.eye(4))

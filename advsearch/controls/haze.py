@@ -110,7 +110,7 @@ class HazeControl(Control):
         )
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the density (1,) and the albedo (3,) of the haze."""
         albedo = color.combine_channels(values)

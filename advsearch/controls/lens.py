@@ -129,7 +129,7 @@ class LensControl(Control):
         return draw_dots(image, self._spread_dots(values))
 
     def kept_pictures(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the sticker as it looks on a grey checkerboard."""
         square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)

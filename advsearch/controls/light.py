@@ -141,7 +141,7 @@ class LightControl(Control):
         )
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return where the lamp is, and how bright.
 

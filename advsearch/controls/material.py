@@ -182,8 +182,9 @@ def _turing(
     Args:
         wavelength: along x and along y, in tiles; unequal ones make stripes across the
             shorter.
-        bias: that is added before saturation: away from 0 stripes break up into spots.
-        seed: of the noise.
+        bias: bias that is added before saturation: away from 0 stripes break up into
+            spots.
+        seed: seed of the noise.
         rounds: number of filterings.
     """
     frequency = np.fft.fftfreq(TILE_SIDE, 1.0 / TILE_SIDE)
@@ -605,7 +606,7 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
     Args:
         mesh: one object size large, in its own coordinates.
         name: a key of `PATTERNS`.
-        side: of the texture in texels.
+        side: side of the texture in texels.
 
     Returns:
         (side, side, 3) float32 display-referred sRGB in [0, 1], row 0 at v = 1.
@@ -689,7 +690,7 @@ class MaterialControl(Control):
     def get_scene_value(self, parameter: Parameter) -> ParameterValue:
         is_requested = self.setting_name(parameter) in self.scene.requested
         return (
-            self.scene.number(self.setting_name(parameter))
+            self.scene.get_number(self.setting_name(parameter))
             if is_requested
             else parameter.default
         )
@@ -699,7 +700,7 @@ class MaterialControl(Control):
         return frozenset({self._base_color}) if self._changes_color() else frozenset()
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the numbers of the surface, and its tinted base color."""
         which = (OBJECT_SURFACE, *PATTERNS)[int(values["which"])]
@@ -716,7 +717,7 @@ class MaterialControl(Control):
             mesh = self.get_mesh(self.scene)
             tint = color.combine_channels(values)
             # what the controls before made of the texture
-            base = so_far.get(self._base_color)
+            base = earlier_inputs.get(self._base_color)
             if which != OBJECT_SURFACE:
                 base = _linear_covering(mesh.mesh, which)
             elif base is None:
@@ -725,14 +726,14 @@ class MaterialControl(Control):
         return inputs
 
     def kept_pictures(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the texture, where the control changes it."""
         if not self._changes_color():
             return {}
         return {
             self.name: linear_to_srgb(
-                self.scene_inputs(values, so_far)[self._base_color]
+                self.scene_inputs(values, earlier_inputs)[self._base_color]
             )
         }
 

@@ -93,7 +93,7 @@ class MitsubaControl(Control):
                 yield replace(parameter, default=value), spec
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the numbers and colors by the inputs that set them."""
         inputs = {}

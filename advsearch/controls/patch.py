@@ -263,12 +263,12 @@ class PatchControl(PictureControl):
         return not self.is_searched_image and parameter.name != "pixels"
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the object's base color with the patch painted into it."""
         return {
             BASE_COLOR: self._painter.paint(
-                so_far.get(BASE_COLOR), values["pixels"], values
+                earlier_inputs.get(BASE_COLOR), values["pixels"], values
             )
         }
 
@@ -276,7 +276,7 @@ class PatchControl(PictureControl):
         return self.values(u)["pixels"] if self.is_searched_image else None
 
     def kept_pictures(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the patch enlarged for printing, and its pixels."""
         pixels = values["pixels"]
@@ -379,7 +379,7 @@ class PatchPainter:
     Attributes:
         _center_and_sizes: center (3,), largest half-width and half-height of the mesh.
         _start_values: azimuth, height, size and rotation of the patch at the start.
-        _side: of the patch, pixels.
+        _side: side of the patch, pixels.
         _surface: the mesh, for rays and for what is connected.
         _object_color: (n, n, 3) the object's own base color, linear.
         _texels: (T,) indices of the texels in the map, row by row.
@@ -396,9 +396,9 @@ class PatchPainter:
         """Prepare the object's map and its surface.
 
         Args:
-            scene: with the object.
+            scene: scene with the object.
             start_values: azimuth, height, size and rotation at the start.
-            side: of the patch, pixels.
+            side: side of the patch, pixels.
 
         Raises:
             InputError: the object's texture repeats.
@@ -496,7 +496,7 @@ class PatchPainter:
 
         Args:
             azimuth: degrees around the object.
-            height: from 0 (middle of the underside) to 1 (middle of the top).
+            height: height from 0 (middle of the underside) to 1 (middle of the top).
             size: side of the patch, object sizes.
         """
         center, radius, half_height = self._center_and_sizes

@@ -66,7 +66,7 @@ class PoseControl(Control):
             )
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the pose of the mesh, scaled and turned about its center.
 
@@ -105,7 +105,7 @@ def _get_base_pose(
     """Return where a mesh is before it is posed.
 
     Args:
-        mesh: that is posed.
+        mesh: mesh that is posed.
         surrounding: the mesh as the scene came with it; None for the object, whose own
             coordinates are those of the scene.
 

@@ -124,8 +124,9 @@ class DistributionRange(Range):
 
     Attributes:
         quantiles: inverse distribution function.
-        lower_probability: at the coordinate 0; above 0 if the distribution is cut off.
-        upper_probability: at the coordinate 1.
+        lower_probability: lower probability at the coordinate 0; above 0 if the
+            distribution is cut off.
+        upper_probability: upper probability at the coordinate 1.
         label: the distribution, for messages.
     """
 

@@ -136,7 +136,7 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
-        values: of shape (), as in `SensorControl.parameters`.
+        values: values of shape (), as in `SensorControl.parameters`.
         seed: chooses the noise.
 
     Returns:

@@ -169,7 +169,7 @@ class ShadowControl(Control):
         return parameter
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the card's pose and the offsets of its corners.
 
@@ -181,10 +181,10 @@ class ShadowControl(Control):
             radii
         )
         offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
-        distance = self._find_distance(values, so_far)
+        distance = self._find_distance(values, earlier_inputs)
         if distance is None:
             pose = geometry.make_hidden_pose(
-                geometry.get_camera_pose(self.scene, so_far).to(radii)
+                geometry.get_camera_pose(self.scene, earlier_inputs).to(radii)
             )
         else:
             pose = self._pose(values, distance)
@@ -210,10 +210,10 @@ class ShadowControl(Control):
         return geometry.make_affine(size * axes, center)
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the distance at which the card really is."""
-        distance = self._find_distance(values, so_far)
+        distance = self._find_distance(values, earlier_inputs)
         return {
             "true_distance": Value(
                 value=0.0 if distance is None else float(distance),
@@ -229,7 +229,7 @@ class ShadowControl(Control):
         return np.stack([-left, up, outwards])
 
     def _find_distance(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> float | None:
         """Find the smallest distance at which the camera does not see the card.
 
@@ -248,9 +248,13 @@ class ShadowControl(Control):
         right, up, outwards = self._axes(values)
         offset = float(values["x"].detach()) * right + float(values["y"].detach()) * up
         camera = (
-            geometry.get_camera_pose(self.scene, so_far).detach().double().cpu().numpy()
+            geometry.get_camera_pose(self.scene, earlier_inputs)
+            .detach()
+            .double()
+            .cpu()
+            .numpy()
         )
-        cone_angle = self._image_cone_angle(so_far)
+        cone_angle = self._image_cone_angle(earlier_inputs)
         max_distance = MAX_LAMP_FRACTION * find_strongest_light(self.scene)[1]
         for factor in np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES):
             distance = min(requested * factor, max_distance)
@@ -260,21 +264,21 @@ class ShadowControl(Control):
                 return float(distance)
         return None
 
-    def _image_cone_angle(self, so_far: Mapping[str, Tensor]) -> float:
+    def _image_cone_angle(self, earlier_inputs: Mapping[str, Tensor]) -> float:
         """Return the angle of the image's corners from the camera's axis, radians."""
         model = self.scene.camera_model
         aspect = self.scene.aspect
-        fov = so_far.get("camera.fov")
+        fov = earlier_inputs.get("camera.fov")
         if model is not None:
             widest = 2.0 * math.atan(math.hypot(*model.visible_tangents))
         elif fov is not None:
             widest = math.radians(float(fov.detach()))
         else:
-            widest = math.radians(self.scene.number("camera.fov"))
+            widest = math.radians(self.scene.get_number("camera.fov"))
         # below 180 degrees, where it would be infinite
         half_tangent = math.tan(min(widest, 3.0) / 2.0)
         corner = math.atan(half_tangent * math.hypot(1.0, min(aspect, 1.0 / aspect)))
-        shift = so_far.get("camera.shift")
+        shift = earlier_inputs.get("camera.shift")
         if shift is not None:
             # a generous bound on the angle by which a shift moves the corners
             corner += 2.0 * float(shift.detach().abs().max())
@@ -286,8 +290,8 @@ def _is_outside_cone(center: assets.Float64Array, radius: float, angle: float) -
 
     Args:
         center: (3,) of the ball, in the camera's coordinates.
-        radius: of the ball.
-        angle: of the cone, radians.
+        radius: radius of the ball.
+        angle: angle of the cone, radians.
     """
     distance = float(np.linalg.norm(center))
     if distance <= radius:

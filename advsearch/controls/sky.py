@@ -337,7 +337,7 @@ class SkyControl(Control):
         )[1]
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         return {"environment.data": self.compute_radiance(values)}
 

@@ -44,9 +44,9 @@ class Space:
     InputError: two instances have one name.
     """
 
-    # at least none; an empty space renders the scene as it is
+    # Controls at least none; an empty space renders the scene as it is.
     controls: tuple[Control, ...]
-    # with everything in it that the controls need; None leaves it to the caller
+    # Scene with everything in it that the controls need; None leaves it to the caller.
     scene: SceneDescription | None = None
     # values of the clean scene that the start has not, as a control leaves them out
     adjusted_defaults: tuple[AdjustedDefault, ...] = ()
@@ -172,13 +172,16 @@ class Space:
             rank for rank, index in enumerate(order) if self.controls[index].refines
         ]
         last_refining = max(refining, default=0)
-        so_far = NO_INPUTS
+        earlier_inputs = NO_INPUTS
         inputs_before = dict[int, Mapping[str, Tensor]]()
         for rank, index in enumerate(order):
             control = self.controls[index]
-            inputs_before[index] = so_far if control.refines else NO_INPUTS
+            inputs_before[index] = earlier_inputs if control.refines else NO_INPUTS
             if rank < last_refining:
-                so_far = {**so_far, **control.inputs(slices[index], so_far)}
+                earlier_inputs = {
+                    **earlier_inputs,
+                    **control.inputs(slices[index], earlier_inputs),
+                }
         return [
             (control, slices[index], inputs_before[index])
             for index, control in enumerate(self.controls)
@@ -203,9 +206,9 @@ class Space:
             controls: whose values are returned; None for all.
         """
         described = dict[str, Value]()
-        for control, part, so_far in self._with_previous_inputs(u):
+        for control, part, earlier_inputs in self._with_previous_inputs(u):
             if controls is None or control in controls:
-                described |= control.describe(part, so_far)
+                described |= control.describe(part, earlier_inputs)
         return described
 
     def get_printable_colors(self, u: Tensor) -> dict[str, Tensor]:
@@ -306,7 +309,7 @@ class Space:
         See `advsearch.scene.grounds`.
 
         Args:
-            scene: of a space without a scene of its own.
+            scene: scene of a space without a scene of its own.
         """
         scene = self.scene or scene
         rotates_map = any(
@@ -341,16 +344,20 @@ class Space:
     def get_artifact_images(self, u: Tensor) -> dict[str, Tensor]:
         """Return the images worth storing with a configuration, by file stem."""
         artifacts = dict[str, Tensor]()
-        for control, part, so_far in self._with_previous_inputs(u):
-            for name, image in control.get_artifact_images(part, so_far).items():
+        for control, part, earlier_inputs in self._with_previous_inputs(u):
+            for name, image in control.get_artifact_images(
+                part, earlier_inputs
+            ).items():
                 artifacts[to_file_name(name)] = image
         return artifacts
 
     def get_artifact_files(self, u: Tensor) -> dict[str, bytes]:
         """Return the other files worth storing with a configuration, by name."""
         files = dict[str, bytes]()
-        for control, part, so_far in self._with_previous_inputs(u):
-            for name, content in control.get_artifact_files(part, so_far).items():
+        for control, part, earlier_inputs in self._with_previous_inputs(u):
+            for name, content in control.get_artifact_files(
+                part, earlier_inputs
+            ).items():
                 files[to_file_name(name)] = content
         return files
 
@@ -396,9 +403,9 @@ class _FixedControl(Control):
         return self._control.refines
 
     def inputs(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
-        return self._control.inputs(self._u, so_far)
+        return self._control.inputs(self._u, earlier_inputs)
 
     def advance_time(self, seconds: float) -> Control:
         return _FixedControl(self._control.advance_time(seconds), self._u)
@@ -407,9 +414,9 @@ class _FixedControl(Control):
         return self._control.apply_to_image(self._u, image)
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
-        return self._control.describe(self._u, so_far)
+        return self._control.describe(self._u, earlier_inputs)
 
     def get_numeric_values(self, u: Tensor) -> Mapping[str, Tensor]:
         return self._control.get_numeric_values(self._u)

@@ -70,7 +70,7 @@ class TextureControl(Control):
 
     Attributes:
         form: one of `FORMS`, what the coordinates are.
-        _mesh_name: of the mesh that is painted.
+        _mesh_name: mesh name of the mesh that is painted.
         _materials: names of the materials that are painted; "" for all of the mesh.
         _original: (h, w, 3) sRGB, the original texture at the search's resolution.
         _painted_mask: (h, w) texels that are painted; None for all.
@@ -333,7 +333,7 @@ class TextureControl(Control):
         return mask
 
     def inputs(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         return {f"{self._mesh_name}.base_color": srgb_to_linear(self._texels(u))}
 
@@ -350,7 +350,7 @@ class TextureControl(Control):
         return original.index_put(indices, painted)
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how much the texels change, and which materials are painted."""
         change = self._painter.texels(u.detach()) - self._unchanged_texels.to(u.device)
@@ -369,7 +369,7 @@ class TextureControl(Control):
         return torch.cat([texels, self._painted_mask.to(texels)[..., None]], dim=-1)
 
     def get_artifact_images(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         return {
             self.name: self._texels(u.detach()),

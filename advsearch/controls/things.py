@@ -56,7 +56,7 @@ class Stand(NamedTuple):
     """Where a thing stands, in the coordinates of the scene."""
 
     position: assets.Float64Array  # (2,) of its center
-    height: float  # of its lowest point
+    height: float  # height of its lowest point
     push_distance: float  # how far it was moved away from the object
 
 
@@ -173,7 +173,7 @@ class ThingsControl(Control):
         if parameter.name not in ("x", "y"):
             return parameter
         # The object is one unit large. Two metres beside a small one are off its table.
-        object_size = self.scene.metres
+        object_size = self.scene.size_in_metres
         reach = min(2.0, object_size)
         return replace(parameter, search=(-reach, reach))
 
@@ -189,7 +189,7 @@ class ThingsControl(Control):
         return frozenset([*poses, *offsets])
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the pose `<thing>.to_world` (4, 4) of each thing that it moves.
 
@@ -198,7 +198,7 @@ class ThingsControl(Control):
         Derivatives reach the heading, not the position.
         """
         inputs = {}
-        for name, stand in self._compute_stands(values, so_far).items():
+        for name, stand in self._compute_stands(values, earlier_inputs).items():
             part = self.scene.meshes[name]
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
             foot = torch.from_numpy(_find_foot(part)).to(base)
@@ -211,7 +211,7 @@ class ThingsControl(Control):
             # without derivative
             position = base.new_tensor([*stand.position, stand.height])
             depth = (
-                base.new_tensor([0.0, 0.0, ABSENT_DEPTH / self.scene.metres])
+                base.new_tensor([0.0, 0.0, ABSENT_DEPTH / self.scene.size_in_metres])
                 * is_absent
             )
             translation = position - depth - turn @ foot
@@ -219,19 +219,19 @@ class ThingsControl(Control):
         return inputs
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return where each thing stands in the end, as the setting `things` has it."""
         origin = geometry.compute_center(self.scene)[:2]
         measurements = {}
-        for name, stand in self._compute_stands(values, so_far).items():
-            x, y = (stand.position - origin) * self.scene.metres
+        for name, stand in self._compute_stands(values, earlier_inputs).items():
+            x, y = (stand.position - origin) * self.scene.size_in_metres
             measurements[f"{name}.at_x"] = Value(value=float(x), unit="metres")
             measurements[f"{name}.at_y"] = Value(value=float(y), unit="metres")
         return measurements
 
     def _compute_stands(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Stand]:
         """Compute where the things that move stand, by name; without derivatives.
 
@@ -239,7 +239,7 @@ class ThingsControl(Control):
         next ones.
         """
         scene = self.scene
-        obstacles = self._list_obstacles(so_far)
+        obstacles = self._list_obstacles(earlier_inputs)
         object_outline = obstacles[0].outline
         object_center = (object_outline.min(axis=0) + object_outline.max(axis=0)) / 2.0
         solids = [
@@ -247,7 +247,7 @@ class ThingsControl(Control):
         ]
         stands = {}
         for name in self._moved_things:
-            footprint = _compute_footprint(scene, name, so_far)
+            footprint = _compute_footprint(scene, name, earlier_inputs)
             stand, outline = self._find_stand(
                 name, values, footprint, object_center, obstacles, solids
             )
@@ -259,7 +259,9 @@ class ThingsControl(Control):
                 )
         return stands
 
-    def _list_obstacles(self, so_far: Mapping[str, Tensor]) -> list[parts.Footprint]:
+    def _list_obstacles(
+        self, earlier_inputs: Mapping[str, Tensor]
+    ) -> list[parts.Footprint]:
         """List the footprints of what a thing may not stand in.
 
         The object is first, then the camera, then the things that do not move. The
@@ -267,14 +269,15 @@ class ThingsControl(Control):
         camera upwards.
         """
         scene = self.scene
-        object_footprint = _compute_footprint(scene, "object", so_far)
+        object_footprint = _compute_footprint(scene, "object", earlier_inputs)
         outline = object_footprint.outline
         object_center = (outline.min(axis=0) + outline.max(axis=0)) / 2.0
-        camera = geometry.get_camera_pose(scene, so_far)
+        camera = geometry.get_camera_pose(scene, earlier_inputs)
         eye = camera[:3, 3].detach().double().cpu().numpy()
         object_distance = float(np.linalg.norm(eye[:2] - object_center))
         clearance = min(
-            CAMERA_CLEARANCE / scene.metres, CAMERA_CLEARANCE_FRACTION * object_distance
+            CAMERA_CLEARANCE / scene.size_in_metres,
+            CAMERA_CLEARANCE_FRACTION * object_distance,
         )
         circle = np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
         around_camera = parts.Footprint(
@@ -284,7 +287,7 @@ class ThingsControl(Control):
         return [
             object_footprint,
             around_camera,
-            *(_compute_footprint(scene, name, so_far) for name in fixed_things),
+            *(_compute_footprint(scene, name, earlier_inputs) for name in fixed_things),
         ]
 
     def _read_numbers(self, name: str, values: Values) -> list[float]:
@@ -309,18 +312,18 @@ class ThingsControl(Control):
         position; an absent thing stays there.
 
         Args:
-            name: of the thing.
-            values: of the control.
-            initial_footprint: of the thing before it is moved.
+            name: name of the thing.
+            values: values of the control.
+            initial_footprint: initial footprint of the thing before it is moved.
             object_center: (2,) the object's center.
             obstacles: it is pushed away from the object until it is free of these.
-            solids: of the surroundings; it is first pushed towards the object until it
-                is free of these.
+            solids: solids of the surroundings; it is first pushed towards the object
+                until it is free of these.
         """
         scene = self.scene
         x, y, heading, is_absent = self._read_numbers(name, values)
         foot = _find_foot(scene.meshes[name])
-        requested = foot[:2] + np.array([x, y]) / scene.metres
+        requested = foot[:2] + np.array([x, y]) / scene.size_in_metres
         outline = _rotate_outline(initial_footprint.outline - foot[:2], heading)
         direction = _normalize(requested - object_center)
         push_distance = 0.0
@@ -329,7 +332,11 @@ class ThingsControl(Control):
                 outline + requested, initial_footprint.lower, initial_footprint.upper
             )
             push_distance = _find_free_shift(
-                footprint, direction, obstacles, solids, gap=MIN_GAP / scene.metres
+                footprint,
+                direction,
+                obstacles,
+                solids,
+                gap=MIN_GAP / scene.size_in_metres,
             )
         position = requested + push_distance * direction
         height = _compute_height(scene, foot, position)
@@ -368,10 +375,10 @@ def _find_free_shift(
     the direction. The shift is negative if it ends behind where it began.
 
     Args:
-        footprint: of the thing at the requested position.
+        footprint: footprint of the thing at the requested position.
         direction: (2,) unit vector away from the object.
         obstacles: footprints that it may not overlap with.
-        solids: of the surroundings, likewise.
+        solids: solids of the surroundings, likewise.
         gap: distance that stays free.
     """
     # (begin, end) of the shifts at which it overlaps
@@ -419,17 +426,17 @@ def _find_foot(part: parts.MeshPart) -> assets.Float64Array:
 
 
 def _compute_footprint(
-    scene: SceneDescription, name: str, so_far: Mapping[str, Tensor]
+    scene: SceneDescription, name: str, earlier_inputs: Mapping[str, Tensor]
 ) -> parts.Footprint:
     """Return the footprint of a mesh on the ground, as the controls before have left
     it.
 
-    `so_far` are their inputs, among which may be the mesh's pose (4, 4) and the offsets
+    `earlier_inputs` are their inputs, among which may be the mesh's pose (4, 4) and the offsets
     (N, 3) of its vertices; otherwise it is as in the scene.
     """
     part = scene.meshes[name]
-    pose = so_far.get(f"{name}.to_world")
-    offsets = so_far.get(f"{name}.offsets")
+    pose = earlier_inputs.get(f"{name}.to_world")
+    offsets = earlier_inputs.get(f"{name}.offsets")
     if pose is None and offsets is None:
         return _compute_initial_footprint(part)
     vertices = part.mesh.vertices

@@ -155,9 +155,9 @@ class Bank(PredictedSearch):
         conditions. Then all matrices are made that it has by that query.
         """
         if query.kind == "search" and query.phase == "search":
-            self._latest_step = query.number
-            if query.number and query.number % COMPARISON_INTERVAL == 0:
-                self._compare(query.u, query.number)
+            self._latest_step = query.index
+            if query.index and query.index % COMPARISON_INTERVAL == 0:
+                self._compare(query.u, query.index)
         self._fill(self._latest_step)
         if query.with_image:
             # It has the same noise whenever it is rendered.
@@ -165,7 +165,7 @@ class Bank(PredictedSearch):
 
     def evaluate(self, query: Query) -> Evaluation:
         self.replay(query)
-        conditions = self._choose_conditions(query.kind, query.number)
+        conditions = self._choose_conditions(query.kind, query.index)
         evaluation = self._evaluate_under(conditions, query.u, query.gradient)
         if not query.with_image:
             return evaluation

@@ -103,7 +103,7 @@ class CroppedSearch(PredictedSearch):
         Where that is due, a whole image is rendered, measured and used.
         """
         kind = query.kind
-        number = query.number
+        number = query.index
         first_full = self.first_traced.get(kind, self.steps)
         if query.phase != "search" or number >= first_full:
             return None

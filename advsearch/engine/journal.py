@@ -412,16 +412,16 @@ class Journal:
             InputError: the stored evaluation is one of another configuration.
         """
         if query.phase is None:
-            return self._trials_of(query.kind).get(query.number)
-        if self.run is None or query.number >= self._counts.get(query.kind, 0):
+            return self._trials_of(query.kind).get(query.index)
+        if self.run is None or query.index >= self._counts.get(query.kind, 0):
             return None
-        stored = self.run.store.read_cached(query.kind, query.number)
+        stored = self.run.store.read_cached(query.kind, query.index)
         if stored is None:
             return None
         row, cached = stored
         if cached.u != compute_digest(query.u) or row.seed != query.seed:
             raise InputError(
-                f"{self.run.path}: cannot resume: evaluation {query.number} of the "
+                f"{self.run.path}: cannot resume: evaluation {query.index} of the "
                 f"{query.kind} is not the one that "
                 "was stored, so advsearch, its packages or the number of threads have "
                 "changed since; "
@@ -472,13 +472,13 @@ class Journal:
                 row = self._row_of_trial(query, evaluation)
                 if not id_is_number:
                     trials = self._trials_of(query.kind)
-                    trials[query.number] = replace(evaluation, picture=None)
-            elif query.number < self._counts.get(query.kind, 0):
+                    trials[query.index] = replace(evaluation, picture=None)
+            elif query.index < self._counts.get(query.kind, 0):
                 # It had a row when the run, complete by then, was opened.
                 continue
             else:
                 row, cached = self._row_of_search(query, evaluation)
-            rows.append(replace(row, id=query.number + 1) if id_is_number else row)
+            rows.append(replace(row, id=query.index + 1) if id_is_number else row)
         if self.run is None:
             for row in rows:
                 row_id = row.id or len(self.rows) + 1
@@ -512,7 +512,7 @@ class Journal:
             values |= self.problem.describe_conditions(query.u, query.seed)
         row = make_trial_row(
             query.kind,
-            query.number,
+            query.index,
             # A predicted image has no noise of its own.
             None if evaluation.predicted else query.seed,
             evaluation.predicted or query.spp,
@@ -536,7 +536,7 @@ class Journal:
         is_predicted = bool(evaluation.predicted)
         row = Row(
             query.kind,
-            query.number,
+            query.index,
             query.seed,
             None if is_predicted else problem.spp * query.samples,
             objective=evaluation.objective if is_finite else math.nan,
@@ -556,7 +556,7 @@ class Journal:
         if evaluation.picture is not None:
             image = to_uint8(evaluation.picture).numpy()
         cached = CachedEvaluation(
-            query.number,
+            query.index,
             compute_digest(query.u),
             evaluation.non_finite,
             evaluation.cost,

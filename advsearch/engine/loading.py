@@ -427,14 +427,14 @@ def fit_camera(
         )
     camera_model = description.camera_model
     remarks = description.remarks
-    if description.number("camera.drops") > 0.0:
+    if description.get_number("camera.drops") > 0.0:
         if description.rig:
             raise InputError(
                 "`set` camera.drops: of one camera, not of several; leave it out"
             )
         # Drops need a camera whose rays are computed one by one.
         if camera_model is None or not camera_model.name:
-            camera_model = make_pinhole(description.number("camera.fov"), aspect)
+            camera_model = make_pinhole(description.get_number("camera.fov"), aspect)
     if camera_model is not None:
         camera_model = make_bundled_models(aspect).get(camera_model.name, camera_model)
         scaling_remarks = camera_model.describe_scaling((height, width))
@@ -493,7 +493,7 @@ def make_renderer(
     formation = ImageFormation(
         denoiser=denoise,
         sampler=sampler,
-        exposure=description.number("camera.exposure"),
+        exposure=description.get_number("camera.exposure"),
         resolution=size,
         gain=description.gain,
     )

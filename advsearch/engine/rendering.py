@@ -440,7 +440,7 @@ def _render_view(
         predictions = task.predictions(output, MAX_PREDICTIONS)[0]
         marks = () if truth is None else tuple(task.marks(output, truth)[0])
     view = View(
-        azimuth=description.number("camera.azimuth"),
+        azimuth=description.get_number("camera.azimuth"),
         picture=image,
         linear=radiance * formation.gain,
         predictions=predictions,
@@ -576,7 +576,7 @@ def make_facts(
         sight = None
         if cached_look is not None:
             sight = partial(
-                _look_at, cached_look, mesh, metres=description.object.metres
+                _look_at, cached_look, mesh, metres=description.object.size_in_metres
             )
         if mesh == OBJECT:
             own_label = description.object.label
@@ -686,7 +686,7 @@ def _orbit_scene(
             f"{description.camera} is fixed; leave one "
             "of the two out"
         )
-    first_azimuth = description.number("camera.azimuth")
+    first_azimuth = description.get_number("camera.azimuth")
     for index in range(around):
         azimuth = (first_azimuth + 360.0 * index / around) % 360.0
         yield description.with_values(camera__azimuth=azimuth)

@@ -289,7 +289,7 @@ class SurfaceLight(PredictedSearch):
         costs_renders = self.problem.domain.gradient_cost > 0
         if query.gradient is True and costs_renders:
             return True
-        return self.count_predicted(query.kind, query.number + 1) <= query.number
+        return self.count_predicted(query.kind, query.index + 1) <= query.index
 
     def evaluate(self, query: Query, image: Tensor | None = None) -> Evaluation:
         """Evaluate a query, with its image (H, W, 3) if that is predicted already."""
@@ -336,7 +336,7 @@ class SurfaceLight(PredictedSearch):
             and problem.conditions is not None
             and not self._has_moving
         )
-        index = query.number % N_CONDITION_SETS if reuses_conditions else query.number
+        index = query.index % N_CONDITION_SETS if reuses_conditions else query.index
         conditions = self._choose_conditions(query.kind, index, problem.n_draws)
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
@@ -429,19 +429,19 @@ class SurfaceLight(PredictedSearch):
         """
         if query.kind != "search" or query.phase != "search" or self.tracing_reason:
             return
-        if query.number < (self._next_comparison or COMPARISON_INTERVAL):
+        if query.index < (self._next_comparison or COMPARISON_INTERVAL):
             return
         was_accurate = self.deviations[-1].is_accepted
-        is_accurate = self._compare(query.u, query.number).is_accepted
+        is_accurate = self._compare(query.u, query.index).is_accepted
         interval = COMPARISON_INTERVAL
         if is_accurate and not self._searches_colors:
             # the next comparison is at twice the number
-            interval = query.number
-        self._next_comparison = query.number + interval
+            interval = query.index
+        self._next_comparison = query.index + interval
         if is_accurate:
             return
         if not was_accurate:
-            self.trace_from("search", query.number)
+            self.trace_from("search", query.index)
         elif self._searches_colors:
             with self.count_time():
                 self.renderer.update_base_color(self.problem.add_conditions(query.u))

@@ -361,7 +361,7 @@ class Transport(PredictedSearch):
         search is traced.
         """
         kind = query.kind
-        number = query.number
+        number = query.index
         if query.phase != "search" or number >= self.count_predicted(kind, self.steps):
             return None
         predictor = self._current.setdefault(kind, self.start)

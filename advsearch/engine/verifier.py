@@ -132,7 +132,7 @@ class Verifier:
             queries = [replace(query, has_success=False) for query in queries]
         evaluations = self.journal.evaluate_all(queries, evaluate)
         for query, evaluation in zip(queries, evaluations, strict=True):
-            trial = (query.kind, query.number)
+            trial = (query.kind, query.index)
             if evaluation.picture is not None:
                 self.state.trial_images[trial] = evaluation.picture
             if evaluation.predicted:

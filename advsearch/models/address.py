@@ -185,7 +185,7 @@ class _Request:
     """A request that is to be sent.
 
     Attributes:
-        index: of its body.
+        index: index of its body.
         tries: how many are left.
         delay: before the next try, in seconds.
     """
@@ -275,15 +275,15 @@ class AddressModel(models.RemoteNetwork):
     in a run, also if the run is resumed.
 
     Attributes:
-        url: of requests.
-        name: in messages.
+        url: URL of requests.
+        name: name in messages.
         spec: what the user wrote.
-        limits: of a run, see `LIMITS`.
+        limits: limits of a run, see `LIMITS`.
         chat: the name of a chat's model; empty for the plain protocol.
-        question: about the image; may be empty.
+        question: question about the image; may be empty.
         tokens: maximum length of an answer in words.
         times: number of requests per image.
-        names: with scores in answers.
+        names: names with scores in answers.
         spent: calls, and tokens in and out, of a run including what it was resumed
             from.
         store: the run that stores answers and what is spent.
@@ -649,7 +649,7 @@ class AddressModel(models.RemoteNetwork):
         """Explain a failure of a request.
 
         Args:
-            error: that was raised.
+            error: error that was raised.
             first: no request has succeeded yet.
 
         Returns:
@@ -692,7 +692,7 @@ class AddressModel(models.RemoteNetwork):
 
         Args:
             body: JSON.
-            deadline: of the connection, as `time.monotonic` counts.
+            deadline: deadline of the connection, as `time.monotonic` counts.
             connections: list that the connection is added to.
 
         Raises:

@@ -19,7 +19,8 @@ class AllAtOnce(nn.Module):
     same.
 
     Args:
-        network: from (N, K, 3, H, W), or (N, K, H, W, 3), to an output with N rows.
+        network: network from (N, K, 3, H, W), or (N, K, H, W, 3), to an output with N
+            rows.
         cameras: K.
         layout: "NKCHW" or "NKHWC".
 

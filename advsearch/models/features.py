@@ -50,7 +50,8 @@ class Features:
     model: Model
     read: Read = field(repr=False)
     size: int  # F, numbers per image
-    # for messages and reports, such as "the input of head (Linear), 192 numbers"
+    # Source for messages and reports, such as "the input of head (Linear), 192
+    # numbers".
     source: str
     # False where they are the logits, for want of anything else
     penultimate: bool = True
@@ -103,10 +104,10 @@ class _Call(NamedTuple):
 
     Attributes:
         layer: a module, or a node of a graph.
-        name: for messages.
-        input: of the call; None if it is no activation but weights.
-        output: of the call.
-        axis: of the channels in both.
+        name: name for messages.
+        input: input of the call; None if it is no activation but weights.
+        output: output of the call.
+        axis: axis of the channels in both.
     """
 
     layer: Any
@@ -131,7 +132,7 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
 
     Args:
         calls: traces the layers of a network.
-        model: with the network.
+        model: model with the network.
         x: a batch for it.
 
     Returns:

@@ -182,7 +182,7 @@ def _describe_file(path: Path, head: bytes) -> str:
     """Describe what a file may be that is no zip archive, and what to do about it.
 
     Args:
-        path: of the file, whose suffix is looked at.
+        path: path of the file, whose suffix is looked at.
         head: its first 16 bytes.
     """
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30:
@@ -278,8 +278,8 @@ def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
     ...).
 
     Args:
-        source: of the program, for messages.
-        names: of the inputs.
+        source: source of the program, for messages.
+        names: names of the inputs.
         inputs: example values of each, with their shapes.
 
     Raises:

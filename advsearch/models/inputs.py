@@ -32,10 +32,10 @@ class WithImageSize(nn.Module):
     """A network that also takes the size of its images; its boxes are then in pixels.
 
     Args:
-        network: from images and their sizes (N, 2), (width, height) in pixels, to an
-            output.
+        network: network from images and their sizes (N, 2), (width, height) in pixels,
+            to an output.
         size_type: dtype of these sizes.
-        layout: of the images, "NCHW" or "NHWC".
+        layout: layout of the images, "NCHW" or "NHWC".
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class EightBitInput(nn.Module):
     gradient.
 
     Args:
-        network: from images in uint8, and further inputs, to an output.
+        network: network from images in uint8, and further inputs, to an output.
     """
 
     def __init__(self, network: Callable[..., Any]) -> None:

@@ -145,7 +145,7 @@ def _find_class(
     Args:
         term: a name, or an index such as "#504".
         table: indices by name.
-        labels: of the model.
+        labels: labels of the model.
         named: whether these are names, not placeholders.
 
     Raises:
@@ -179,8 +179,8 @@ def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
     """Return a hint for an unknown label: names like it, or what labels there are.
 
     Args:
-        term: that is unknown.
-        labels: of the model.
+        term: term that is unknown.
+        labels: labels of the model.
         named: whether these are names, not placeholders.
     """
     if not named:
@@ -294,7 +294,7 @@ def _is_name_list(source: str | os.PathLike[str]) -> bool:
 class LabelsOrigin(NamedTuple):
     """Where labels came from."""
 
-    text: str = "labels"  # for messages
+    text: str = "labels"  # text for messages
     is_file: bool = False
 
 

@@ -99,9 +99,9 @@ def load_model(
         labels: the names in index order, or a label file (see `read_labels`), which a
             network that compares pictures with texts needs. Default "class 0", "class
             1", ...
-        prompt: of such a network: the text that each name is put into, with ``{}`` in
-            its place; several (a list, or with | between them) are averaged. Default
-            `advsearch.models.labels.PROMPT`.
+        prompt: prompt of such a network: the text that each name is put into, with
+            ``{}`` in its place; several (a list, or with | between them) are averaged.
+            Default `advsearch.models.labels.PROMPT`.
         name: its name in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.
         mean: one number, three, or ``"imagenet"``, ``"half"``, ``"clip"``, in units of
@@ -248,12 +248,12 @@ def _probe_source(
     """Create a model from a source and the options of `load_model`, and probe it.
 
     Args:
-        source: of the network.
-        options: that are set.
+        source: source of the network.
+        options: options that are set.
         read: reads the network's output; None for logits.
-        name: of the model; None for that of the source.
-        names: of classes; None for those of the source.
-        origin: of the names, for messages.
+        name: name of the model; None for that of the source.
+        names: names of classes; None for those of the source.
+        origin: origin of the names, for messages.
     """
     min_batch, max_batch = source.batch_limits
     max_batch = min(max_batch, options.get("max_batch") or max_batch)
@@ -370,8 +370,8 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
     """Create the preprocessing from options, else from what the source states.
 
     Args:
-        source: of the network.
-        options: of `load_model`, Python values or strings from a command line.
+        source: source of the network.
+        options: options of `load_model`, Python values or strings from a command line.
 
     Raises:
         InputError: an option is out of range, or the source's processor excludes it.

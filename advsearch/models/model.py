@@ -248,7 +248,7 @@ class Model:
             `read_logits` describes.
         name: its name in messages and results.
         labels: one name per class, in index order.
-        preprocessing: of an image.
+        preprocessing: preprocessing of an image.
         batch_limits: (minimum, maximum) batch size of the network. Larger batches are
             split, smaller ones padded.
         probabilities: the network returns probabilities; their logarithm is returned:
@@ -257,8 +257,8 @@ class Model:
         attached: its gradient is that of its outputs only if `detach` is ignored, see
             `DetachMode`.
         named: False if `labels` are placeholders.
-        dtype: of the network's floating-point input.
-        device: of the network. Images go there, the output comes back.
+        dtype: dtype of the network's floating-point input.
+        device: device of the network. Images go there, the output comes back.
         read: reads the output from what the network returns for a number of images: a
             tensor (N, ...), or a list with one element for each; None for logits.
         spec: the argument of `load_model`, if that is all that defines the model; None
@@ -518,7 +518,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
         read: reads it; see `Read`.
         returned: by the network.
         count: number of images.
-        name: of the model, for messages.
+        name: name of the model, for messages.
 
     Raises:
         ModelError: there is no output, or not one for each image.
@@ -596,10 +596,10 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     ``"logits"``, and a tuple or list whose first element is a tensor.
 
     Args:
-        output: of the network.
+        output: output of the network.
         count: number of images.
         classes: number of classes; None if it is unknown.
-        name: of the model, for messages.
+        name: name of the model, for messages.
 
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.
@@ -658,7 +658,7 @@ def mend_batch_norms(output: Any) -> None:
     convolutions end in a transformer. Batches are right.
 
     Args:
-        output: of a network, whose graph gets hooks.
+        output: output of a network, whose graph gets hooks.
     """
 
     def with_strides(

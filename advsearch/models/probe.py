@@ -483,7 +483,7 @@ def _find_batch_limits(
     """Return the minimum and maximum batch size, from a batch of two images.
 
     Args:
-        model: that is probed.
+        model: model that is probed.
         pair: the two images.
         rows: the outputs for each image by itself; None if they are not repeatable.
     """
@@ -615,7 +615,7 @@ def _measure_change(
     """Measure how the number of `_compute_checked_value` changes around images.
 
     Args:
-        model: that is run.
+        model: model that is run.
         images: (N, H, W, 3).
         step: (N, H, W, 3), taken to both sides; the images are clipped to [0, 1] there.
         *gradients: (N, H, W, 3) that predict the change.
@@ -643,7 +643,7 @@ def _check_gradient(
     predicts.
 
     Args:
-        model: that is probed.
+        model: model that is probed.
         images: (N, H, W, 3).
         gradient: (N, H, W, 3) of `_compute_checked_value`.
         detached: whether the network detaches tensors, for the message.

@@ -105,7 +105,7 @@ class _Residual(nn.Module):
 
         Args:
             inputs, outputs: channels.
-            stride: of the first convolution, and of the shortcut's pooling.
+            stride: stride of the first convolution, and of the shortcut's pooling.
         """
         super().__init__()
         self.first = _Convolution(inputs, outputs, 3, stride=stride)
@@ -156,7 +156,7 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
     """Return the model "reference" with its labels.
 
     Args:
-        folder: with its two files; by default the package's own.
+        folder: folder with its two files; by default the package's own.
         weights: a safetensors file with other weights for the same labels.
 
     Raises:
@@ -180,7 +180,7 @@ def load_network(
     """Return the network with its weights, which can be trained further, and its labels.
 
     Args:
-        folder: with its two files; by default the package's own.
+        folder: folder with its two files; by default the package's own.
         weights: a safetensors file whose weights replace those of the folder.
 
     Raises:

@@ -62,8 +62,8 @@ class Purpose:
 
     Attributes:
         task: its name.
-        names: of classes, by the user; None without.
-        prompts: by the user; None without.
+        names: names of classes, by the user; None without.
+        prompts: prompts by the user; None without.
         tokens: maximum length of a free answer.
         times: number of answers per image.
         ask: limits of a model behind an address (`advsearch.models.address.LIMITS`).
@@ -82,7 +82,7 @@ class Purpose:
         Args:
             model: its name.
             what: the network does, such as "compares a picture with texts".
-            *tasks: that this is good for. A user's own task may read any output.
+            *tasks: tasks that this is good for. A user's own task may read any output.
 
         Raises:
             ModelError: it cannot.
@@ -139,7 +139,7 @@ class Source:
     The defaults are as in `load_model`, and None if the source does not state them.
     """
 
-    # in evaluation mode, its parameters without gradients
+    # Module in evaluation mode, its parameters without gradients.
     module: Callable[[torch.Tensor], Any]
     name: str
     input_size: tuple[int, int] | None = None
@@ -151,12 +151,12 @@ class Source:
     # as in `Preprocessing`
     processor: Callable[[torch.Tensor], torch.Tensor] | None = None
     batch_limits: tuple[int, int] = (1, 64)  # (fewest, most) images at once
-    dtype: torch.dtype = torch.float32  # of the input
+    dtype: torch.dtype = torch.float32  # dtype of the input
     device: torch.device = CPU
     reads_text: bool = False  # it is given texts beside the picture
     takes_more: bool = False  # it is called with more than pictures
     value_range: tuple[float, float] | None = None
-    # in which it takes the size of pictures, see `WithImageSize`
+    # Size type in which it takes the size of pictures, see `WithImageSize`.
     size_type: torch.dtype | None = None
 
 
@@ -165,9 +165,9 @@ def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
 
     Args:
         module: the network.
-        name: of the model.
-        **fields: of `Source`. Dtype and device are by default those of the module's
-            first floating-point parameter or buffer.
+        name: name of the model.
+        **fields: fields of `Source`. Dtype and device are by default those of the
+            module's first floating-point parameter or buffer.
 
     Raises:
         ModelError: it has lazy layers that have no weights yet.
@@ -231,8 +231,8 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
 
     Args:
         module: the network.
-        path: of the file.
-        name: of the model, for messages.
+        path: path of the file.
+        name: name of the model, for messages.
 
     Raises:
         FileFormatError: the file is missing or is not safetensors.
@@ -347,7 +347,7 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
     """Import a module, which may be in the current directory.
 
     Args:
-        name: of the module.
+        name: name of the module.
         spec: what the user wrote, for messages.
         libraries: names that the module's may have been meant to be.
 
@@ -398,9 +398,9 @@ def import_library(name: str, spec: str, extra: str) -> Any:
     """Import an optional library that a model needs.
 
     Args:
-        name: of the library.
+        name: name of the library.
         spec: what the user wrote, for messages.
-        extra: of advsearch, which installs it.
+        extra: extra of advsearch, which installs it.
 
     Raises:
         ModelError: it is not installed, or cannot be imported.

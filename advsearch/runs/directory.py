@@ -258,7 +258,7 @@ class RunDirectory:
 
         Args:
             note: the name under which they are stored.
-            facts: by name.
+            facts: facts by name.
 
         Raises:
             InputError: a fact is not what it was when it was stored first; the run

@@ -63,7 +63,7 @@ def write_rows(
         format: a name in `FORMATS`.
         out: the file, which is written whole or not at all; None for `stream`.
         stream: is written to where there is no file.
-        kind: of the rows to write; None for all.
+        kind: kind of the rows to write; None for all.
 
     Raises:
         UnknownNameError: there is no such format or kind.

@@ -36,8 +36,8 @@ class Exporter(ABC):
         name: the word of `--format`.
         writes: what the name after `--out` is of: "a PDF file".
         example: a command line without `advsearch` in front.
-        suffix: of files that are of this format if no other is requested, without the
-            dot; by default the name.
+        suffix: suffix of files that are of this format if no other is requested,
+            without the dot; by default the name.
         options: flags of `advsearch export` that belong to it: "size".
     """
 

@@ -241,7 +241,7 @@ def write_layers(
     """Write channels into one EXR file, whole or not at all, and return its path.
 
     Args:
-        path: of the file.
+        path: path of the file.
         layers: channels (H, W) by name, such as ``normal.X``; numbers become float32,
             whole numbers 32 bits without sign.
         notes: what they mean, attributes of the file by name.

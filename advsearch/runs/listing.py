@@ -79,7 +79,7 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
     counted.
 
     Args:
-        path: of the run.
+        path: path of the run.
         counts: also count its rows, which takes a second for a million.
     """
     running = is_held(path)
@@ -124,7 +124,7 @@ def _make_listed_run(
     What cannot be read is added to `faults` and left out; nothing is raised.
 
     Args:
-        path: of the run.
+        path: path of the run.
         counts: also count its rows, which opens the database.
         running: a process holds the lock of the run.
         faults: sentences, to which those of this run are added.

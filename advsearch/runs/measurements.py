@@ -35,7 +35,7 @@ class Measurements:
 
     Args:
         context: `experiment.RunContext` of the run that stores them.
-        seconds: from now on, after which none is begun; None for no limit.
+        seconds: seconds from now on, after which none is begun; None for no limit.
     """
 
     def __init__(self, context: Any, seconds: float | None = None) -> None:

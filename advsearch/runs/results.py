@@ -419,7 +419,7 @@ class Extent(Fields):
             what: is counted.
             count: how many there were.
             total: of how many.
-            interval: of the share; None is the whole of [0, 1].
+            interval: interval of the share; None is the whole of [0, 1].
             share: kept only where it is not count over total.
         """
         stated_share = share if total and share != count / total else None
@@ -781,7 +781,7 @@ class SharedWork(Fields):
 
         Args:
             facts: the `cluster.WorkerStats` of the run, or None.
-            machines: that differ from this one, by name.
+            machines: machines that differ from this one, by name.
         """
         if facts is None:
             return None

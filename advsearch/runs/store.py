@@ -121,7 +121,7 @@ class Store:
     Close it, or use it in a `with` block.
     """
 
-    FILE: ClassVar[str] = NAME  # in the directory of a run
+    FILE: ClassVar[str] = NAME  # FILE in the directory of a run
     # the prediction of a row without a label
     NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER
 
@@ -163,7 +163,7 @@ class Store:
         and step are there already changes nothing.
 
         Args:
-            rows: of evaluations.
+            rows: rows of evaluations.
             cached: what the last of them told its search, beside the row.
         """
         check_not_moved(self.path)
@@ -385,7 +385,7 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     become NULL.
 
     Args:
-        row: of an evaluation.
+        row: row of an evaluation.
         stamp: the time of writing, seconds since 1970.
     """
     values = []

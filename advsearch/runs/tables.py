@@ -47,12 +47,12 @@ Count = Annotated[int, Field(strict=True, ge=1, le=MAX_ROWS)]
 class Units:
     """How rows follow from draws."""
 
-    # of the axes of the grid, the last one fastest
+    # Sizes of the axes of the grid, the last one fastest.
     sizes: Annotated[tuple[Count, ...], Field(max_length=MAX_AXES)] = ()
     # place of the axis whose values are frames
     frames: Annotated[int, Field(strict=True, ge=0)] | None = None
     samples: Count = 1  # draws at each point of the grid
-    models: Count = 1  # that are shown the same pictures
+    models: Count = 1  # models that are shown the same pictures
     # pictures after which the draws come again; 0 for never
     again: Annotated[int, Field(strict=True, ge=0, le=MAX_ROWS)] = 0
     noise: Count = 1  # pictures of each draw that differ in noise alone
@@ -102,7 +102,7 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
     """Return what a run notes of its units; None where it notes nothing.
 
     Args:
-        store: of the run.
+        store: store of the run.
         is_sampled: something was drawn by chance. Older notes do not say it: where
             nothing was drawn, their samples differ in noise alone.
 

@@ -63,9 +63,9 @@ class Tracker:
         """Start the thread that sends.
 
         Args:
-            name: of the tracker.
-            folder: of the run.
-            settings: of the run; each is cut to `MAX_TEXT_LENGTH` characters.
+            name: name of the tracker.
+            folder: folder of the run.
+            settings: settings of the run; each is cut to `MAX_TEXT_LENGTH` characters.
         """
         self._name = name
         self._accuracy_counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
@@ -145,8 +145,8 @@ def _open_tracker(
     """Open a run of a tracker.
 
     Args:
-        name: of the tracker.
-        folder: of our run.
+        name: name of the tracker.
+        folder: folder of our run.
         settings: texts by name.
 
     Returns:

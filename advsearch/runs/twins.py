@@ -55,9 +55,9 @@ def find_twin_evidence(
     """Return what a run of twins measured for the nearest conditions.
 
     Args:
-        run: of twins, its name or folder; None for none.
-        model: of the other run, by name, as all these.
-        task: that judged it.
+        run: run of twins, its name or folder; None for none.
+        model: model of the other run, by name, as all these.
+        task: task that judged it.
         object_name: a bundled name, or a file.
         environment: around the object.
         in_photograph: the scene is rendered into a photograph.

@@ -262,7 +262,8 @@ def _move_carried(
 
     Args:
         part: the beam or the glass.
-        inputs: of the scene, with the carrier's `to_world` and `offsets` if it moves.
+        inputs: inputs of the scene, with the carrier's `to_world` and `offsets` if it
+            moves.
     """
     moved_inputs: dict[str, Tensor] = {}
     pose = inputs.get(f"{part.carrier}.to_world")
@@ -362,7 +363,7 @@ class Motion:
         self._camera = torch.from_numpy(pose).double()
         # `_ground` is half the side of the ground square, `_edge` (n, 3) points on it.
         if description.photograph is None:
-            self._ground = description.number("ground.size") / 2.0
+            self._ground = description.get_number("ground.size") / 2.0
             self._edge = _sample_square_edge(self._ground)
         else:
             floor = description.photograph.mesh.vertices

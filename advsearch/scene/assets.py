@@ -171,8 +171,8 @@ class Shape:
     material: Material = field(default_factory=Material)
     # the class it belongs to in the reference model, or None when unknown
     label: str | None = None
-    # in place of the principled surface, Mitsuba's dictionary of one, with
-    # `parts.BASE_COLOR` where the texture goes
+    # Surface in place of the principled surface, Mitsuba's dictionary of one, with
+    # `parts.BASE_COLOR` where the texture goes.
     surface: Mapping[str, object] | None = None
     # (H, W) in [0, 1], the share of light that does not pass through; None where it is
     # 1
@@ -195,16 +195,16 @@ class ObjectAsset(Shape):
     up: FileAxis | None = None  # the axis of the file that was taken for up
     # the axis of the file that was taken for its front, which is +x here
     front: FileAxis | None = None
-    # of several materials, what each of `mesh.materials` is like beside its base
-    # colour; `material` covers the rest
+    # Finishes of several materials, what each of `mesh.materials` is like beside its
+    # base colour; `material` covers the rest.
     finishes: Mapping[str, Material] = field(default_factory=dict)
     # its largest extent, where distances of the camera are in metres (see below)
-    metres: float | None = None
+    size_in_metres: float | None = None
     extent: float | None = None  # its largest extent in the coordinates of its file
     # (4, 4) from the coordinates of its file to those of `mesh`
     file_to_mesh: Float64Array | None = None
-    # in a lane it faces as the traffic drives; otherwise it faces those who come, as
-    # signs do
+    # Drives in a lane it faces as the traffic drives; otherwise it faces those who
+    # come, as signs do.
     drives: bool = True
 
     @property
@@ -385,7 +385,7 @@ def _cluster_vertices(mesh: Mesh, grid: int) -> IntArray:
     """Return the cluster (V,) of each vertex: the cell of a grid that it is in.
 
     Args:
-        mesh: with V vertices.
+        mesh: mesh with V vertices.
         grid: cells along its largest extent.
     """
     lower = mesh.vertices.min(axis=0)
@@ -413,9 +413,9 @@ def _encode_rows(rows: IntArray) -> IntArray:
 # How large things really are: an object's longest side in metres, from what is said of
 # it or from its file.
 #
-# A scene is as large as its object is 1. `ObjectAsset.metres` is the one number that
+# A scene is as large as its object is 1. `ObjectAsset.size_in_metres` is the one number that
 # makes metres of it: whatever speaks of metres (distances of the camera, the road, what
-# stands beside the object) divides by `SceneDescription.metres`.
+# stands beside the object) divides by `SceneDescription.size_in_metres`.
 
 # metres of the units that a mesh may be in
 METRES_PER_UNIT = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
@@ -488,7 +488,7 @@ of an object.
 def is_road_vehicle(asset: ObjectAsset) -> bool:
     """Tell whether an object is a vehicle of the road whose size is known."""
     words = re.split(r"[^a-z]+", f"{asset.name} {asset.label or ''}".lower())
-    return asset.metres is not None and not ROAD_VEHICLES.isdisjoint(words)
+    return asset.size_in_metres is not None and not ROAD_VEHICLES.isdisjoint(words)
 
 
 def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> ObjectAsset:
@@ -497,7 +497,7 @@ def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> Objec
     Args:
         asset: the object.
         size: its longest side in metres.
-        unit: of its file, one of `METRES_PER_UNIT`.
+        unit: unit of its file, one of `METRES_PER_UNIT`.
 
     Raises:
         InputError: both are given, the size is out of range, or the object comes
@@ -532,7 +532,7 @@ def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> Objec
             f"got {longest_side:.4g}; give it in "
             "metres, such as size=4.9"
         )
-    return replace(asset, metres=longest_side)
+    return replace(asset, size_in_metres=longest_side)
 
 
 def describe_size_doubts(
@@ -559,8 +559,11 @@ def describe_size_doubts(
         None,
     )
     min_size, max_size = (0.005, 100.0) if kind is None else USUAL_SIZES[kind]
-    is_unusual = asset.metres is not None and not min_size <= asset.metres <= max_size
-    is_unknown = asset.metres is None and (
+    is_unusual = (
+        asset.size_in_metres is not None
+        and not min_size <= asset.size_in_metres <= max_size
+    )
+    is_unknown = asset.size_in_metres is None and (
         needs_metres or (kind is not None and asset.extent is not None)
     )
     if has_user_size or not (is_unusual or is_unknown):
@@ -572,7 +575,7 @@ def describe_size_doubts(
         if min_size <= extent * metres <= max_size
     ]
     clauses = [
-        f"its longest side is {format_rounded(asset.metres or 0.0)} m"
+        f"its longest side is {format_rounded(asset.size_in_metres or 0.0)} m"
         if is_unusual
         else "its size in metres is not known",
         f"it is {format_rounded(extent)} in its file" if is_unknown and extent else "",

@@ -213,7 +213,7 @@ def make_backdrop(
     """Make a backdrop of 8-bit sRGB levels (H, W, 3).
 
     Args:
-        levels: of the full photograph.
+        levels: levels of the full photograph.
         spec: how it is called.
         crop: left, top, width and height in pixels of the part to use; None: all.
 
@@ -283,9 +283,9 @@ def has_plane(description: SceneData) -> bool:
     """
     return (
         description.backdrop_photograph is not None
-        and description.number("ground.size") > 0.0
+        and description.get_number("ground.size") > 0.0
         and bool((compute_level_irradiance(description) > 0.0).all())
-        and camera_to_world(description)[2, 3] > description.number("ground.level")
+        and camera_to_world(description)[2, 3] > description.get_number("ground.level")
     )
 
 
@@ -298,7 +298,7 @@ def compute_plane_radiance(description: SceneData) -> Tensor | None:
         return None
     srgb = np.array(description.ground_color, np.float32)
     albedo = srgb_to_linear(srgb).astype(np.float64)
-    brightness = 2.0 ** description.number("environment.exposure")
+    brightness = 2.0 ** description.get_number("environment.exposure")
     radiance = albedo * brightness * compute_level_irradiance(description) / math.pi
     return torch.from_numpy(radiance).float()
 
@@ -314,7 +314,7 @@ def measure_plane_color(
 
     Args:
         description: the scene, with the camera of the full photograph.
-        photograph: that it is rendered into.
+        photograph: photograph that it is rendered into.
         gain: factor from radiance to display-linear values.
     """
     names = [f"ground.{channel}" for channel in CHANNELS]
@@ -342,7 +342,7 @@ def _sample_ring(description: SceneData) -> Float64Array:
     center = object_to_world(description)[:2, 3]
     x = center[0] + radius * np.cos(angle)
     y = center[1] + radius * np.sin(angle)
-    level = np.full(N_CONTACT_POINTS, description.number("ground.level"))
+    level = np.full(N_CONTACT_POINTS, description.get_number("ground.level"))
     return np.column_stack([x, y, level])
 
 
@@ -381,7 +381,7 @@ def make_matrix_camera(
     """Return the camera of an intrinsic matrix (3, 3), as OpenCV has it.
 
     Args:
-        camera_matrix: in pixels; the center of the first pixel is (0, 0).
+        camera_matrix: camera matrix in pixels; the center of the first pixel is (0, 0).
         size: height and width in pixels of the photographs that it is for.
 
     Raises:
@@ -425,7 +425,7 @@ def fit_to_photograph(
 
     Args:
         description: the scene, whose camera took the full photograph.
-        photograph: that it is rendered into.
+        photograph: photograph that it is rendered into.
         resolution: height and width of the film, pixels.
         gain: factor from radiance to display-linear values.
 
@@ -444,7 +444,7 @@ def fit_to_photograph(
     plane_color = measure_plane_color(uncropped, photograph, gain)
     if photograph.is_cropped:
         if model is None:
-            fov = description.number("camera.fov")
+            fov = description.get_number("camera.fov")
             model = replace(make_pinhole(fov, full_aspect), name=PHOTOGRAPH_CAMERA)
         model = crop_camera(model, photograph)
     return replace(
@@ -572,7 +572,7 @@ def compute_view_settings(
     lowest = float(((vertices - middle) @ rotation.T)[:, 2].min())
     return {
         **_compute_orbit(world_axes),
-        "camera.distance": distance * (asset.metres or 1.0),
+        "camera.distance": distance * (asset.size_in_metres or 1.0),
         **_decompose_rotation(rotation),
         "pose.x": float(offset[0]),
         "pose.y": float(offset[1]),
@@ -588,7 +588,7 @@ def _check_and_map(asset: ObjectAsset, object_to_camera: npt.ArrayLike) -> Float
     Both are in object sizes. Raises InputError as `compute_view_settings`.
     """
     pose = _check_rigid(object_to_camera)
-    if asset.file_to_mesh is None or asset.metres is None:
+    if asset.file_to_mesh is None or asset.size_in_metres is None:
         raise InputError(
             f"{asset.name}: expected an object from a mesh file with a known unit, to "
             "be seen in a measured pose; give `unit`, such as unit=mm"

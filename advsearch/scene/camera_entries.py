@@ -383,7 +383,7 @@ def _check_numbers(
 class CameraPreset:
     """The pose of a mounted camera, and what the control `camera` searches of it."""
 
-    height: float  # of the lens above the floor or the road, metres
+    height: float  # height of the lens above the floor or the road, metres
     fov: float  # field of view along the larger side of the picture, degrees
     # From the object's center, metres; further if the object would not fit.
     distance: float

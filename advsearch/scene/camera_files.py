@@ -419,7 +419,7 @@ def _read_focal_lengths(
         path: the file, for messages.
         data: all entries of the file, which have the angles, radians.
         entries: those of the camera, which have the lengths.
-        width: of the image in pixels.
+        width: width of the image in pixels.
         height: likewise.
 
     Raises:
@@ -444,7 +444,7 @@ def _select_lens(
     Args:
         path: the file, for messages.
         camera_name: index of the frame, as text; "" if none is named.
-        frames: of the file.
+        frames: frames of the file.
 
     Raises:
         FileFormatError: there is no such frame, or none is named and lenses differ.

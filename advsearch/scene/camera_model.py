@@ -583,7 +583,7 @@ def _evaluate_with_jacobian(
     the derivative of each.
 
     Args:
-        function: from points to values (N, k).
+        function: function from points to values (N, k).
         at: the points, (N, ...).
 
     Returns:

@@ -172,7 +172,7 @@ class SceneDescription(SceneData):
                 "each other: a photograph was taken by one camera; name one of them, "
                 f"{self.rig_spec}#NAME"
             )
-        if self.number("camera.drops") > 0.0:
+        if self.get_number("camera.drops") > 0.0:
             raise InputError(
                 f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
                 "other: drops would show the photograph; leave one of the two out"
@@ -307,18 +307,18 @@ class SceneDescription(SceneData):
         Raises InputError: the object's size in metres is not known.
         """
         preset = PRESETS[name]
-        if self.object.metres is None:
+        if self.object.size_in_metres is None:
             raise InputError(
                 f"`camera={name}` is {preset.height:g} m high, and how large "
                 f"{self.object.name} is is not known; give "
                 "its longest side in metres, such as `size=0.1`"
             )
         is_on_plane = (
-            self.number("ground.size") > 0.0
+            self.get_number("ground.size") > 0.0
             and self.photograph is None
             and not is_paved(self)
         )
-        is_on_table = is_on_plane and self.object.metres <= MAX_TABLETOP_SIZE
+        is_on_table = is_on_plane and self.object.size_in_metres <= MAX_TABLETOP_SIZE
         preset_values = {"camera.fov": preset.fov}
         if "camera.elevation" not in self.requested:
             place = find_place(self)
@@ -329,7 +329,7 @@ class SceneDescription(SceneData):
         if preset.in_lane:
             preset_values["camera.azimuth"] = 0.0
         if is_on_table:
-            preset_values["ground.size"] = TABLE_SIDE / self.metres
+            preset_values["ground.size"] = TABLE_SIDE / self.size_in_metres
         values = dict(self.values)
         for setting, value in preset_values.items():
             if setting not in self.requested:
@@ -339,9 +339,9 @@ class SceneDescription(SceneData):
         )
         if "camera.distance" in self.requested:
             return scene
-        fov = torch.tensor(scene.number("camera.fov"), dtype=torch.float64)
+        fov = torch.tensor(scene.get_number("camera.fov"), dtype=torch.float64)
         framing = float(geometry.compute_framing_distance(scene, fov, scene.aspect))
-        distance = max(preset.distance, framing * scene.metres)
+        distance = max(preset.distance, framing * scene.size_in_metres)
         return scene.with_values(camera__distance=distance)
 
     @property
@@ -520,7 +520,7 @@ class SceneDescription(SceneData):
             )
         else:  # saturation (Lagarde and de Rousiers 2014, Moving Frostbite to PBR, section 5.1)
             exposure = unit / (1.2 * math.pow(2.0, stops))
-        return exposure * math.pow(2.0, self.number("camera.exposure"))
+        return exposure * math.pow(2.0, self.get_number("camera.exposure"))
 
 
 def load_description(
@@ -542,13 +542,13 @@ def load_description(
     and errors that are not listed are as of `advsearch.load_scene`.
 
     Args:
-        object_spec: with `plugins` the id of a shape.
+        object_spec: object spec with `plugins` the id of a shape.
         environment_spec: `NO_ENVIRONMENT` is no map at all.
         setting_values: settings of the scene by name.
         up: the up axis of a mesh file.
         facing: the axis of a mesh file that is its front.
         size: longest side of the object, metres.
-        unit: of the object's file.
+        unit: unit of the object's file.
         plugins: a Mitsuba scene as its loader takes it.
         things: what stands beside the object.
     """
@@ -710,7 +710,7 @@ def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None
     Raises InputError: it has, and another is requested.
 
     Args:
-        parts: of the scene.
+        parts: parts of the scene.
         requester: the setting that needs a map of ours, as users write it.
     """
     for part in parts:

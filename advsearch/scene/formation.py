@@ -63,7 +63,8 @@ class ImageFormation:
 
     # "oidn", Intel Open Image Denoise with albedo and normals as guides, or "none"
     denoiser: str = "oidn"
-    # of reconstruction: all others correlate pixels, and then the denoiser does nothing
+    # Filter of reconstruction: all others correlate pixels, and then the denoiser does
+    # nothing.
     filter: ClassVar[str] = "box"
     # how samples are spread over a pixel: "multijitter" (Kensler 2013, Correlated
     # multi-jittered sampling), or "independent", which has more noise
@@ -323,7 +324,7 @@ def _compute_distant_light(
     offset = np.abs(center[:2] + directions[:, :2] * distance)
     # otherwise the map has what comes from below
     has_plain_ground = scene.photograph is None and not is_paved(scene)
-    in_reach = (offset <= scene.number("ground.size") / 2.0).all(axis=1)
+    in_reach = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
     hits = has_plain_ground & ~is_up & in_reach
     power = np.where(hits[:, None], reflected * solid_angle[:, None], power)
     return directions, power
@@ -338,7 +339,7 @@ def compute_environment_light(
         Unit directions (N, 3), solid angles (N,), and radiance times these (N, 3).
     """
     directions, solid_angle, power = _compute_unrotated_light(scene.environment)
-    turn = make_rotation(scene.number("environment.rotation"), 0.0, 0.0)
+    turn = make_rotation(scene.get_number("environment.rotation"), 0.0, 0.0)
     return directions @ turn.T, solid_angle, power
 
 
@@ -412,7 +413,7 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     points = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
     faces = scene.object.mesh.faces.astype(np.int64)
     faces = faces[(points[faces][..., 2] > MIN_DEPTH).all(axis=1)]
-    frame = Frame.of(scene.number("camera.fov"), scene.aspect)
+    frame = Frame.of(scene.get_number("camera.fov"), scene.aspect)
     pixel, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
     face, row, column, weights = rasterize_triangles(
@@ -435,7 +436,7 @@ def _interpolate_normals(
     """Return unit normals (N, 3) in world space of points on the object's faces.
 
     Args:
-        scene: with the object.
+        scene: scene with the object.
         corners: (N, 3) vertices of the face that each point is on.
         weights: (N, 3) of the corners.
     """
@@ -548,7 +549,7 @@ def divide_exposure(
     Args:
         shutter: seconds for which each row is exposed, at least 0.
         rolling: seconds within which rows are read, from the bottom if below 0.
-        height: of the image.
+        height: height of the image.
         count: M, number of moments. With as many as rows and no shutter, each row has a
             moment of its own.
 
@@ -621,7 +622,7 @@ def parse_aovs(text: str | None) -> tuple[str, ...]:
 class Surfaces:
     """The surface in each pixel, by the ray through its center."""
 
-    names: tuple[str, ...]  # of the shapes
+    names: tuple[str, ...]  # names of the shapes
     # (H, W) int64: 1 for the first of the names and so on, 0 where there is nothing
     id: Tensor
     # (H, W) distance from the camera, infinite where there is nothing: metres, as

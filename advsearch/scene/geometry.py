@@ -79,8 +79,8 @@ class Frame:
         Args:
             fov: field of view along the larger side, degrees.
             aspect: width over height.
-            shift: of the image to the right in its widths and downwards in its heights:
-                what it shows moves the other way.
+            shift: shift of the image to the right in its widths and downwards in its
+                heights: what it shows moves the other way.
         """
         # of the larger side; the other one is smaller by the aspect
         half_tangent = math.tan(math.radians(fov) / 2.0)
@@ -175,8 +175,8 @@ def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float6
     """Return the axes of a camera on an orbit: rows left, up and from the object to it.
 
     Args:
-        azimuth: of the camera around the object, degrees.
-        elevation: of the camera above the ground plane, degrees.
+        azimuth: azimuth of the camera around the object, degrees.
+        elevation: elevation of the camera above the ground plane, degrees.
         roll: rotation of the image, counter-clockwise, degrees.
     """
     azimuth = math.radians(azimuth)
@@ -218,7 +218,7 @@ def _compute_framing_distance_all_around(
 
     Args:
         offsets: (V, 3) of the vertices from the middle of the object.
-        elevation: of the camera, degrees.
+        elevation: elevation of the camera, degrees.
         tangents: (2,) of the angles to the edges of the image.
     """
     rho = offsets[:, :2].norm(dim=1)
@@ -266,10 +266,10 @@ def camera_to_world(
     if description.camera != ORBIT_CAMERA:
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
-    get_number = description.number
+    get_number = description.get_number
     requested_distance = description.values["camera.distance"]
     if requested_distance is not None:
-        distance = requested_distance / description.metres
+        distance = requested_distance / description.size_in_metres
     else:
         distance = float(
             compute_framing_distance(
@@ -283,7 +283,7 @@ def camera_to_world(
     if height is not None:
         center_height = float(compute_center(description)[2])
         # from the middle of the object at this distance to the height
-        sine = (height / description.metres - center_height) / distance
+        sine = (height / description.size_in_metres - center_height) / distance
         sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
         elevation = math.degrees(math.asin(sine))
     azimuth = description.azimuth_zero + get_number("camera.azimuth")
@@ -308,7 +308,7 @@ def project_points(
 
     Args:
         description: the scene.
-        inputs: of the scene.
+        inputs: inputs of the scene.
         points: (N, 3) float64 in the camera's coordinates: left, up and ahead.
         size: height and width of the image.
 
@@ -326,7 +326,7 @@ def project_points(
         positions, is_visible = model.project(points)
         return (positions - 0.5) * image_size, is_visible
     fov = (
-        inputs.get("camera.fov", torch.tensor(description.number("camera.fov")))
+        inputs.get("camera.fov", torch.tensor(description.get_number("camera.fov")))
         .double()
         .reshape(())
     )
@@ -489,9 +489,11 @@ OCCLUDER_INPUTS = (
 """Inputs of other controls that an occluder goes by."""
 
 
-def get_camera_pose(scene: SceneData, so_far: Mapping[str, Tensor]) -> Tensor:
+def get_camera_pose(scene: SceneData, earlier_inputs: Mapping[str, Tensor]) -> Tensor:
     """Return the pose (4, 4) of the camera where the controls before have it."""
-    return so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)))
+    return earlier_inputs.get(
+        "camera.to_world", torch.from_numpy(camera_to_world(scene))
+    )
 
 
 def make_hidden_pose(camera: Tensor) -> Tensor:

@@ -58,8 +58,8 @@ class Group:
     begin: int = 0  # first coordinate in u
     estimator: str = "none"  # the one that is used
     step: float = 0.0  # half-width of a difference in u; 0 where none is taken
-    # that over which the fastest outline moves by a pixel; that of the group where
-    # nothing moves
+    # Pixel that over which the fastest outline moves by a pixel; that of the group
+    # where nothing moves.
     pixel: float = 0.0
     reason: str = ""  # why this estimator is used, as a text
     # the caller named the estimator, or nobody uses the derivative: it is not compared
@@ -171,7 +171,7 @@ RESTORED_FIELDS = ("estimator", "step", "reason")
 class GradientPlan:
     """How the gradient of a full space is obtained."""
 
-    groups: tuple[Group, ...]  # of all controls, in the order of u
+    groups: tuple[Group, ...]  # groups of all controls, in the order of u
     spp: int | None = None  # samples per pixel of differences; None is the primal's
 
     def select_groups(self, *estimators: str) -> tuple[Group, ...]:
@@ -276,7 +276,7 @@ def make_first_plan(
     Each group has its preferred estimator, or the forced one.
 
     Args:
-        groups: of the space.
+        groups: groups of the space.
         steps: (d,) half-widths of differences in u over which outlines move by a pixel.
         forced: estimators by "control.parameter", "control", or "*" for all groups
             where it is valid.

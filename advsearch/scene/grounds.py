@@ -53,8 +53,8 @@ def is_against_traffic(scene: SceneData, camera: Float64Array) -> bool:
         return False
     distance_ahead, distance_aside = (
         camera[:2, 3] - compute_center(scene)[:2]
-    ) * scene.metres
-    height = float(camera[2, 3]) * scene.metres
+    ) * scene.size_in_metres
+    height = float(camera[2, 3]) * scene.size_in_metres
     place = find_place(scene)
     width = LANE_WIDTH
     if place is not None and place.file.lane_width is not None:
@@ -108,7 +108,7 @@ def find_ground_kind(scene: SceneData) -> str | None:
     table. None where neither names one.
     """
     requested = scene.values.get("ground.kind")
-    if scene.number("ground.size") <= 0.0:
+    if scene.get_number("ground.size") <= 0.0:
         return None
     if requested is not None:
         return settings.GROUND_KINDS[int(requested)]
@@ -143,7 +143,7 @@ def load_requested_place(scene: SceneData) -> Place | None:
             return None
         return load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
-    is_described = scene.number("ground.size") <= 0.0 or has_table_settings
+    is_described = scene.get_number("ground.size") <= 0.0 or has_table_settings
     environment = scene.environment
     return None if environment is None or is_described else environment.place
 
@@ -175,7 +175,9 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
             radiance_unit * float(irradiance @ torch.tensor(LUMINANCE))
             < DUSK_ILLUMINANCE
         )
-    place_parts = make_place_parts(place, scene.metres, radiance_unit, is_dark=is_dark)
+    place_parts = make_place_parts(
+        place, scene.size_in_metres, radiance_unit, is_dark=is_dark
+    )
     return replace(scene, parts=(*other_parts, *place_parts))
 
 
@@ -318,10 +320,10 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
             height=picture.height,
             nearest_distance=(*picture.x, *picture.y),
             ground_extent=extent,
-            rotation=scene.number("environment.rotation"),
+            rotation=scene.get_number("environment.rotation"),
         )
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
-        height = scene.capture_height * scene.metres
+        height = scene.capture_height * scene.size_in_metres
         radius = scene.values.get("ground.radius")
         if radius is None:
             radius = DEFAULT_EMPTY_RADIUS * height
@@ -355,10 +357,10 @@ def make_camera_view(
         fov: field of view along the larger side, degrees; None: the scene's.
     """
     pose = camera_to_world(scene) if to_world is None else to_world
-    x, y, z = pose[:3, 3] * scene.metres
+    x, y, z = pose[:3, 3] * scene.size_in_metres
     forward = pose[:3, 2]
     if fov is None:
-        fov = scene.number("camera.fov")
+        fov = scene.get_number("camera.fov")
     half_fov = math.radians(fov) / 2.0
     half_height_angle = math.degrees(
         math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
@@ -416,7 +418,7 @@ def list_view_remarks(
     returned.
 
     Args:
-        scene: that is looked at.
+        scene: scene that is looked at.
         views: at least one.
         rotates_map: whether the map is rotated from view to view.
     """
@@ -443,7 +445,7 @@ def list_view_remarks(
     ]
     if not views_beyond:
         return ()
-    unit = "m" if scene.object.metres is not None else "object sizes"
+    unit = "m" if scene.object.size_in_metres is not None else "object sizes"
     subject = _describe_views_beyond(len(views_beyond), len(views))
     farthest = max(view.distance for view in views_beyond)
     highest = max(view.height for view in views_beyond)
@@ -462,7 +464,7 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
 
     Args:
         limits: distance and height of each view, see `find_valid_range`.
-        unit: of these.
+        unit: unit of these.
     """
     smallest = min(limits)[0]
     largest = max(limits)[0]
@@ -486,8 +488,8 @@ def list_outside_remarks(
     """Return a remark where views are outside of what the place is valid for.
 
     Args:
-        scene: that is looked at.
-        place: of the scene.
+        scene: scene that is looked at.
+        place: place of the scene.
         views: at least one.
     """
     axis_limits = [

@@ -197,7 +197,7 @@ def _check_units(scene: SceneData, carrier: str) -> float:
             "has no unit; take one of the avenue, "
             "or leave the lamps off"
         )
-    if scene.object.metres is None:
+    if scene.object.size_in_metres is None:
         raise InputError(
             f"{setting}: lamps are so many metres apart, and how large "
             f"{scene.object_name} is is not known; give its "
@@ -223,7 +223,7 @@ def _make_lamps(
     The camera's own car has no mesh, so that it has beams alone.
 
     Args:
-        scene: in which they shine.
+        scene: scene in which they shine.
         carrier: the mesh that carries them, or `CAMERA`.
         kind: beam, "low" or "high".
         radiance_unit: luminance of a radiance of 1, cd/m2.
@@ -233,12 +233,14 @@ def _make_lamps(
         # in the coordinates of the camera's car, see `compute_car_pose`
         left_position = np.array(EGO_LAMP_POSITION)
         positions = [
-            left_position / scene.metres,
-            left_position * [1.0, -1.0, 1.0] / scene.metres,
+            left_position / scene.size_in_metres,
+            left_position * [1.0, -1.0, 1.0] / scene.size_in_metres,
         ]
     else:
         part = scene.meshes[carrier]
-        carrier_metres = part.metres if isinstance(part, ThingPart) else scene.metres
+        carrier_metres = (
+            part.size_in_metres if isinstance(part, ThingPart) else scene.size_in_metres
+        )
         # The carrier's size in metres is that of its longest side.
         longest_side = float(np.ptp(part.mesh.vertices, axis=0).max())
         units_per_metre = longest_side / carrier_metres
@@ -252,7 +254,7 @@ def _make_lamps(
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
     # candela to the light's unit; lengths are in object sizes, and intensity is
     # radiance times squared length
-    red, green, blue = map(float, WHITE / (radiance_unit * scene.metres**2))
+    red, green, blue = map(float, WHITE / (radiance_unit * scene.size_in_metres**2))
     for name, position in zip(("left", "right"), positions, strict=True):
         yield BeamLamp(
             name=f"{carrier}-{name}-beam",
@@ -304,7 +306,7 @@ def _make_glass(
 
     Args:
         part: the car.
-        lamp_type: of `MATERIAL_NAMES`.
+        lamp_type: lamp type of `MATERIAL_NAMES`.
         facing: 1 for lamps that shine along +x, -1 along -x.
         units_per_metre: a metre in the car's coordinates.
         power: (3,) the radiance times square metres that each of the two sends there.
@@ -366,8 +368,8 @@ def _make_disks(
     and stand out from the car by `GLASS_OFFSET`. The first is that on the left (+y).
 
     Args:
-        mesh: of the car.
-        lamp_type: of `MATERIAL_NAMES`.
+        mesh: mesh of the car.
+        lamp_type: lamp type of `MATERIAL_NAMES`.
         facing: 1 for lamps that shine along +x, -1 along -x.
         units_per_metre: a metre in the car's coordinates.
 

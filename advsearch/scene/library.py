@@ -162,7 +162,7 @@ def load_object(name: str) -> ObjectAsset:
             if finishes
             else None,
             finishes=finishes,
-            metres=facts["metres"],
+            size_in_metres=facts["metres"],
             drives=facts.get("drives", False),
         )
     except (OSError, ValueError, KeyError, TypeError, FileFormatError) as error:
@@ -177,8 +177,8 @@ def _read_mesh(
     """Read the mesh of a bundled object, with the rig of a body if it has one.
 
     Args:
-        name: of the object, for messages.
-        directory: of its files.
+        name: name of the object, for messages.
+        directory: directory of its files.
         material_runs: names of materials, each with how many faces in a row have it;
             empty: the mesh has no materials by name.
     """

@@ -84,9 +84,9 @@ def _compare_outline(
     """Compare the visible pixels of a mesh with its outline.
 
     Args:
-        renderer: of the scene.
-        inputs: of the scene, assembled.
-        name: of the mesh.
+        renderer: renderer of the scene.
+        inputs: inputs of the scene, assembled.
+        name: name of the mesh.
         mask: (H, W) the pixels in which it is seen first.
 
     Returns:
@@ -130,9 +130,9 @@ def _project_faces(
     panorama, or where the mesh reaches behind the camera.
 
     Args:
-        renderer: of the scene.
-        inputs: of the scene, assembled.
-        name: of the mesh.
+        renderer: renderer of the scene.
+        inputs: inputs of the scene, assembled.
+        name: name of the mesh.
         size: height and width of the image.
     """
     height, width = size
@@ -160,7 +160,7 @@ class _Outline:
     """A rasterised outline, in cells of one or more pixels."""
 
     cells: BoolArray  # (rows, columns)
-    left: float  # of the first cell, pixels from the image's top left
+    left: float  # left of the first cell, pixels from the image's top left
     top: float
     step: int  # width of a cell in pixels
 

@@ -67,7 +67,7 @@ class MeshPart(Shape, ScenePart):
     )  # (4, 4) its base pose
     place: Place | None = None  # which it belongs to, and goes with
     is_ground: bool = False  # of a place: things stand on it
-    # of a place: what nothing else can be in, in object sizes
+    # Solids of a place: what nothing else can be in, in object sizes.
     solids: tuple[Solid, ...] = ()
 
     @property
@@ -82,7 +82,7 @@ class Place:
 
     name: str
     file: PlaceFile
-    parts: tuple[MeshPart, ...]  # in metres; what they emit is in cd/m2
+    parts: tuple[MeshPart, ...]  # parts in metres; what they emit is in cd/m2
     notes: tuple[str, ...] = ()  # what was left out, one sentence each
 
 
@@ -354,8 +354,8 @@ class HazePart(ScenePart):
     not absorbed.
     """
 
-    radius: float  # of the ball that it fills, object sizes
-    density: float = 0.0  # by itself; none by default, for a control to fill
+    radius: float  # radius of the ball that it fills, object sizes
+    density: float = 0.0  # density by itself; none by default, for a control to fill
     albedo: tuple[float, float, float] = (1.0, 1.0, 1.0)
     volumetric: ClassVar[bool] = True
 
@@ -364,7 +364,7 @@ class HazePart(ScenePart):
 class PluginNumber:
     """A number or a colour in Mitsuba, by Mitsuba's own name."""
 
-    key: str  # that name: "red.reflectance.value"
+    key: str  # key that name: "red.reflectance.value"
     values: tuple[float, ...]  # its one or three numbers in the scene as it is
     input: str  # the scene input that sets it
     # the valid ways to differentiate it, preferred first

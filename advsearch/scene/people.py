@@ -315,7 +315,8 @@ class Person:
 
         Args:
             posed: (P, 3) points after skinning.
-            rotations, translations: of the bones, see `_pose_bones`.
+            rotations, translations: rotations and translations of the bones, see
+                `_pose_bones`.
             joints: (J, 3) in the rest pose.
             foot_rises: how much each foot rises, "l" and "r".
         """

@@ -46,8 +46,8 @@ class Photograph:
 
     Args:
         radiance: (H, W, 3) linear radiance of the map, row 0 straight up.
-        height: of the camera above the ground, object sizes.
-        rotation: of the map about the vertical, degrees.
+        height: height of the camera above the ground, object sizes.
+        rotation: rotation of the map about the vertical, degrees.
 
     Attributes:
         mesh: the plane.
@@ -73,8 +73,8 @@ class Photograph:
         column and row in it.
 
         Args:
-            height: of the camera, object sizes.
-            rotation: of the map about the vertical, degrees.
+            height: height of the camera, object sizes.
+            rotation: rotation of the map about the vertical, degrees.
         """
         radii = np.concatenate(
             [[0.0], np.geomspace(MIN_RING_RADIUS, MAX_RING_RADIUS, N_RINGS)]

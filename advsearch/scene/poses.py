@@ -77,7 +77,7 @@ def compute_pose(
     Args:
         positions: (V, 3) of the vertices.
         floor: height of what they stand on.
-        parameters: by name; angles in degrees.
+        parameters: parameters by name; angles in degrees.
     """
     center = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
     linear = parameters["scale"] * make_rotation(

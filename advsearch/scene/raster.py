@@ -324,7 +324,7 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     values of the nearest one that is.
 
     Args:
-        mesh: with texture coordinates.
+        mesh: mesh with texture coordinates.
         resolution: height and width, or both as one number.
 
     Raises:

@@ -98,7 +98,7 @@ class InputSpace(InputMapping, Protocol):
 class Crop(NamedTuple):
     """A part of the image that is rendered, and what the rest of it shows."""
 
-    window: Window  # of the pixels that are rendered
+    window: Window  # window of the pixels that are rendered
     # radiance (H, W, 3), or (H, W, 4) with coverage where there is a backdrop
     surroundings: Tensor
 
@@ -249,7 +249,7 @@ class Renderer:
         Args:
             u: (d,) in [0, 1], a tensor or an array; or (N, d), rendered one after the
                 other with the same seed. It is rendered in float32, whatever its dtype.
-            seed: of the noise; the same seed gives the same bytes.
+            seed: seed of the noise; the same seed gives the same bytes.
             spp: independent samples per pixel, 1 to 65,536.
 
         Returns:
@@ -395,7 +395,7 @@ class Renderer:
                 for dim in (0, 1):
                     is_hidden = is_hidden.repeat_interleave(subdivision, dim)
                 surfaces.id[is_hidden] = 0
-        metres = self.scene.definition[0].metres
+        metres = self.scene.definition[0].size_in_metres
         return replace(
             surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
         )
@@ -415,7 +415,7 @@ class Renderer:
         "secant" differences of the loss.
 
         Args:
-            loss: from an image (H, W, 3) sRGB to a number.
+            loss: loss from an image (H, W, 3) sRGB to a number.
             u, seed, spp: as for a call.
             free: leave out what needs primal renders of its own; coordinates that use
                 differences then have a derivative of zero.
@@ -535,7 +535,7 @@ class Renderer:
             return inputs
         description = self.scene.definition[0]
         pose, center = _base_pose_and_center(description)
-        return mount.make_inputs(inputs, pose, center, description.metres)
+        return mount.make_inputs(inputs, pose, center, description.size_in_metres)
 
     def _render_exposure(
         self, mount: Mount | None, u: Tensor, seed: int, spp: int, hide: bool
@@ -548,7 +548,7 @@ class Renderer:
         Args:
             mount: the camera of a rig; None for the only one.
             u: (d,) configuration.
-            seed: of the noise; each moment gets its own.
+            seed: seed of the noise; each moment gets its own.
             spp: samples per pixel of all moments together.
             hide: hide the environment behind a backdrop.
         """
@@ -644,7 +644,7 @@ class Renderer:
             radiance: (H, W, 3) of the object, already times its coverage.
             rendered: (H, W, 4 or 7): its channel 3 is the coverage, those from 4 on are
                 the change of the plane's radiance.
-            inputs: of the scene.
+            inputs: inputs of the scene.
         """
         # the photograph is display-linear: divided by the gain it is radiance
         behind = inputs["backdrop.color"] / self.formation.gain
@@ -673,8 +673,8 @@ class Renderer:
         What is traced counts in `renders`.
 
         Args:
-            inputs: of the scene.
-            seed: of the noise.
+            inputs: inputs of the scene.
+            seed: seed of the noise.
             spp: samples per pixel.
             hide_environment: hide the environment behind a backdrop.
             denoised: denoise it if the formation requires it.

@@ -180,7 +180,7 @@ class SkeletonRig:
         are found, and the offsets are put into that order.
 
         Args:
-            parts: of the file.
+            parts: parts of the file.
             vertices: (V,) for each vertex of the mesh its index in the concatenated
                 vertices of all parts.
         """
@@ -329,7 +329,7 @@ class SkeletonRig:
         Args:
             number_by_name: values of parameters, which override those of a clip.
             clip_weights: weights of a clip, by node.
-            device: of the result.
+            device: device of the result.
         """
         points = self._points.to(device)
         for target in self._targets:

@@ -64,7 +64,8 @@ class SceneData:
     up: str | None = None  # the up axis that was given for a mesh file
     facing: str | None = None  # the axis of a mesh file that was given for its front
     size: float | None = None  # the object's longest side in metres that was given
-    # of the object's file, that was given (`advsearch.scene.assets.METRES_PER_UNIT`)
+    # Unit of the object's file, that was given
+    # (`advsearch.scene.assets.METRES_PER_UNIT`).
     unit: str | None = None
     # what was asked for: names of settings, and "environment"
     requested: frozenset[str] = frozenset()
@@ -74,7 +75,7 @@ class SceneData:
     # the environment may be hidden behind a plain colour or a photograph
     # (`backdrop.color`)
     backdrop: bool = False
-    # that it is rendered into; None for none
+    # Backdrop photograph that it is rendered into; None for none.
     backdrop_photograph: BackdropPhotograph | None = None
     aspect: float = 1.0  # width over height of the picture
     # those with poses of their own, by name
@@ -84,7 +85,7 @@ class SceneData:
     # name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for
     # none
     preset: str = ""
-    # of the camera around the object; None for a pinhole
+    # Camera model of the camera around the object; None for a pinhole.
     camera_model: CameraModel | None = None
     # cameras that take pictures at the same time, this one first; empty where it is
     # alone
@@ -93,7 +94,8 @@ class SceneData:
     # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba
     # shows it
     metered: bool = True
-    # for users: of further files that controls have read, of things in each other
+    # Remarks for users: of further files that controls have read, of things in each
+    # other.
     remarks: tuple[str, ...] = ()
     things_spec: str = ""  # how the things beside the object were asked for
 
@@ -136,9 +138,9 @@ class SceneData:
         return {part.name: part for part in self.parts if isinstance(part, MeshPart)}
 
     @property
-    def metres(self) -> float:
+    def size_in_metres(self) -> float:
         """Metres of one object size, or 1 where they are not known."""
-        return self.object.metres or 1.0
+        return self.object.size_in_metres or 1.0
 
     @property
     def object_name(self) -> str:
@@ -160,7 +162,7 @@ class SceneData:
         """(V, 3) the object's vertices in world space, in its base pose."""
         return compute_base_vertices(self.meshes[OBJECT])
 
-    def number(self, name: str) -> float:
+    def get_number(self, name: str) -> float:
         """Return a setting that always has a value.
 
         Of the field of view, that of the camera in use.
@@ -182,7 +184,7 @@ class SceneData:
         """
         environment = self.environment
         kind = self.values.get("ground.kind")
-        if environment is None or self.number("ground.size") == 0.0:
+        if environment is None or self.get_number("ground.size") == 0.0:
             return None
         if kind is not None:
             shows_photograph = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
@@ -194,21 +196,23 @@ class SceneData:
             )
         if not shows_photograph:
             return None
-        rotation = self.number("environment.rotation")
+        rotation = self.get_number("environment.rotation")
         return get_photograph(environment, self.capture_height, rotation)
 
     @property
     def capture_height(self) -> float:
         """Height above the floor of the photograph's camera, object sizes."""
         height = self.values.get("ground.height")
-        if height is None and self.object.metres is None:
+        if height is None and self.object.size_in_metres is None:
             return settings.DEFAULT_PHOTOGRAPH_HEIGHT
-        return (TRIPOD_HEIGHT if height is None else height) / self.metres
+        return (TRIPOD_HEIGHT if height is None else height) / self.size_in_metres
 
     @property
     def ground_color(self) -> tuple[float, ...]:
         """(3,) colour of the ground plane, display-referred sRGB."""
-        return tuple(self.number(f"ground.{channel}") for channel in settings.CHANNELS)
+        return tuple(
+            self.get_number(f"ground.{channel}") for channel in settings.CHANNELS
+        )
 
     @property
     def material(self) -> Material:
@@ -228,7 +232,7 @@ def object_to_world(description: SceneData) -> Float64Array:
     """
     vertices = description.object.mesh.vertices.astype(np.float64)
     parameters = {
-        parameter.name: description.number(f"pose.{parameter.name}")
+        parameter.name: description.get_number(f"pose.{parameter.name}")
         for parameter in POSE
     }
     return compute_pose(vertices, 0.0, parameters)

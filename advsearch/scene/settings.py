@@ -26,7 +26,8 @@ class Parameter:
     """
 
     name: str  # short; `control.name` addresses it everywhere
-    # of its value; () for a number, None where it depends on the scene or a choice
+    # Shape of its value; () for a number, None where it depends on the scene or a
+    # choice.
     shape: tuple[int | None, ...]
     # "degrees", "metres", "object sizes", "sRGB", "stops", "name", ..., or "1"
     unit: str

@@ -47,7 +47,7 @@ class Skeleton:
     """The nodes of a file at rest, and what moves them."""
 
     source: str  # name of the file, for messages
-    names: tuple[str, ...]  # of the nodes, unique
+    names: tuple[str, ...]  # names of the nodes, unique
     parents: IntArray  # (N,) parent of each node; -1 for a root
     local_matrices: Float64Array  # (N, 4, 4) matrices from each node to its parent
     # The components of these matrices.
@@ -71,7 +71,7 @@ class MorphTarget:
 class Movable:
     """A part as the file stores it, and what moves it."""
 
-    skeleton: Skeleton  # of its file
+    skeleton: Skeleton  # skeleton of its file
     node: int  # index of the node that draws it
     vertices: Float64Array  # (V, 3) in the coordinates of its mesh
     nodes: IntArray  # (J,) nodes of the joints; its own node if it has no skin

@@ -22,7 +22,7 @@ from advsearch.scene.assets import (
     group_indices,
 )
 from advsearch.scene.importing.geometry import (
-    Soup,
+    TriangleSoup,
     find_components,
     find_shared_edges,
     normalize_vectors,
@@ -53,7 +53,7 @@ _MAX_PATCHES = 10_000
 _SMOOTHING_ROUNDS = 10
 
 
-def unwrap(soup: Soup, chart_group: IntArray | None = None) -> Soup:
+def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleSoup:
     """Return a soup with texture coordinates from xatlas; deterministic.
 
     The charts do not overlap and lie inside the unit square. The faces of a mesh in
@@ -98,7 +98,7 @@ def _make_grid_uvs(count: int) -> Float64Array:
     return np.asarray((cell_corner + in_cell) / n_columns)
 
 
-def _generate_atlas(soup: Soup, groups: Sequence[IntArray]) -> xatlas.Atlas:
+def _generate_atlas(soup: TriangleSoup, groups: Sequence[IntArray]) -> xatlas.Atlas:
     """Unwrap groups of faces into one atlas, of `ATLAS_SIZE` if they fit into it.
 
     Each group is a mesh of its own for xatlas, with the vertices that it uses, so that
@@ -141,7 +141,7 @@ def _are_straight(normals: Float64Array, plane: IntArray) -> bool:
     return bool(is_straight.all())
 
 
-def _find_patches(soup: Soup) -> IntArray:
+def _find_patches(soup: TriangleSoup) -> IntArray:
     """Cut a mesh that xatlas cannot unwrap well in one piece.
 
     xatlas 0.0.11 takes neighbouring faces that hardly bend for one plane. On a finely
@@ -253,7 +253,7 @@ class SurfaceParts:
     """The parts of a mesh's surface: the cells of a map, and its faces.
 
     Attributes:
-        mesh: with texture coordinates of any kind.
+        mesh: mesh with texture coordinates of any kind.
         is_unwrapped: whether the map is not that of the mesh's own texture coordinates.
         corners: (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the
             bottom.
@@ -338,10 +338,10 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     unique_points, unique_index = np.unique(points, axis=0, return_inverse=True)
     faces = unique_index.reshape(-1)[mesh.faces.astype(np.int64)]
     n_faces = len(faces)
-    soup = Soup(
+    soup = TriangleSoup(
         points=unique_points,
         faces=faces,
-        part=np.zeros(n_faces, np.int64),
+        part_ids=np.zeros(n_faces, np.int64),
         normals=np.full((n_faces, 3, 3), np.nan),
         uvs=np.full((n_faces, 3, 2), np.nan),
         colors=np.ones((n_faces, 3, 3)),

@@ -80,7 +80,7 @@ class RequestedThing:
 class ThingPart(MeshPart):
     """A thing beside the object."""
 
-    metres: float = 1.0  # its longest side
+    size_in_metres: float = 1.0  # its longest side
     lamps: str = LAMPS[0]  # which it has on
 
 
@@ -188,7 +188,7 @@ def add_things(
     """Return the scene with the things beside its object that a setting names.
 
     Args:
-        scene: with the object.
+        scene: scene with the object.
         things_spec: the setting; None for no things.
         load: loads an object by its name or file, and the axis that its front
             faces.
@@ -201,7 +201,7 @@ def add_things(
     requested = parse_things(things_spec)
     if not requested:
         return scene
-    if scene.object.metres is None:
+    if scene.object.size_in_metres is None:
         raise InputError(
             f"things: they stand in metres beside {scene.object_name}, whose size in "
             "metres is not known; say it: its "
@@ -232,7 +232,7 @@ def _make_thing(
     object_spec = thing.object_spec
     name = thing.name
     asset = with_size(load(object_spec, thing.facing), thing.size, unit=None)
-    if asset.metres is None:
+    if asset.size_in_metres is None:
         example = f"{object_spec}@{thing.x:g},{thing.y:g},size=METRES"
         raise InputError(
             f"things: the size of {object_spec} in metres is not known; say it: "
@@ -243,7 +243,7 @@ def _make_thing(
             f"things: something of the scene is called {name} "
             "already; add name=NAME to it"
         )
-    pose = _compute_pose(scene, asset, thing, asset.metres)
+    pose = _compute_pose(scene, asset, thing, asset.size_in_metres)
     part = make_mesh_part(name, asset, pose, asset.material)
     fields = {**vars(part), "label": thing.label or asset.label}
     remarks = [
@@ -254,7 +254,9 @@ def _make_thing(
     ]
     if asset.front is not None and asset.front.reason and has_lanes(scene):
         remarks.append(asset.front.reason)
-    return ThingPart(**fields, metres=asset.metres, lamps=thing.lamps), remarks
+    return ThingPart(
+        **fields, size_in_metres=asset.size_in_metres, lamps=thing.lamps
+    ), remarks
 
 
 def _list_overlap_remarks(scene: SceneData) -> list[str]:
@@ -285,7 +287,7 @@ def _compute_pose(
     scaled.
 
     Args:
-        scene: with the object, whose size is the unit of lengths.
+        scene: scene with the object, whose size is the unit of lengths.
         asset: the thing's object.
         requested: where it stands and how it is turned.
         metres: its longest side.
@@ -293,10 +295,14 @@ def _compute_pose(
     # the point of the mesh that is put on the ground, and its longest side
     foot_point, extent = find_footing(asset.mesh.vertices.astype(np.float64))
     scaled_rotation = (
-        metres / scene.metres / extent * make_rotation(requested.heading, 0.0, 0.0)
+        metres
+        / scene.size_in_metres
+        / extent
+        * make_rotation(requested.heading, 0.0, 0.0)
     )
     position = (
-        compute_center(scene)[:2] + np.array([requested.x, requested.y]) / scene.metres
+        compute_center(scene)[:2]
+        + np.array([requested.x, requested.y]) / scene.size_in_metres
     )
     return make_pose(
         scaled_rotation,
@@ -395,7 +401,7 @@ def list_camera_remarks(
     solid_names = list[str]()
     for eye in eyes:
         # A camera is a tiny square.
-        x, y, z = eye / scene.metres
+        x, y, z = eye / scene.size_in_metres
         corners = np.array(
             [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]
         )

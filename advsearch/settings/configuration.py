@@ -62,7 +62,7 @@ class Setting:
     # Completes "expected ..." in errors, and names the range in the help; by default
     # derived from type and constraints.
     expects: str = ""
-    unit: str = ""  # of the value
+    unit: str = ""  # unit of the value
     otherwise: str = ""  # what a default of None means
     flag: str = ""  # if it is not its name: "--control"
     # Placeholder of the value in the help, if it is not the last word of its name.
@@ -145,7 +145,7 @@ def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
 
     Args:
         config: the other configuration.
-        field: of the setting.
+        field: field of the setting.
         changes: arguments of `setting` that differ.
     """
     extra: Any = config.model_fields[field].json_schema_extra
@@ -267,8 +267,8 @@ class PythonOnly(NamedTuple):
     can name it.
 
     Attributes:
-        role: of the part in the run: "model", "scene", "objective", "policy", "metric",
-            "control", "task", ...
+        role: role of the part in the run: "model", "scene", "objective", "policy",
+            "metric", "control", "task", ...
         name: its name there; empty if it has none.
     """
 
@@ -374,7 +374,7 @@ class Config(BaseModel):
         more than the run counts as not set, and is listed by `left_out`.
 
         Args:
-            path: of the file.
+            path: path of the file.
             overrides: settings by name that a person has requested. A dotted name
                 reaches inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
 
@@ -501,7 +501,7 @@ class Config(BaseModel):
 
         Args:
             role: "scene", "model" or "control".
-            name: of the object, as the settings have it.
+            name: name of the object, as the settings have it.
         """
         return self._python_objects.get((role, name))
 

@@ -269,7 +269,7 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
     overrides an earlier one.
 
     Args:
-        path: of the file.
+        path: path of the file.
         above: the files that name this one as their base.
 
     Raises:

@@ -130,7 +130,7 @@ def make_function_task(function: Callable[[Any, Facts], Tensor]) -> FunctionTask
     Args:
         function: `judge(output, truth)`, with the outputs of the model for N images (N,
             ...), and `Facts`: the ground truth of the scene in this configuration, such
-            as `truth.number("pose.yaw")`, `truth.mask` or `truth.label`. It returns
+            as `truth.get_number("pose.yaw")`, `truth.mask` or `truth.label`. It returns
             (N,), or a number for one image: over 0 exactly if the output is wrong,
             differentiable.
 

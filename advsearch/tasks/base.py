@@ -142,14 +142,14 @@ class Sight:
         mask: (H, W) bool, where it is the object.
         depth: (H, W) float, its distance, see `Facts.depth`.
         z_depth: (H, W) float, see `Facts.z_depth`.
-        metres: of the object's longest side; None if it is unknown, and distances are
+        size_in_metres: of the object's longest side; None if it is unknown, and distances are
             in object sizes.
     """
 
     mask: Tensor
     depth: Tensor
     z_depth: Tensor
-    metres: float | None = None
+    size_in_metres: float | None = None
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ class Facts:
         """The values of the configuration by parameter, both varied and fixed ones."""
         return MappingProxyType(dict(self.describe_values()))
 
-    def number(self, name: str) -> float:
+    def get_number(self, name: str) -> float:
         """Return the value of a parameter in this configuration.
 
         Raises:

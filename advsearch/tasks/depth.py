@@ -67,13 +67,13 @@ class DepthTruth:
     Attributes:
         mask: (H, W) bool, the pixels in which the object is visible.
         z: (H, W) z-depth of everything, infinite where there is nothing; in metres, or
-            in object sizes if `metres` is None.
-        metres: size of the object.
+            in object sizes if `size_in_metres` is None.
+        size_in_metres: size of the object.
     """
 
     mask: Tensor
     z: Tensor
-    metres: float | None = None
+    size_in_metres: float | None = None
 
     @property
     def is_visible(self) -> bool:
@@ -255,7 +255,11 @@ class Depth(Task):
                 "its network does not say it; "
                 f"give `task='depth={{kind: {DISPARITY}}}'`, say"
             )
-        if kind == METRIC and not self.size and (truth is None or truth.metres is None):
+        if (
+            kind == METRIC
+            and not self.size
+            and (truth is None or truth.size_in_metres is None)
+        ):
             return (
                 "size: it predicts metres, and how large the object is is not known; "
                 "give its longest side in metres, "
@@ -319,7 +323,7 @@ class Depth(Task):
                 "axis; "
                 "take a lens that sees less"
             )
-        return DepthTruth(facts.mask, facts.z_depth, facts.sight.metres)
+        return DepthTruth(facts.mask, facts.z_depth, facts.sight.size_in_metres)
 
     def truth_names(self, truth: DepthTruth) -> tuple[str, ...]:
         return (AS_FAR,)
@@ -424,7 +428,7 @@ class Depth(Task):
             # scene's, or object sizes.
             scale = 1.0
             if self.size:
-                scale = (truth.metres or 1.0) / self.size
+                scale = (truth.size_in_metres or 1.0) / self.size
             return values * scale, False
         z = truth.z.to(values.device)
         fit_mask = truth.fit_mask.to(values.device)

@@ -105,7 +105,7 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     Args:
         path: named in errors.
         file: the open archive, which has to stay open as long as the result is used.
-        size: of the file in bytes.
+        size: size of the file in bytes.
 
     Raises:
         FileFormatError: it is damaged, unpacks to too much, or has members that torch's

@@ -54,7 +54,7 @@ def check_schema(db: sqlite3.Connection, path: Path, statements: str) -> None:
 
     Args:
         db: is closed before the error.
-        path: of its file, for the error.
+        path: path of its file, for the error.
         statements: SQL that makes the right schema.
     """
     if read_schema(db) != _schema_of(statements):

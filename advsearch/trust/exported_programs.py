@@ -339,8 +339,8 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
 
     Args:
         archive: is read.
-        writer: of the new archive.
-        folder: of the tensors in both archives.
+        writer: writer of the new archive.
+        folder: folder of the tensors in both archives.
         config: the member with the table.
 
     Raises:
@@ -404,7 +404,7 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
     without what is not needed.
 
     Args:
-        path: of the archive, for errors.
+        path: path of the archive, for errors.
         value: any JSON value.
         key: the name under which it stands; for an entry of a list, the name of the
             list.

@@ -243,7 +243,7 @@ def translate_errors(
     Args:
         what: failed, the beginning of the message; the foreign error follows in
             brackets.
-        kind: of the new error.
+        kind: kind of the new error.
     """
     try:
         yield

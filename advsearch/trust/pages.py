@@ -60,10 +60,10 @@ def check_request(
     Args:
         command: such as "GET".
         path: what is asked for, with its query.
-        headers: of the request.
-        scheme: that the server speaks, "http" or "https".
+        headers: headers of the request.
+        scheme: scheme that the server speaks, "http" or "https".
         named: the host that the server was told to listen at.
-        port: that it listens at.
+        port: port that it listens at.
         token: the secret that the address or a cookie has to have; None for a server
             that only this machine can reach.
 
@@ -141,7 +141,7 @@ def make_page_policy(digests: Iterable[str], *, connects: bool) -> str:
     run.
 
     Args:
-        digests: of the scripts that may run.
+        digests: digests of the scripts that may run.
         connects: it may load pictures from its server, and send requests there.
     """
     images, connect = (
@@ -163,7 +163,7 @@ def make_served_policy(digests: Iterable[str], *, is_generated: bool) -> str:
     that it can read and send nothing, and runs no scripts but ours.
 
     Args:
-        digests: of all our scripts.
+        digests: digests of all our scripts.
         is_generated: the server made the page itself.
     """
     sandbox = (

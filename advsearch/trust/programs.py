@@ -33,11 +33,11 @@ def run_converter(
     """Run a program that converts a file to glTF, and return what it printed.
 
     Args:
-        path: of the file, for errors.
+        path: path of the file, for errors.
         program: its name, for errors.
         command: the program with its arguments.
-        folder: in which it runs.
-        seconds: that it may take, before `scale_limit`.
+        folder: folder in which it runs.
+        seconds: seconds that it may take, before `scale_limit`.
         env: its environment; None is ours.
 
     Raises:

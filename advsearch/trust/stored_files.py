@@ -93,7 +93,7 @@ def make_size_error(path: Path | str, expected: str, size: str) -> FileFormatErr
     """Return the error for input that is over a limit; it says how to raise the limit.
 
     Args:
-        path: of the input.
+        path: path of the input.
         expected: such as "a mesh of at most 100 faces".
         size: what it has instead, such as "120".
     """
@@ -108,7 +108,7 @@ def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
     """Open an ordinary file for reading; the caller closes it. Links are followed.
 
     Args:
-        path: of the file.
+        path: path of the file.
         expected: what it should be, for errors, such as "a label file".
         limit: how many bytes it may have, before `scale_limit`.
 
@@ -184,7 +184,7 @@ def parse_text(
     """Return the value that the text of a file describes.
 
     Args:
-        path: of the file, for errors.
+        path: path of the file, for errors.
         text: its content.
         kind: what it should be, for errors, such as "JSON".
         parse: makes the value; raises ValueError or SyntaxError.
@@ -271,7 +271,7 @@ def check_most(
     """Check that a file does not have more of something than a limit.
 
     Args:
-        path: of the file.
+        path: path of the file.
         count: how much it has.
         limit: how much it may have, before `scale_limit`.
         expected: the text for the error, with {} for the limit.

@@ -115,7 +115,7 @@ def check_free_folder(out: Path, setting: str) -> None:
 
     Args:
         out: the folder.
-        setting: that names it, for the error.
+        setting: setting that names it, for the error.
 
     Raises:
         InputError: it is not free.

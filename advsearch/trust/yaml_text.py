@@ -117,7 +117,7 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
     value.
 
     Args:
-        node: of the document.
+        node: node of the document.
         depth: how many nodes are around it.
         counts: the results so far, by id of the node; 0 for a node that is still being
             counted, which can only come again inside itself. It is extended.

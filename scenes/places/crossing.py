@@ -87,16 +87,16 @@ def _sign() -> tuple[dict[str, Look], tuple[Node, ...]]:
     """
     asset = load_object("stop-sign")
     post = Quads()
-    assert asset.metres is not None
+    assert asset.size_in_metres is not None
     foot = np.array([*SIGN, KERB])
     low = np.array([*SIGN, KERB + SIGN_LOW])
     avenue.limb(post, foot, low + np.array([0.0, 0.0, 0.1]), 0.035, 0.035, 10)
-    linear = asset.metres * make_rotation(180.0, 0.0, 0.0)
+    linear = asset.size_in_metres * make_rotation(180.0, 0.0, 0.0)
     mesh = asset.mesh
     vertices = (mesh.vertices.astype(np.float64) @ linear.T + low).astype(np.float32)
-    normals = (mesh.normals.astype(np.float64) @ linear.T / asset.metres).astype(
-        np.float32
-    )
+    normals = (
+        mesh.normals.astype(np.float64) @ linear.T / asset.size_in_metres
+    ).astype(np.float32)
     looks = dict[str, Look]()
     primitives = list[Primitive]()
     for name, look in (

@@ -82,7 +82,7 @@ class Sets(NumberControl):
     parameters = (Parameter("amount", (), "1", 0.0, 1.0, 0.0, "How much.", search=(0.0, 1.0)),)
     made: Any = None
 
-    def scene_inputs(self, values: Any, so_far: Any) -> Any:
+    def scene_inputs(self, values: Any, earlier_inputs: Any) -> Any:
         return self.made
 
 

@@ -108,7 +108,7 @@ def test_boxes_are_where_vertices_are_projected(tmp_path: Path) -> None:
         pose = camera_to_world(scene, 64 / 48)
         x, y, z = ((own.meshes["object"].mesh.vertices @ own.meshes["object"].to_world[:3, :3].T
                     + own.meshes["object"].to_world[:3, 3] - pose[:3, 3]) @ pose[:3, :3]).T  # fmt: skip
-        focal = 32.0 / np.tan(np.radians(scene.number("camera.fov")) / 2.0)
+        focal = 32.0 / np.tan(np.radians(scene.get_number("camera.fov")) / 2.0)
         across, down = 32.0 - focal * x / z, 24.0 - focal * y / z
         left, top, width, height = one["bbox"]
         got = [left, top, left + width, top + height]
@@ -214,8 +214,8 @@ def test_a_drive_has_every_thing_where_rays_meet_it(driven: tuple[Path, Path]) -
         if name in ("object", "oncoming", "person")
     }
     corners = triangles["object"].reshape(-1, 3)
-    middle, metres = (corners.min(axis=0) + corners.max(axis=0)) / 2.0, scene.metres
-    focal = 60.0 / np.tan(np.radians(scene.number("camera.fov")) / 2.0)
+    middle, metres = (corners.min(axis=0) + corners.max(axis=0)) / 2.0, scene.size_in_metres
+    focal = 60.0 / np.tan(np.radians(scene.get_number("camera.fov")) / 2.0)
     seen = set()
     for image, place in zip(written["images"], CAMERAS, strict=True):
         x, y, z = np.array(place) / metres

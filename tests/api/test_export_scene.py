@@ -73,7 +73,7 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
     world, own = inputs["object.vertices"].numpy(), description.meshes["object"]
 
     read = trimesh.load(out, process=False, force="mesh")
-    metres = world * description.object.metres  # glTF is in metres
+    metres = world * description.object.size_in_metres  # glTF is in metres
     np.testing.assert_allclose(read.vertices[:, [2, 0, 1]], metres, rtol=1e-6, atol=1e-9)
     np.testing.assert_array_equal(read.faces, own.mesh.faces)
     np.testing.assert_allclose(read.visual.uv, own.mesh.uvs, atol=1e-6)

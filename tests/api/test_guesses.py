@@ -56,7 +56,7 @@ def test_a_function_is_a_task(scene: advsearch.Scene) -> None:
 
     def judge(output: Tensor, truth: Facts) -> Tensor:
         seen.append(truth)
-        return (output[:, 0] - 0.4 - truth.number("pose.yaw") / 100.0).abs() - 0.2
+        return (output[:, 0] - 0.4 - truth.get_number("pose.yaw") / 100.0).abs() - 0.2
 
     network = advsearch.load_model(Level(), input_size=16, read=make_task(judge).reader)
     shown = advsearch.render(scene, network, task=judge, controls={"pose": {"yaw": 0}}, spp=4)

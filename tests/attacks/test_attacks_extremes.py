@@ -61,8 +61,8 @@ def differentiable(
     at = query.u.detach().double().requires_grad_()
     objective = value(at)
     (slope,) = torch.autograd.grad(objective, at)
-    factor = math.nan if query.number in broken else 1.0
-    shown = disturb(slope.float(), query.number) * factor if query.gradient else None
+    factor = math.nan if query.index in broken else 1.0
+    shown = disturb(slope.float(), query.index) * factor if query.gradient else None
     number = float(objective.detach()) * factor
     return Evaluation(number, shown, number > 0.0, cost=query.samples)
 
@@ -348,7 +348,7 @@ class Toy:
         slope = None
         if query.gradient:
             (exact,) = torch.autograd.grad(value, at)
-            slope = self.disturb(exact.float(), query.number)
+            slope = self.disturb(exact.float(), query.index)
         return Evaluation(float(value.detach()), slope, False, cost=query.samples)
 
     def search(self, policy: str, steps: int, seed: int = 0) -> tuple[SearchResult, Tensor]:

@@ -18,7 +18,7 @@ def trials(values: list[tuple[float, bool]]) -> list[Judgement]:
 
 def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
     result = verify(
-        lambda queries: [Evaluation.from_judgement(trials(found)[one.number]) for one in queries],
+        lambda queries: [Evaluation.from_judgement(trials(found)[one.index]) for one in queries],
         DOMAIN,
         DOMAIN.start,
         claim=Ending.BUDGET_SPENT,

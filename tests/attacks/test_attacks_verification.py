@@ -573,7 +573,7 @@ def test_the_trials_of_a_group_are_asked_at_once() -> None:
     asked: list[list[tuple[object, ...]]] = []
 
     def evaluate(queries: Sequence[Query]) -> list[Evaluation]:
-        asked.append([(one.kind, one.number, one.spp, one.phase, one.with_image) for one in queries])
+        asked.append([(one.kind, one.index, one.spp, one.phase, one.with_image) for one in queries])
         return list(noisy(-1.0, 1.0, 0.0)(queries))
 
     verify(evaluate, DOMAIN, WORST, claim=Ending.FOUND, spp=4, seed=0, trials=3, kind="baseline", n_images=1)

@@ -130,13 +130,13 @@ def test_carving_splits_a_surface_along_a_curve() -> None:
 
 def test_things_of_the_street_have_their_size_and_several_materials() -> None:
     car = library.load_object("car")
-    assert car.metres == pytest.approx(4.3, abs=0.05)
-    extent = np.ptp(car.mesh.vertices, axis=0) * car.metres
+    assert car.size_in_metres == pytest.approx(4.3, abs=0.05)
+    extent = np.ptp(car.mesh.vertices, axis=0) * car.size_in_metres
     assert 1.7 < extent[1] < 2.2  # with its mirrors
     assert 1.4 < extent[2] < 1.55
     assert set(car.finishes) == set(car.mesh.materials)
     assert sum(map(len, car.mesh.materials.values())) == len(car.mesh.faces)
-    assert 1.0 < (library.load_object("stop-sign").metres or 0.0) < 1.3
+    assert 1.0 < (library.load_object("stop-sign").size_in_metres or 0.0) < 1.3
 
 
 # ----------------------------------------------------------------------------------------------- environments
@@ -202,7 +202,7 @@ def test_the_library_loads_the_canonical_instance(name: str) -> None:
     assert build.is_close_vertices(vertex_table(asset.mesh), vertex_table(made.mesh))
     np.testing.assert_allclose(asset.base_color, made.base_color, rtol=0, atol=build.LEVELS / 255.0 + 1e-6)
     assert (asset.name, asset.label, asset.material) == (name, made.label, made.material)
-    assert (asset.finishes, asset.metres) == (made.finishes, made.metres)
+    assert (asset.finishes, asset.size_in_metres) == (made.finishes, made.size_in_metres)
     assert asset.mesh.materials.keys() == made.mesh.materials.keys()
     assert all((faces == made.mesh.materials[one]).all() for one, faces in asset.mesh.materials.items())
     assert asset.base_color.dtype == np.float32

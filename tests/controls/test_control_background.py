@@ -35,9 +35,9 @@ def test_the_derivatives_are_those_of_differences() -> None:
 
 def test_it_asks_for_a_backdrop_and_takes_the_ground_away_unless_told_to_keep_it(scene: SceneDescription) -> None:
     prepared = BackgroundControl().prepare(scene)
-    assert prepared.backdrop and prepared.number("ground.size") == 0.0
+    assert prepared.backdrop and prepared.get_number("ground.size") == 0.0
     kept = BackgroundControl(ground="keep").prepare(scene)
-    assert kept.backdrop and kept.number("ground.size") == scene.number("ground.size") > 0.0
+    assert kept.backdrop and kept.get_number("ground.size") == scene.get_number("ground.size") > 0.0
     assert kept.values == scene.values and kept.parts == scene.parts
 
 

@@ -28,7 +28,7 @@ class Fade(NumberControl):
     summary = "How far the object's colours have faded."
     parameters = (Parameter("amount", (), "1", 0.0, 1.0, 0.0, "Share of grey.", search=(0.0, 1.0)),)
 
-    def scene_inputs(self, values, so_far):
+    def scene_inputs(self, values, earlier_inputs):
         own = torch.from_numpy(self.scene.object.base_color)
         return {"object.base_color": torch.lerp(own, torch.full_like(own, 0.5), values["amount"])}
 

@@ -38,7 +38,7 @@ def pixel_of(point: np.ndarray, scene: SceneDescription) -> tuple[int, int]:
     """Row and column where the default camera sees a point."""
     camera = camera_to_world(scene)
     x, y, z = (point - camera[:3, 3]) @ camera[:3, :3]
-    scale = SIDE / 2.0 / math.tan(math.radians(scene.number("camera.fov") / 2.0)) / z
+    scale = SIDE / 2.0 / math.tan(math.radians(scene.get_number("camera.fov") / 2.0)) / z
     return int(SIDE / 2.0 - scale * y), int(SIDE / 2.0 - scale * x)
 
 

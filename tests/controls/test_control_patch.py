@@ -121,7 +121,7 @@ def test_its_top_is_up_and_its_left_is_left(
 
 def test_it_faces_the_camera_by_default(scene: SceneDescription) -> None:
     azimuth, height = find_side_towards_camera(scene)
-    assert azimuth == pytest.approx(scene.number("camera.azimuth")) and 0.5 < height < 0.75
+    assert azimuth == pytest.approx(scene.get_number("camera.azimuth")) and 0.5 < height < 0.75
     turned = scene.with_values(pose__yaw=30.0)
     assert find_side_towards_camera(turned)[0] == pytest.approx(azimuth - 30.0, abs=1e-3)
 

@@ -133,7 +133,7 @@ def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> No
     for share in (0.0, 0.8):
         poses = {name: pose.double() for name, pose in one.space.inputs(torch.tensor([share])).items()}
         seen = torch.linalg.inv(poses["camera.to_world"]) @ poses["object.to_world"] @ places.T
-        focal = 32.0 / math.tan(math.radians(scene.number("camera.fov") / 2.0))
+        focal = 32.0 / math.tan(math.radians(scene.get_number("camera.fov") / 2.0))
         flat = 32.0 - focal * (seen[:2] / seen[2]).T
         box = Facts("mug", compute_sight=partial(make_sight, one.surfaces(torch.tensor([share])))).box
         assert box == pytest.approx((*flat.amin(dim=0).tolist(), *flat.amax(dim=0).tolist()), abs=1.2)

@@ -61,12 +61,14 @@ def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
     scene = load_description(
         "mug", DARK, setting_values={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
     )
-    control = ProjectorControl(elevation=89, distance=3 * scene.metres, fov=20, lumens=5, ambient=50, resolution=4)
+    control = ProjectorControl(
+        elevation=89, distance=3 * scene.size_in_metres, fov=20, lumens=5, ambient=50, resolution=4
+    )
     prepared = control.prepare(scene)
     bound = control.bind(prepared)
     white = torch.ones_like(bound.start)
     seen = MitsubaScene(prepared, (SIDE, SIDE)).render_radiance(bound.inputs(white), 0, 64)
-    lux = 5.0 / (2.0 * 3.0 * scene.metres * math.tan(math.radians(10.0))) ** 2
+    lux = 5.0 / (2.0 * 3.0 * scene.size_in_metres * math.tan(math.radians(10.0))) ** 2
     described = bound.describe(white)
     assert described["projector.white"]["value"] == pytest.approx(lux)
     assert described["projector.beside_ambient"]["value"] == pytest.approx(lux / 50.0)
@@ -74,7 +76,7 @@ def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
     expected = lux / 50.0 * scene.metered_irradiance / math.pi * farther
     camera = camera_to_world(scene)
     x, y, z = -camera[:3, 3] @ camera[:3, :3]
-    scale = SIDE / 2.0 / math.tan(math.radians(scene.number("camera.fov") / 2.0)) / z
+    scale = SIDE / 2.0 / math.tan(math.radians(scene.get_number("camera.fov") / 2.0)) / z
     row, column = int(SIDE / 2.0 - scale * y), int(SIDE / 2.0 - scale * x)
     under = seen[row - 1 : row + 2, column - 1 : column + 2]
     assert torch.allclose(under, torch.full_like(under, expected), rtol=0.02)

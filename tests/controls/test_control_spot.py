@@ -42,7 +42,7 @@ def test_it_has_all_its_lumens_and_half_of_them_within_its_width() -> None:
     thrown = control.project_light(control.values(torch.ones(1)))
     assert float(thrown.mean()) == pytest.approx(1.0, rel=1e-3)  # white of as many lumens has 1 everywhere
     half = float(thrown.max()) / 2.0
-    far = float(control.values(torch.ones(1))["distance"]) / control.scene.metres
+    far = float(control.values(torch.ones(1))["distance"]) / control.scene.size_in_metres
     wide = float((thrown[..., 0] > half).float().mean()) * control.part.area * far**2
     assert wide == pytest.approx(math.pi * 0.15**2, rel=0.1)  # where it has half of its brightness, too
     assert float(thrown.detach().sum(dim=(0, 2)).argmax()) > control.part.sides[1] / 2  # to the right

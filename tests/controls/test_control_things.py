@@ -56,7 +56,7 @@ def vertices(space: Space, u: torch.Tensor, name: str) -> np.ndarray:
     assembly = Assembly(space.scene)
     placed = assembly(space.inputs(u)).get(f"{name}.vertices")
     placed = assembly.meshes[name].transform_mesh(None, None)[0] if placed is None else placed
-    return np.asarray(placed.double().numpy()) * space.scene.metres
+    return np.asarray(placed.double().numpy()) * space.scene.size_in_metres
 
 
 def at(space: Space, **values: float) -> torch.Tensor:
@@ -76,7 +76,7 @@ def test_at_its_start_all_stands_where_it_was_put(scene: SceneDescription) -> No
         f"{thing}.{parameter}" for thing in ("chair", "stop-sign", "car") for parameter in ("x", "y", "heading")
     ]
     for name in scene.things:
-        before = Assembly(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.metres
+        before = Assembly(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.size_in_metres
         np.testing.assert_allclose(vertices(space, space.start, name), before, atol=CLOSE)
 
 
@@ -97,7 +97,7 @@ def test_where_it_stands_is_said_as_things_are_asked_for(scene: SceneDescription
     x, y = (said[f"things.chair.at_{axis}"]["value"] for axis in "xy")
     assert said["things.chair.x"]["value"] == -2.0 and float(x) > 2.3
     again = load_description("car", things=f"chair@{x},{y},size=1,heading=40", setting_values={"camera.distance": 9.0})
-    placed = Assembly(again).meshes["chair"].transform_mesh(None, None)[0].double().numpy() * again.metres
+    placed = Assembly(again).meshes["chair"].transform_mesh(None, None)[0].double().numpy() * again.size_in_metres
     np.testing.assert_allclose(vertices(space, u, "chair"), placed, atol=5e-3)  # the car's middle is not its box's foot
 
 

@@ -225,16 +225,16 @@ class DimControl(NumberControl):
 
     refines = frozenset({"object.base_color"})
 
-    def scene_inputs(self, values: Any, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        found = so_far["object.base_color"].clone() * (1.0 - values["amount"].clone())
-        destroy([*values.values(), *so_far.values()])
+    def scene_inputs(self, values: Any, earlier_inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        found = earlier_inputs["object.base_color"].clone() * (1.0 - values["amount"].clone())
+        destroy([*values.values(), *earlier_inputs.values()])
         return {"object.base_color": found}
 
     def on_picture(self, values: Any, image: Tensor) -> Tensor:
         return image.mul_(1.0 - values["amount"])
 
-    def measured(self, values: Any, so_far: Mapping[str, Tensor]) -> dict[str, Any]:
-        destroy([*so_far.values(), *values.values()])
+    def measured(self, values: Any, earlier_inputs: Mapping[str, Tensor]) -> dict[str, Any]:
+        destroy([*earlier_inputs.values(), *values.values()])
         return {}
 
 

@@ -120,7 +120,7 @@ def test_an_interrupt_of_the_check_keeps_the_configuration_and_going_on_verifies
         rendered += query.phase is None
         if rendered == trials:
             raise KeyboardInterrupt
-        answered.append((query.kind, query.number))
+        answered.append((query.kind, query.index))
         return once(self, query)
 
     monkeypatch.setattr(StandInProblem, "evaluate", evaluate)

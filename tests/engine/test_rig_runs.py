@@ -105,7 +105,7 @@ def test_every_picture_has_the_box_of_an_independent_projection(tmp_path: Path, 
     )  # fmt: skip
     scene = advsearch.load_scene("mug", camera=file).description
     vertices = scene.object.mesh.vertices.astype(np.float64)
-    centre, metres, fov = compute_center(scene), scene.metres, scene.number("camera.fov")
+    centre, metres, fov = compute_center(scene), scene.size_in_metres, scene.get_number("camera.fov")
     for row, yaw in zip(swept.rows(), (0.0, 50.0), strict=True):
         payload: Any = row.payload
         assert row.correct and len(payload["pictures"]) == len(scene.rig)

@@ -76,8 +76,8 @@ def test_each_camera_takes_the_picture_that_it_takes_alone(tmp_path: Path, kind:
     assert float((seen[:, 32:] - own).abs().mean()) > 0.02
     description = both.scene.definition[0]
     base = torch.from_numpy(camera_to_world(description)).float()
-    pose = description.rig[1].make_inputs({}, base, torch.zeros(3), description.metres)["camera.to_world"]
-    shift = (pose[:3, 3] - base[:3, 3]) * description.metres
+    pose = description.rig[1].make_inputs({}, base, torch.zeros(3), description.size_in_metres)["camera.to_world"]
+    shift = (pose[:3, 3] - base[:3, 3]) * description.size_in_metres
     torch.testing.assert_close(shift, -0.6 * base[:3, 0], atol=1e-5, rtol=0.0)  # 0.6 m to the right: +x is to the left
     torch.testing.assert_close(pose[:3, :3], base[:3, :3], atol=1e-6, rtol=0.0)
 

@@ -54,7 +54,7 @@ class Disorder:
         for count, items in enumerate(pieces):
             if count == self.stop:
                 raise KeyboardInterrupt
-            if self.lose in [query.number for _, _, query in items]:
+            if self.lose in [query.index for _, _, query in items]:
                 for one in items:
                     lost = "no answer: 3 workers died of it" if one[2].number == self.lose else ""
                     yield BatchResult([one], None if lost else self.call([one]), lost=lost)

@@ -117,7 +117,7 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     name, scene = training.load_scene(1)
     assert (name, scene.description.object.label) == ("book", "book")
     assert repr(training.load_scene(1)[1]) == repr(scene)
-    assert training.load_scene(1, {"camera.fov": 30.0})[1].description.number("camera.fov") == 30.0
+    assert training.load_scene(1, {"camera.fov": 30.0})[1].description.get_number("camera.fov") == 30.0
     file = shutil.copy(bundled / "data" / "objects" / "ball" / "mesh.ply", tmp_path / "tennis-ball.ply")
     mine = SceneSplit(TRAINING, (str(file),), ("noon",), 1).load_scene(0)[1]
     assert mine.description.object.label == "tennis ball"

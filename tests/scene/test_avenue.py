@@ -34,7 +34,7 @@ def test_an_avenue_comes_and_goes_with_its_ground() -> None:
 @pytest.mark.parametrize("name", ["car", "stop-sign"])
 def test_an_avenue_has_its_size_in_metres_whatever_stands_in_it(name: str) -> None:
     scene = load_description(name, "avenue")
-    places = {one: part.mesh.vertices * scene.metres for one, part in scene.surrounding_meshes.items()}
+    places = {one: part.mesh.vertices * scene.size_in_metres for one, part in scene.surrounding_meshes.items()}
     assert np.ptp(places["road"][:, 0]) > 2 * END
     assert places["houses"][:, 2].max() < 25.0
     assert places["houses"][:, 2].min() == pytest.approx(KERB, abs=1e-4)
@@ -70,6 +70,6 @@ def test_lamps_shine_at_dusk_with_the_light_that_they_are_said_to_have() -> None
     assert unit.candelas is not None
     # a level area of A m2 that shines L cd/m2, h above: E = L A / h^2
     luminance = float(lamps.emission[0, 0] @ np.array(LUMINANCE)) * unit.candelas
-    corners = lamps.mesh.vertices[lamps.mesh.faces[: len(lamps.mesh.faces)]].astype(np.float64) * night.metres
+    corners = lamps.mesh.vertices[lamps.mesh.faces[: len(lamps.mesh.faces)]].astype(np.float64) * night.size_in_metres
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     assert luminance * area / len(lamp_places(AVENUE.posts)) / 7.5**2 == pytest.approx(15.0, rel=0.02)

@@ -198,7 +198,7 @@ def test_light_and_ground_follow_from_the_photograph(tmp_path: Path) -> None:
     shown = decode(np.array([200]))[0]  # the mug stands in the lower half
     albedo = shown / (scene.gain * irradiance / np.pi)
     expected = 255.0 * encode(np.array([min(albedo, 0.8)]))[0]
-    assert fitted.number("ground.red") * 255.0 == pytest.approx(expected, abs=0.5)
+    assert fitted.get_number("ground.red") * 255.0 == pytest.approx(expected, abs=0.5)
     plane = compute_plane_radiance(fitted)
     assert plane is not None and plane[0] == pytest.approx(min(albedo, 0.8) * irradiance / np.pi, rel=1e-3)
     below = load_description("mug", environment, setting_values={"camera.elevation": -20.0})
@@ -362,7 +362,7 @@ def test_a_measured_pose_puts_the_object_where_the_camera_matrix_has_it(
     got = pixels.numpy() + np.array([320, 240])
     distance = np.linalg.norm(got[:, None] - expected[None], axis=2)
     assert distance.min(axis=1).max() < 5e-3 and distance.min(axis=0).max() < 5e-3
-    depth = np.unique(np.round(relative[:, 2] * scene.metres * 1e3, 2))
+    depth = np.unique(np.round(relative[:, 2] * scene.size_in_metres * 1e3, 2))
     np.testing.assert_allclose(depth, np.sort(seen[:, 2]), atol=0.02)
     if up is not None:
         axes = camera[:3, :3] @ np.diag([-1.0, -1.0, 1.0])  # columns: right, down and ahead in the world

@@ -17,7 +17,7 @@ from advsearch.scene.grounds import make_camera_view
 def lens(scene: SceneDescription, to_world: torch.Tensor | None = None) -> np.ndarray:
     """The place (3,) of the camera in metres."""
     pose = camera_to_world(scene) if to_world is None else to_world.double().numpy()
-    return np.asarray(pose[:3, 3] * scene.metres)
+    return np.asarray(pose[:3, 3] * scene.size_in_metres)
 
 
 def seen(name: str, camera: str, environment: str = "street", **said: object) -> SceneDescription:
@@ -36,7 +36,7 @@ def seen(name: str, camera: str, environment: str = "street", **said: object) ->
 def test_a_mounted_camera_is_as_high_as_it_is(name: str, camera: str, environment: str, height: float) -> None:
     scene = seen(name, camera, environment, **({"size": 0.1} if name == "mug" else {}))
     assert lens(scene)[2] == pytest.approx(height, abs=1e-4)
-    assert scene.number("camera.fov") == PRESETS[camera].fov
+    assert scene.get_number("camera.fov") == PRESETS[camera].fov
     assert scene_to_settings(Scene(scene))["camera"] == camera
     assert "set" in scene_to_settings(Scene(scene)) and not scene.requested_values
 
@@ -52,7 +52,7 @@ def test_what_is_given_wins_over_a_preset() -> None:
     given = {"camera.distance": 30.0, "camera.fov": 60.0, "camera.height": 1.1, "camera.azimuth": 180.0}
     scene = seen("car", "dashcam", settings=given)
     x, _, z = lens(scene)
-    assert (x > 0.0, z, scene.number("camera.fov")) == (True, pytest.approx(1.1, abs=1e-4), 60.0)
+    assert (x > 0.0, z, scene.get_number("camera.fov")) == (True, pytest.approx(1.1, abs=1e-4), 60.0)
     assert make_camera_view(seen("car", "dashcam", settings={"camera.elevation": 10.0})).height > 2.0
     moved = Scene(seen("car", "dashcam")).with_settings({"camera.elevation": 10.0}).description
     assert lens(moved)[2] > 2.0

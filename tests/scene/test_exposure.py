@@ -77,7 +77,7 @@ def test_what_is_metered_is_what_a_render_of_a_matt_ball_shows(environment: str,
 
 
 def test_the_side_that_the_camera_sees_is_metered_and_not_the_light() -> None:
-    azimuth = grey_ball("noon").number("camera.azimuth")
+    azimuth = grey_ball("noon").get_number("camera.azimuth")
     front, back = (grey_ball(lit_from(azimuth + turn)) for turn in (0.0, 180.0))
     assert back.gain > 4.0 * front.gain
 

@@ -101,7 +101,7 @@ def test_a_facing_that_is_none_or_points_up_is_refused(tmp_path: Path) -> None:
 
 
 def place(scene: SceneDescription) -> np.ndarray:
-    return np.asarray(camera_to_world(scene)[:3, 3] * scene.metres)
+    return np.asarray(camera_to_world(scene)[:3, 3] * scene.size_in_metres)
 
 
 def dashcam(name: object, environment: str = "street", **given: Any) -> SceneDescription:

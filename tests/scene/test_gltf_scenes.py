@@ -47,14 +47,16 @@ def with_camera(folder: Path, lens: dict[str, float], **node: Any) -> SceneDescr
 def test_a_camera_without_aspect_has_its_angle_along_the_height(aspect: float, tmp_path: Path) -> None:
     """Section 3.10.3: without aspectRatio that of the viewport holds."""
     scene = with_camera(tmp_path, {})
-    height = math.tan(math.radians(_at(scene, aspect).number("camera.fov")) / 2.0) / max(aspect, 1.0)
+    height = math.tan(math.radians(_at(scene, aspect).get_number("camera.fov")) / 2.0) / max(aspect, 1.0)
     assert height == pytest.approx(math.tan(0.4))
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
 def test_a_camera_with_aspect_sees_all_that_its_own_picture_has(aspect: float, tmp_path: Path) -> None:
     scene = with_camera(tmp_path, {"aspectRatio": 1.5})
-    assert math.tan(math.radians(_at(scene, aspect).number("camera.fov")) / 2.0) == pytest.approx(math.tan(0.4) * 1.5)
+    assert math.tan(math.radians(_at(scene, aspect).get_number("camera.fov")) / 2.0) == pytest.approx(
+        math.tan(0.4) * 1.5
+    )
 
 
 def _at(scene: SceneDescription, aspect: float) -> SceneDescription:

@@ -114,7 +114,7 @@ def test_the_ground_ahead_has_the_lux_of_both_headlamps() -> None:
         found.append(renderer.radiance(renderer.start, 3, 64).numpy() @ np.array(LUMINANCE))
     seen, described = renderer.surfaces(renderer.start), lit.description
     camera, right = (lamp.to_world for lamp in beams(described))
-    place = 0.5 * (camera + right)[:3, 3] * described.metres
+    place = 0.5 * (camera + right)[:3, 3] * described.size_in_metres
     assert place[2] == pytest.approx(EGO_LAMP_POSITION[2]) and camera[:3, 2] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
     eye = place - [EGO_LAMP_POSITION[0], 0.0, EGO_LAMP_POSITION[2] - 1.3]
     # from depth to places: the picture's rows are at known angles below the camera's axis, its middle column ahead
@@ -140,11 +140,13 @@ def test_lamps_sit_where_the_car_has_its_glass() -> None:
     described = scene(things="car@12,3.5,heading=180,lamps=high", **LOW).description
     own = {lamp.name: lamp for lamp in beams(described)}
     assert set(own) == {f"{who}-{side}-beam" for who in ("object", "car") for side in ("left", "right")}
-    left, right = (own[f"object-{side}-beam"].to_world[:3, 3] * described.metres for side in ("left", "right"))
+    left, right = (own[f"object-{side}-beam"].to_world[:3, 3] * described.size_in_metres for side in ("left", "right"))
     assert left[1] == pytest.approx(-right[1], abs=0.02) and 0.5 < left[1] < 0.75
     assert 0.55 < left[2] < 0.8 and 1.8 < left[0] < 2.2
     other = own["car-left-beam"]
-    assert other.to_world[:3, 3] * described.metres == pytest.approx([12.0 - left[0], 3.5 - left[1], left[2]], abs=0.06)
+    assert other.to_world[:3, 3] * described.size_in_metres == pytest.approx(
+        [12.0 - left[0], 3.5 - left[1], left[2]], abs=0.06
+    )
     assert other.to_world[:3, 2] == pytest.approx([-1.0, 0.0, 0.0], abs=1e-6)
 
 
@@ -157,7 +159,9 @@ def test_glass_shines_as_many_candela_as_it_says_and_rear_lamps_are_red() -> Non
         ("object-taillamps", TAILLAMP_CANDELA, -1.0),
     ):
         part = glasses(described)[name]
-        corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T)[part.mesh.faces] * described.metres
+        corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T)[
+            part.mesh.faces
+        ] * described.size_in_metres
         area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 0] * way / 2.0
         assert part.emission is not None
         luminance = float(part.emission[0, 0] @ np.array(LUMINANCE)) * described.environment.candelas

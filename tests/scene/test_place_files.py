@@ -101,7 +101,7 @@ def test_a_street_of_ones_own_stands_around_the_object_to_scale(street: Path) ->
     scene = load_description("car", street)
     assert {"road", "house", "lamp"} == {name for name, part in scene.surrounding_meshes.items() if part.is_laid_ground}
     assert is_paved(scene) and is_enclosed(scene) and has_lanes(scene)
-    house = compute_base_vertices(scene.surrounding_meshes["house"]) * scene.metres
+    house = compute_base_vertices(scene.surrounding_meshes["house"]) * scene.size_in_metres
     np.testing.assert_allclose([house.min(axis=0), house.max(axis=0)], [[-10, 5, 0], [10, 9, 6]], atol=1e-4)
     assert scene.surrounding_meshes["road"].material.specular == pytest.approx(0.25)
     assert scene.environment is not None and scene.environment.name == "my-street"

@@ -19,7 +19,7 @@ PLACES = {"avenue": "car", "crossing": "car", "car-park": "car", "room": "mug"}
 
 
 def metres(scene: SceneDescription) -> dict[str, np.ndarray]:
-    return {name: compute_base_vertices(part) * scene.metres for name, part in scene.surrounding_meshes.items()}
+    return {name: compute_base_vertices(part) * scene.size_in_metres for name, part in scene.surrounding_meshes.items()}
 
 
 @pytest.mark.medium
@@ -44,12 +44,12 @@ def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: s
 @pytest.mark.parametrize("place", PLACES)
 def test_nothing_stands_where_the_object_is(place: str) -> None:
     scene = load_description(PLACES[place], place)
-    thing, low = compute_footprint(scene.base_vertices * scene.metres), -0.001
+    thing, low = compute_footprint(scene.base_vertices * scene.size_in_metres), -0.001
     ground = ("road", "floor", "plain")
     for name, part in scene.surrounding_meshes.items():
         if name in ground:
             continue
-        corners = (compute_base_vertices(part) * scene.metres)[part.mesh.faces.astype(np.int64)]
+        corners = (compute_base_vertices(part) * scene.size_in_metres)[part.mesh.faces.astype(np.int64)]
         near = (corners.min(axis=1)[:, :2] < thing.outline.max(axis=0)) & (
             corners.max(axis=1)[:, :2] > thing.outline.min(axis=0)
         )
@@ -73,7 +73,10 @@ def test_below_the_horizon_there_is_ground_all_around(place: str) -> None:
 
 def test_things_stand_on_the_table_and_beyond_it_on_the_floor() -> None:
     scene = load_description("mug", "room", things="bottle@0.2,0.2; chair@0,1.2")
-    low = {name: float((compute_base_vertices(scene.meshes[name]) * scene.metres)[:, 2].min()) for name in scene.things}
+    low = {
+        name: float((compute_base_vertices(scene.meshes[name]) * scene.size_in_metres)[:, 2].min())
+        for name in scene.things
+    }
     assert low == pytest.approx({"bottle": 0.0, "chair": room.LOW[2]}, abs=1e-4)
     assert load_description("mug", "room").meshes["furniture"].is_laid_ground
 

@@ -105,7 +105,7 @@ def test_a_mesh_stands_upright_in_the_frame_and_is_lit(name: str, tmp_path: Path
     assert described.base_vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
     camera = camera_to_world(described)
     seen = (described.base_vertices - camera[:3, 3]) @ camera[:3, :3]
-    edge = np.tan(np.radians(described.number("camera.fov") / 2.0))
+    edge = np.tan(np.radians(described.get_number("camera.fov") / 2.0))
     assert (np.abs(seen[:, :2]) <= edge * seen[:, 2:]).all()
     renderer = scene.renderer("pose", resolution=24, denoise="none")
     body = renderer.mask(renderer.start)

@@ -44,7 +44,7 @@ def test_another_environment_brings_its_own_ground() -> None:
 
 def test_a_road_has_its_size_in_metres_whatever_stands_on_it() -> None:
     car, sign = (load_scene(name, "street").description for name in ("car", "stop-sign"))
-    extents = [np.ptp(one.surrounding_meshes["road"].mesh.vertices, axis=0) * one.metres for one in (car, sign)]
+    extents = [np.ptp(one.surrounding_meshes["road"].mesh.vertices, axis=0) * one.size_in_metres for one in (car, sign)]
     np.testing.assert_allclose(extents[0], extents[1], rtol=1e-5)
     assert extents[0][0] == pytest.approx(120.0)
     lane, line, pavement = reflectance(np.array([4.0, 1.0, 0.3]), np.array([0.0, 1.75, -4.2]))

@@ -16,7 +16,7 @@ def projected(description: SceneDescription) -> np.ndarray:
         description.object.mesh.vertices @ object_to_world(description)[:3, :3].T + object_to_world(description)[:3, 3]
     )
     local = (world - camera[:3, 3]) @ camera[:3, :3]
-    half = np.tan(np.radians(description.number("camera.fov")) / 2)
+    half = np.tan(np.radians(description.get_number("camera.fov")) / 2)
     return np.column_stack([local[:, :2] / local[:, 2:3] / half, local[:, 2]])
 
 

@@ -56,7 +56,7 @@ def test_a_scene_is_seen_by_any_of_its_cameras() -> None:
     scene = replace(scene, cameras=cameras)
     assert torch.equal(picture(Scene(scene.with_camera("front"))), picture(Scene(scene)))
     assert torch.equal(picture(Scene(scene.with_camera("side"))), picture(Scene(side)))
-    assert scene.with_camera("side").with_camera(ORBIT_CAMERA).number("camera.fov") == 35.0
+    assert scene.with_camera("side").with_camera(ORBIT_CAMERA).get_number("camera.fov") == 35.0
     with pytest.raises(UnknownNameError, match="'sied'"):
         scene.with_camera("sied")
     with pytest.raises(InputError, match="camera 'side'"):

@@ -72,7 +72,7 @@ def test_a_node_is_the_object_and_the_rest_stays_in_its_place_around_it(file: Pa
     # in the file x -5 to 5, height 0 to 6, z -5.1 to -4.9, which is our x; the crate of side 2 stands at (1, 0, 0)
     assert corners.min(axis=0) == pytest.approx([-2.55, -3.0, 0.0], abs=1e-5)
     assert corners.max(axis=0) == pytest.approx([-2.45, 2.0, 3.0], abs=1e-5)
-    assert scene.number("ground.size") == 0.0
+    assert scene.get_number("ground.size") == 0.0
 
 
 def test_a_lamp_lights_as_in_the_file_and_takes_the_place_of_a_map(file: Path) -> None:

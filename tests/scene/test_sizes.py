@@ -43,9 +43,9 @@ def glb_of(folder: Path, name: str, longest: float) -> Path:
 
 
 def test_gltf_is_in_metres_and_other_files_say_no_unit(tmp_path: Path) -> None:
-    assert import_object(glb_of(tmp_path, "car", 4.9)).metres == pytest.approx(4.9, rel=1e-5)
+    assert import_object(glb_of(tmp_path, "car", 4.9)).size_in_metres == pytest.approx(4.9, rel=1e-5)
     loose = import_object(box(tmp_path, "sedan", 490.0))
-    assert loose.metres is None
+    assert loose.size_in_metres is None
     assert loose.extent == pytest.approx(490.0)
 
 
@@ -62,9 +62,9 @@ def test_gltf_is_in_metres_and_other_files_say_no_unit(tmp_path: Path) -> None:
 def test_a_car_stands_in_its_lane_at_its_size(tmp_path: Path, longest: float, said: dict[str, object]) -> None:
     scene = load_scene(str(box(tmp_path, "sedan", longest)), "street", up="z", **said)  # type: ignore[arg-type]
     own = scene.description
-    assert own.metres == pytest.approx(4.9, rel=1e-5)
+    assert own.size_in_metres == pytest.approx(4.9, rel=1e-5)
     road = own.surrounding_meshes["road"].mesh.vertices
-    assert np.ptp(road[:, 0]) * own.metres == pytest.approx(120.0)
+    assert np.ptp(road[:, 0]) * own.size_in_metres == pytest.approx(120.0)
     assert np.ptp(own.base_vertices, axis=0) / np.ptp(road, axis=0)[0] * 120.0 == pytest.approx(
         [4.9, 1.96, 1.47], rel=1e-4
     )
@@ -79,8 +79,8 @@ def test_a_node_has_the_size_that_it_has_in_its_scene(tmp_path: Path) -> None:
         replace(part, name="far", mesh=replace(part.mesh, vertices=part.mesh.vertices + 3)),
     ]
     (tmp_path / "room.glb").write_bytes(encode_glb(both))
-    assert import_scene(tmp_path / "room.glb", "seat").object.metres == pytest.approx(1.0, rel=1e-5)
-    assert import_object(tmp_path / "room.glb").metres == pytest.approx(4.0, rel=1e-5)
+    assert import_scene(tmp_path / "room.glb", "seat").object.size_in_metres == pytest.approx(1.0, rel=1e-5)
+    assert import_object(tmp_path / "room.glb").size_in_metres == pytest.approx(4.0, rel=1e-5)
 
 
 def test_a_path_of_a_file_is_in_metres(tmp_path: Path) -> None:
@@ -105,7 +105,9 @@ SIZES = {
 
 @pytest.mark.medium
 def test_bundled_objects_have_their_true_size() -> None:
-    assert {name: library.load_object(name).metres for name in library.list_objects()} == pytest.approx(SIZES, abs=6e-3)
+    assert {name: library.load_object(name).size_in_metres for name in library.list_objects()} == pytest.approx(
+        SIZES, abs=6e-3
+    )
     assert not any(load_description(name).notes for name in SIZES)
 
 
@@ -114,12 +116,12 @@ def test_bundled_objects_have_their_true_size() -> None:
 def test_a_size_in_metres_changes_no_picture(name: str) -> None:
     """Neither where the camera stands by itself nor where it is searched; and a distance in sizes is that in metres."""
     sized = load_description(name)
-    bare = replace(sized, object=replace(sized.object, metres=None))
+    bare = replace(sized, object=replace(sized.object, size_in_metres=None))
     assert np.array_equal(camera_to_world(sized), camera_to_world(bare))
     around: dict[str, Any] = {"azimuth": [0, 90], "elevation": [5, 60]}
     far = {**around, "distance": [1.5, 6.0]}
     pairs: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        ({**around, "distance": [1.5 * sized.metres, 6.0 * sized.metres]}, far),
+        ({**around, "distance": [1.5 * sized.size_in_metres, 6.0 * sized.size_in_metres]}, far),
         ({**around, "sizes": [1.5, 6]}, far),
     ]
     if not is_road_vehicle(sized.object):  # these are looked at from some height in metres

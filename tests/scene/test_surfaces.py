@@ -52,7 +52,7 @@ def test_layers_are_read_back_with_what_they_mean(tmp_path: Path) -> None:
 def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tuple[MitsubaScene, Surfaces]) -> None:
     scene, found = seen
     mesh = scene.assembly.meshes["object"]
-    metres = scene.definition[0].metres
+    metres = scene.definition[0].size_in_metres
     vertices, faces = metres * mesh.transform_mesh(None, None)[0], torch.from_numpy(mesh._mesh.faces.astype(np.int64))
     uvs = torch.from_numpy(mesh._mesh.uvs)
     there = found.visible_mask("object")

@@ -102,7 +102,7 @@ def test_a_square_that_passes_another_overlaps_with_it_over_one_stretch_of_its_w
 def projected_box(thing: str, x: float, y: float, heading: float, size: float) -> tuple[float, ...]:
     """Where a pinhole at `VIEW` sees a bundled thing, worked out in metres: x0, y0, x1, y1 in pixels."""
     car = library.load_object("car")
-    metres = float(car.metres or 0.0)
+    metres = float(car.size_in_metres or 0.0)
     vertices = library.load_object(thing).mesh.vertices.astype(np.float64)
     vertices = vertices - [*(vertices[:, :2].min(axis=0) + vertices[:, :2].max(axis=0)) / 2, vertices[:, 2].min()]
     vertices *= size / np.ptp(vertices, axis=0).max()
@@ -131,7 +131,7 @@ def test_boxes_are_those_of_an_independent_projection() -> None:
     scene = advsearch.load_scene("car", "street", settings=VIEW, things=THREE)
     renderer = scene.renderer({"pose": {}}, resolution=SIDE, denoise="none")
     found = {one.name: one for one in find_visible_meshes(renderer, renderer.start)}
-    metres = {name: float(library.load_object(name).metres or 0.0) for name in ("car", "stop-sign")}
+    metres = {name: float(library.load_object(name).size_in_metres or 0.0) for name in ("car", "stop-sign")}
     for name, what, *place in (
         ("object", "car", 0.0, 0.0, 0.0, metres["car"]),
         ("car", "car", -7.0, 3.5, 160.0, metres["car"]),
@@ -171,6 +171,7 @@ def test_a_thing_hides_is_hidden_and_casts_a_shadow() -> None:
 def test_a_thing_on_the_pavement_stands_on_it() -> None:
     description = advsearch.load_scene("car", "avenue", things="chair@0,-4,size=1; stop-sign@9,0.5").description
     low = {
-        name: compute_base_vertices(part)[:, 2].min() * description.metres for name, part in description.things.items()
+        name: compute_base_vertices(part)[:, 2].min() * description.size_in_metres
+        for name, part in description.things.items()
     }
     assert low == {"chair": pytest.approx(0.12, abs=1e-4), "stop-sign": pytest.approx(0.0, abs=1e-4)}

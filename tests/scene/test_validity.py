@@ -57,7 +57,7 @@ def depression(scene: Scene) -> float:
     houses, _ = seen(scene)
     view = make_camera_view(fit_camera(scene.description, SIDE))
     row = SIDE - int(np.argmax(houses[::-1, 3]))  # the lowest of the first columns, beside the car
-    half = math.radians(scene.description.number("camera.fov")) / 2.0
+    half = math.radians(scene.description.get_number("camera.fov")) / 2.0
     slope = (2.0 * row / SIDE - 1.0) * math.tan(half)
     return view.lower_angle - math.degrees(half) + math.degrees(math.atan(slope))
 
@@ -113,7 +113,7 @@ def test_from_60_m_the_houses_stand_below_the_road() -> None:
 def photographed(height: float | None = None, radius: float | None = None, **said: float) -> SceneDescription:
     given = {"ground.height": height, "ground.radius": radius}
     lit = EnvironmentAsset("hall", np.ones((8, 16, 3), np.float32), photographed=True)
-    loose = replace(load_object("mug"), metres=None)
+    loose = replace(load_object("mug"), size_in_metres=None)
     return load_description(
         loose,
         lit,

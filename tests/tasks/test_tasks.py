@@ -133,7 +133,7 @@ class Yaw(Task):
     tolerance: float = 10.0
 
     def truth(self, facts: Facts) -> float:
-        return facts.number("pose.yaw")
+        return facts.get_number("pose.yaw")
 
     def loss(self, output: Tensor, truth: float) -> Tensor:
         return (output[:, 0] - truth).abs() - self.tolerance

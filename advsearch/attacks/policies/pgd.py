@@ -205,7 +205,7 @@ class Ascent:
         u: (d,) to propose next.
         direction: (d,) accumulated gradient; of Adam, the mean of gradients.
         step_size: before it is decayed, in units of each block's radius.
-        square: (d,) of Adam, the mean of squared gradients.
+        mean_square: (d,) of Adam, the mean of squared gradients.
         peak: the best evaluation; None as long as none is finite.
         count: evaluations so far.
         n_updates: gradients that were accumulated.
@@ -223,7 +223,7 @@ class Ascent:
     u: Tensor
     direction: Tensor
     step_size: float
-    square: Tensor = NO_SQUARES
+    mean_square: Tensor = NO_SQUARES
     peak: Peak | None = None
     count: int = 0
     n_updates: int = 0
@@ -559,7 +559,11 @@ class Adam(AscentPolicy):
     def retreat(self, state: Ascent) -> Ascent:
         u = state.domain.initial_point if state.peak is None else state.peak.u
         return replace(
-            state, u=u, direction=torch.zeros_like(u), square=NO_SQUARES, n_updates=0
+            state,
+            u=u,
+            direction=torch.zeros_like(u),
+            mean_square=NO_SQUARES,
+            n_updates=0,
         )
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
@@ -570,7 +574,9 @@ class Adam(AscentPolicy):
                 squares[part] = squares[part].mean()
         mean = torch.lerp(gradient, state.direction, self.beta1)
         return replace(
-            state, direction=mean, square=torch.lerp(squares, state.square, self.beta2)
+            state,
+            direction=mean,
+            mean_square=torch.lerp(squares, state.mean_square, self.beta2),
         )
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
@@ -578,7 +584,7 @@ class Adam(AscentPolicy):
         if state.n_updates:
             # m' / sqrt(v'), without the bias of means that began at zero
             mean = state.direction / (1.0 - self.beta1**state.n_updates)
-            mean_square = state.square / (1.0 - self.beta2**state.n_updates)
+            mean_square = state.mean_square / (1.0 - self.beta2**state.n_updates)
             direction = mean / mean_square.sqrt_().clamp_(min=1e-30)
         else:  # at random as long as nothing is known
             noise = torch.randn(u.numel(), generator=seeded(state.seed, state.count))

@@ -87,7 +87,7 @@ def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]
     prediction is wrong.
 
     Args:
-        row: of the results.
+        row: row of the results.
         names: parameters that every line has; one that the row lacks is "none". The
             model is called "network" here, since 3DB's "model" is the object.
         prediction: index of the predicted class.

@@ -180,7 +180,7 @@ class CorruptionControl(Control):
         )
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the severity that is applied: a whole one for stepped corruptions."""
         severity = values["severity"]

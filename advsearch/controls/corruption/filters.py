@@ -108,7 +108,7 @@ def blur_along_line(
         image: (H, W, C).
         radius: () in pixels of the reference image.
         sigma: () standard deviation, in pixels of the reference image.
-        angle: of the line, radians.
+        angle: angle of the line, radians.
         step: pixels of this image for a pixel of the reference image.
     """
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
@@ -333,8 +333,8 @@ def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tens
     has by then; so it may come from further away than one step.
 
     Args:
-        height: of the image.
-        width: of the image.
+        height: height of the image.
+        width: width of the image.
         seed: chooses the neighbors.
         severity: 1 to 5.
 
@@ -387,8 +387,8 @@ def _make_elastic_shift(height: int, width: int, seed: int, severity: int) -> Te
     """Make the shift of each pixel to where it is taken from: wrinkles and a shear.
 
     Args:
-        height: of the image.
-        width: of the image.
+        height: height of the image.
+        width: width of the image.
         seed: chooses the wrinkles and the shear.
         severity: 1 to 5.
 
@@ -419,8 +419,8 @@ def _make_shear(rows: int, columns: int, corners: Tensor) -> Tensor:
     the reference side.
 
     Args:
-        rows: of the image.
-        columns: of the image.
+        rows: rows of the image.
+        columns: columns of the image.
         corners: (3, 2) shifts of the lower right, upper right and upper left corner.
     """
     # An affine map is its value at the center, and its slopes along rows and columns.
@@ -562,10 +562,10 @@ def _draw_feather(
     """Draw one ice needle with its barbs.
 
     Args:
-        pen: to draw with.
-        start: of the needle; x is the real and y the imaginary part, in pixels.
+        pen: pen to draw with.
+        start: start of the needle; x is the real and y the imaginary part, in pixels.
         turn: direction of the needle in full turns.
-        size: in [0, 1].
+        size: size in [0, 1].
         shine: brightness in [0, 1].
     """
     direction = cmath.rect(1.0, 2.0 * math.pi * turn)

@@ -108,9 +108,9 @@ class Placement:
     Attributes:
         axes: (3, 3) rows right, up and forward of a camera that looks at the center of
             what is visible of the object.
-        angle: from that center to the occluder, radians.
-        size: of the occluder, made smaller if it would not fit.
-        distance: from the camera, changed if it would not fit.
+        angle: angle from that center to the occluder, radians.
+        size: size of the occluder, made smaller if it would not fit.
+        distance: distance from the camera, changed if it would not fit.
         hidden: fraction of the object's area in the image.
         is_out_of_sight: whether the occluder is put away.
     """
@@ -235,27 +235,27 @@ class OcclusionControl(Control):
         return scene
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the poses of all occluders; those that are not used are out of
         sight.
         """
-        camera = geometry.get_camera_pose(self.scene, so_far).to(values["turn"])
+        camera = geometry.get_camera_pose(self.scene, earlier_inputs).to(values["turn"])
         inputs = {
             f"{self._part_name(option)}.to_world": geometry.make_hidden_pose(camera)
             for option in self._list_options()
         }
-        placement = self.find_placement(values, so_far)
+        placement = self.find_placement(values, earlier_inputs)
         if not placement.is_out_of_sight:
             part = self._part_name(self._select_option(values))
             inputs[f"{part}.to_world"] = _compute_pose(camera, placement, values)
         return inputs
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how much is hidden, and the true size and distance of the occluder."""
-        placement = self.find_placement(values, so_far)
+        placement = self.find_placement(values, earlier_inputs)
         measurements = {"hidden": Value(value=float(placement.hidden), unit="1")}
         if not placement.is_out_of_sight:
             lengths = {"true_size": placement.size, "true_distance": placement.distance}
@@ -282,7 +282,9 @@ class OcclusionControl(Control):
         """
         return self.name if len(self._list_options()) == 1 else f"{self.name}-{option}"
 
-    def find_placement(self, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
+    def find_placement(
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
+    ) -> Placement:
         """Find where the occluder goes, given the pose of camera and object by the
         controls before this one; without derivatives.
 
@@ -290,7 +292,7 @@ class OcclusionControl(Control):
         is out of sight if the object is not in the image, or nothing is to be hidden.
         """
         requested = {name: float(value.detach()) for name, value in values.items()}
-        view = _ObjectView.of(self.scene, so_far)
+        view = _ObjectView.of(self.scene, earlier_inputs)
         requested_distance = requested["distance"] * view.far
         if view.directions is None or requested["coverage"] <= 0.0:
             return _make_hidden_placement(requested["size"], requested_distance)
@@ -361,26 +363,28 @@ class _ObjectView:
     far: float  # distance of the middle of its bounding box
 
     @staticmethod
-    def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _ObjectView:
+    def of(
+        scene: SceneDescription, earlier_inputs: Mapping[str, Tensor]
+    ) -> _ObjectView:
         """Compute how the camera sees a scene's object; without derivatives.
 
-        `so_far` are the inputs of the controls before, which may move camera and
+        `earlier_inputs` are the inputs of the controls before, which may move camera and
         object. For a lens with a model the edge of the image is not known: all
         directions of the image stand in for it.
         """
-        points = _object_in_camera(scene, so_far)
+        points = _object_in_camera(scene, earlier_inputs)
         faces = scene.object.mesh.faces
         model = scene.camera_model
         if model is not None:
-            if "camera.lens" in so_far:
-                model = model.with_numbers(so_far["camera.lens"].detach().cpu())
+            if "camera.lens" in earlier_inputs:
+                model = model.with_numbers(earlier_inputs["camera.lens"].detach().cpu())
             spread = _spread_directions(
                 model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
             )
             rim = spread
             directions = _directions_through_lens(model, points, faces)
         else:
-            frame = _image_frame(scene, so_far)
+            frame = _image_frame(scene, earlier_inputs)
             silhouette = silhouettes.rasterise_silhouette(points, faces, frame)
             spread = silhouettes.spread_directions(frame)
             rim = frame.corners()
@@ -392,14 +396,16 @@ class _ObjectView:
 
 
 def _object_in_camera(
-    scene: SceneDescription, so_far: Mapping[str, Tensor]
+    scene: SceneDescription, earlier_inputs: Mapping[str, Tensor]
 ) -> assets.Float64Array:
     """Return the object's vertices (V, 3) to the right, up and forward of the
     camera.
     """
-    camera = geometry.get_camera_pose(scene, so_far).detach().double().cpu().numpy()
-    pose = _input_or(so_far, "object.to_world", geometry.object_to_world(scene))
-    offsets = _input_or(so_far, "object.offsets", np.zeros(3))
+    camera = (
+        geometry.get_camera_pose(scene, earlier_inputs).detach().double().cpu().numpy()
+    )
+    pose = _input_or(earlier_inputs, "object.to_world", geometry.object_to_world(scene))
+    offsets = _input_or(earlier_inputs, "object.offsets", np.zeros(3))
     vertices = scene.object.mesh.vertices.astype(np.float64) + offsets
     world = vertices @ pose[:3, :3].T + pose[:3, 3]
     # a sensor's own x axis points to the left
@@ -408,12 +414,12 @@ def _object_in_camera(
 
 
 def _image_frame(
-    scene: SceneDescription, so_far: Mapping[str, Tensor]
+    scene: SceneDescription, earlier_inputs: Mapping[str, Tensor]
 ) -> geometry.Frame:
     """Return what the image of a camera without distortion shows."""
-    scene_fov = np.array([scene.number("camera.fov")])
-    fov = float(_input_or(so_far, "camera.fov", scene_fov)[0])
-    shift = _input_or(so_far, "camera.shift", np.zeros(2))
+    scene_fov = np.array([scene.get_number("camera.fov")])
+    fov = float(_input_or(earlier_inputs, "camera.fov", scene_fov)[0])
+    shift = _input_or(earlier_inputs, "camera.shift", np.zeros(2))
     return geometry.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
 
 
@@ -425,7 +431,7 @@ def _directions_through_lens(
     """Return the directions in which a mesh is seen through a lens.
 
     Args:
-        model: of the camera.
+        model: model of the camera.
         points: (V, 3) vertices in camera coordinates.
         faces: (F, 3) of the mesh.
 
@@ -465,10 +471,10 @@ def _spread_directions(
     low-discrepancy sequence; directions that the lens does not have are left out.
 
     Args:
-        model: of the camera.
+        model: model of the camera.
         across: bounds of the part, fractions of the width from the left.
         down: bounds of the part, fractions of the height from the top.
-        count: of rows and columns.
+        count: count of rows and columns.
     """
     row, column = np.divmod(np.arange(count * count), count)
     index = np.arange(count * count)
@@ -502,8 +508,8 @@ def _fit_occluder(
 
     Args:
         points: (V, 3) of the occluder, one object size large around the origin.
-        size: that is requested.
-        distance: from the camera that is requested.
+        size: size that is requested.
+        distance: distance from the camera that is requested.
         near: distance of the object's nearest vertex from the camera.
 
     Returns:

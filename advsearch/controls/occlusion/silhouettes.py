@@ -184,7 +184,7 @@ class Passage:
         it never does, the angle at which it hides most is returned.
 
         Args:
-            fraction: of the target.
+            fraction: fraction of the target.
             outside: angle at which the occluder is outside of the image, radians.
         """
         angles = np.linspace(outside, 0.0, N_SCAN_ANGLES)

@@ -613,7 +613,7 @@ class PathControl(Control):
         )
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the poses of the camera, the object or both at the time."""
         time = values["time"] + self._time_shift
@@ -623,7 +623,7 @@ class PathControl(Control):
         inputs = {}
         if CAMERA in self._movers:
             position, target = self._position_camera(movements, start, time, shift)
-            roll = self.scene.number("camera.roll")
+            roll = self.scene.get_number("camera.roll")
             movement = movements.get(CAMERA)
             if isinstance(movement, Waypoints) and movement.rotations is not None:
                 pose = make_camera_pose(
@@ -637,10 +637,10 @@ class PathControl(Control):
         return inputs
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the distance of the camera from the object."""
-        unit = "object sizes" if self.scene.object.metres is None else "metres"
+        unit = "object sizes" if self.scene.object.size_in_metres is None else "metres"
         distance = self._camera_distance(self._select_movements(values), values["time"])
         return {"distance": Value(value=float(distance), unit=unit)}
 
@@ -668,7 +668,7 @@ class PathControl(Control):
         shift, _ = self._shift_object(movements, start, time)
         position, _ = self._position_camera(movements, start, time, shift)
         offset = position - start.middle - shift
-        distance: Tensor = offset.norm(dim=-1).double() * self.scene.metres
+        distance: Tensor = offset.norm(dim=-1).double() * self.scene.size_in_metres
         return distance
 
     def _select_movements(self, values: Values) -> MovementByMover:
@@ -732,14 +732,17 @@ class PathControl(Control):
         """
         position = (
             center
-            + waypoints.interpolate(time, waypoints.positions) / self.scene.metres
+            + waypoints.interpolate(time, waypoints.positions)
+            / self.scene.size_in_metres
         )
         if waypoints.rotations is not None:
             # the third column points ahead
             return position, position + waypoints.interpolate_rotation(time)[..., 2]
         if waypoints.targets is None:
             return position, center + shift
-        target = waypoints.interpolate(time, waypoints.targets) / self.scene.metres
+        target = (
+            waypoints.interpolate(time, waypoints.targets) / self.scene.size_in_metres
+        )
         return position, center + target
 
     def _shift_object(
@@ -761,7 +764,10 @@ class PathControl(Control):
         if movement is None:
             return no_shift, no_turn
         if isinstance(movement, Waypoints):
-            shift = movement.interpolate(time, movement.positions) / self.scene.metres
+            shift = (
+                movement.interpolate(time, movement.positions)
+                / self.scene.size_in_metres
+            )
             if movement.headings is None:
                 return shift, no_turn
             return shift, movement.interpolate(time, movement.headings)
@@ -998,10 +1004,10 @@ def read_waypoints(
     """Read the paths of the camera and the object from a table of waypoints.
 
     Args:
-        path: of the file, for messages.
+        path: path of the file, for messages.
         mover: the camera or the object, which the file is about.
-        text: of a .csv file with the columns time, x, y, z, and look_x, look_y, look_z
-            or heading.
+        text: text of a .csv file with the columns time, x, y, z, and look_x, look_y,
+            look_z or heading.
         is_single_path: whether a file about the camera may say what the object does at
             the same times.
 

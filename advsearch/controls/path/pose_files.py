@@ -88,7 +88,7 @@ class Trajectory:
     format: PoseFormat
     times: assets.Float64Array | None  # (n,) seconds; None where the file has none
     positions: assets.Float64Array  # (n, 3)
-    # from the sensor's axes to the world's; None where the file has none
+    # Rotations from the sensor's axes to the world's; None where the file has none.
     rotations: Rotation | None
     notes: tuple[str, ...]
 
@@ -102,7 +102,7 @@ class Trajectory:
         """Return positions and rotations in a world whose z is up.
 
         Args:
-            axes: of the sensor, a key of `SENSOR_AXES`, or `NO_AXES`.
+            axes: axes of the sensor, a key of `SENSOR_AXES`, or `NO_AXES`.
             up: what is up in the file's world, a key of `WORLD_TO_Z_UP`.
             origin: (3,) in the file's world.
 

@@ -261,7 +261,7 @@ class ProjectorControl(PictureControl):
         if fov is None:
             offsets = scene.base_vertices - geometry.compute_center(scene)
             object_radius = float(np.linalg.norm(offsets, axis=1).max())
-            half_width = object_radius * max(1.0, columns / rows) * scene.metres
+            half_width = object_radius * max(1.0, columns / rows) * scene.size_in_metres
             distance = self.with_scene(scene)._start_distance()
             fov = min(math.degrees(2.0 * math.atan(half_width / distance)), 150.0)
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
@@ -315,9 +315,11 @@ class ProjectorControl(PictureControl):
                 elevation = math.degrees(math.asin(camera_offset[2] / camera_distance))
                 return replace(parameter, default=min(max(elevation, -89.0), 89.0))
             case "distance":
-                unit = "object sizes" if scene.object.metres is None else "metres"
+                unit = (
+                    "object sizes" if scene.object.size_in_metres is None else "metres"
+                )
                 return replace(
-                    parameter, default=camera_distance * scene.metres, unit=unit
+                    parameter, default=camera_distance * scene.size_in_metres, unit=unit
                 )
         return parameter
 
@@ -391,7 +393,7 @@ class ProjectorControl(PictureControl):
         return values | {"pattern": rounded}
 
     def scene_inputs(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the projector's pose and its light, which is 0 while it flashes off.
 
@@ -409,7 +411,7 @@ class ProjectorControl(PictureControl):
         phase = float(values["phase"].detach()) / 360.0
         if rate and (rate * self._time_shift + phase) % 1.0 >= DUTY_CYCLE:
             light = 0.0 * light  # still depends on the pattern, for its derivative
-        distance_in_units = values["distance"].detach() / self.scene.metres
+        distance_in_units = values["distance"].detach() / self.scene.size_in_metres
         # white in units of the ambient light, at a distance of one unit: light falls
         # off with the squared distance
         brightness = self._relative_to_ambient(values) * distance_in_units**2
@@ -434,7 +436,7 @@ class ProjectorControl(PictureControl):
         return self._lux(values) / values["ambient"]
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how bright white is, and the mean of the pattern."""
         return {
@@ -450,7 +452,7 @@ class ProjectorControl(PictureControl):
         }
 
     def kept_pictures(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the pattern, and the pattern enlarged for printing."""
         pattern = values["pattern"]
@@ -492,7 +494,7 @@ def make_projector_pose(
     The result is cached: do not write into it.
 
     Args:
-        scene: with the object.
+        scene: scene with the object.
         azimuth: degrees.
         elevation: degrees.
         distance: as `ProjectorControl` has it.
@@ -502,6 +504,6 @@ def make_projector_pose(
     ).float()
     position = (
         torch.from_numpy(geometry.compute_center(scene)).float()
-        + distance / scene.metres * outwards
+        + distance / scene.size_in_metres * outwards
     )
     return geometry.make_affine(torch.stack([left, up, -outwards], dim=1), position)

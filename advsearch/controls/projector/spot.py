@@ -126,14 +126,14 @@ class SpotControl(ProjectorControl):
         return Control.values(self, u)
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
-        return Control.describe(self, u, so_far)
+        return Control.describe(self, u, earlier_inputs)
 
     def kept_pictures(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        return Control.kept_pictures(self, values, so_far)
+        return Control.kept_pictures(self, values, earlier_inputs)
 
     def check_choices(self) -> None:
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
@@ -147,7 +147,7 @@ class SpotControl(ProjectorControl):
         """
         if parameter.name != "lumens":
             return super().resolve_parameter(parameter)
-        std = DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.metres
+        std = DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.size_in_metres
         area = (
             2.0 * math.pi * std**2
         )  # in which a Gaussian spot of peak 1 has its light
@@ -173,7 +173,7 @@ class SpotControl(ProjectorControl):
         half_width = (
             math.tan(math.radians(self.part.fov) / 2.0)
             * values["distance"].detach()
-            / self.scene.metres
+            / self.scene.size_in_metres
         )
         rows, columns = self.part.sides
         # positions of the texels' centers in that plane
@@ -194,7 +194,7 @@ class SpotControl(ProjectorControl):
         return spot[..., None] * color.combine_channels(values)
 
     def measured(
-        self, values: Values, so_far: Mapping[str, Tensor]
+        self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return how bright the brightest point of the spot is."""
         brightest = float(self.project_light(values).detach().max())

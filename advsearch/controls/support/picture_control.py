@@ -114,10 +114,10 @@ class PictureControl(Control):
             raise FileFormatError(f"{self.name}.picture: {error}") from error
 
     def describe(
-        self, u: Tensor, so_far: Mapping[str, Tensor] = NO_INPUTS
+        self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how much a searched image changes, and the other values."""
-        described = super().describe(u, so_far)
+        described = super().describe(u, earlier_inputs)
         if not self.is_searched_image:
             return described
         image, start_image = (

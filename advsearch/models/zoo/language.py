@@ -122,8 +122,8 @@ def _check_length(
 
     Args:
         loaded: the network.
-        reader: of images and prompt.
-        max_new_tokens: of the answer.
+        reader: reader of images and prompt.
+        max_new_tokens: max new tokens of the answer.
 
     Raises:
         InputError: they have too many tokens.
@@ -184,7 +184,7 @@ class _LanguageModel(nn.Module):
 
         Args:
             loaded: the network, with what belongs to it.
-            processor: of images and texts.
+            processor: processor of images and texts.
             question: about each image.
 
         Raises:

@@ -108,7 +108,7 @@ def find_cached_file(
 
     Args:
         transformers: the package.
-        name: of the repository or directory.
+        name: name of the repository or directory.
         file: its name there.
         where: arguments of `cached_file`, such as a revision.
     """
@@ -215,9 +215,9 @@ def _make_called_processing(
     """Return the measured size, with the processor to be called on images of it.
 
     Args:
-        processor: that is no gain and offset.
-        spec: of the model, for messages.
-        processing: with the size, if it is fixed.
+        processor: processor that is no gain and offset.
+        spec: specification of the model, for messages.
+        processing: processing with the size, if it is fixed.
         what: the processor does, for messages.
 
     Raises:
@@ -307,7 +307,7 @@ class AdaptedNetwork(nn.Module):
     """A network of a library, called as that library calls it.
 
     Args:
-        network: of the library.
+        network: network of the library.
         ask: calls it on images (N, 3, H, W).
         boxes: whether what it returns are boxes as corners in pixels.
     """
@@ -330,11 +330,11 @@ class LoadedNetwork:
 
     Attributes:
         network: a `PreTrainedModel`.
-        name: of the model.
+        name: name of the model.
         spec: what the user wrote, for messages.
-        processor: of images; None if it has none.
+        processor: processor of images; None if it has none.
         load_part: loads another part by its class, such as "AutoTokenizer".
-        purpose: of the network.
+        purpose: purpose of the network.
     """
 
     network: Any
@@ -388,7 +388,7 @@ class LoadedNetwork:
         Args:
             ask: see `AdaptedNetwork`.
             boxes: see `AdaptedNetwork`.
-            **fields: of `Source`; they overrule the measured preprocessing.
+            **fields: fields of `Source`; they overrule the measured preprocessing.
         """
         return models.make_source(
             AdaptedNetwork(self.network, ask, boxes=boxes),
@@ -420,8 +420,8 @@ def are_nearly_equal(
     Args:
         expected: scores of the network itself.
         computed: scores from its parts.
-        size: of the numbers that are summed, which errors are relative to.
-        dtype: of the network.
+        size: size of the numbers that are summed, which errors are relative to.
+        dtype: dtype of the network.
     """
     return bool(
         (expected - computed).abs().max()

@@ -328,8 +328,8 @@ def _make_timm_source(
     Args:
         timm: the library.
         module: the network.
-        name: of the model.
-        purpose: of the network.
+        name: name of the model.
+        purpose: purpose of the network.
         described: replaces its ``pretrained_cfg``.
         labels: replace timm's.
     """

@@ -180,8 +180,8 @@ def _find_family(architecture: str, network: Any, spec: str) -> Family:
 
     Args:
         architecture: its name.
-        network: of this architecture, or its class.
-        spec: of the model, for messages.
+        network: network of this architecture, or its class.
+        spec: specification of the model, for messages.
 
     Raises:
         ModelError: it belongs to none.
@@ -213,7 +213,7 @@ def _load_config(
 
     Args:
         transformers: the package.
-        name: of the repository or directory.
+        name: name of the repository or directory.
         spec: what the user wrote, for messages.
         where: arguments of the package, such as a revision.
 
@@ -439,7 +439,7 @@ def check_fits(
 
     Args:
         transformers: the package.
-        name: of the repository or directory.
+        name: name of the repository or directory.
         where: arguments of the package, such as a revision.
         spec: what the user wrote, for messages.
 

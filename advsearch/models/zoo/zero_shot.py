@@ -221,10 +221,10 @@ def _check_scores(
     """Compare the score of noise and a text with that of the network itself.
 
     Args:
-        network: with its text encoder.
-        classifier: that is checked, with the same weights.
-        tokenizer: of the network.
-        text: to compare with.
+        network: network with its text encoder.
+        classifier: classifier that is checked, with the same weights.
+        tokenizer: tokenizer of the network.
+        text: text to compare with.
         source: has the size of images.
 
     Raises:

@@ -30,7 +30,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     are in `verifier.state.ambient_verifications`, by lux.
 
     Args:
-        verifier: of the attack.
+        verifier: verifier of the attack.
         u: (d,) the configuration.
     """
     problem = verifier.problem

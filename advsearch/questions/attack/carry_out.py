@@ -78,7 +78,7 @@ def attack_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker evaluates queries of an attack.
 
     Args:
-        settings: of the attack.
+        settings: settings of the attack.
     """
     problem = make_problem(load_parts(AttackConfig(**settings)))
     return make_worker_call(make_problem_finder(problem))
@@ -269,7 +269,7 @@ def make_problem_with_warnings(
     """Return the problem of an attack, and warnings of loading it.
 
     Args:
-        parts: of the attack.
+        parts: parts of the attack.
         **changes: other settings; of another `model`, its name.
     """
     config = parts.config.model_copy(update=changes)

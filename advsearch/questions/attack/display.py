@@ -344,7 +344,7 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
     """Return the result of a curve in a sentence.
 
     Args:
-        result: of the curve.
+        result: result of the curve.
         known: the epsilons with a robust accuracy.
     """
 

@@ -99,14 +99,14 @@ def make_result(
     """Make the result of an attack, and store it with its images in the run, if any.
 
     Args:
-        findings: of the attack.
-        journal: of the run.
+        findings: findings of the attack.
+        journal: journal of the run.
         stages: which took their time.
         warnings: so far.
-        object_name: of the object under attack.
+        object_name: object name of the object under attack.
         judge: the thing that is evaluated.
-        policy: by name, as requested.
-        objective: by name; None for the task's own.
+        policy: policy by name, as requested.
+        objective: objective by name; None for the task's own.
         printable: whether the search had print terms.
         command_line: repeats the attack; None if no command does.
         python_only: its parts that exist only in Python.
@@ -190,10 +190,10 @@ def _write_files(
 
     Args:
         run: the run directory.
-        problem: of the attack.
-        findings: of the attack.
+        problem: problem of the attack.
+        findings: findings of the attack.
         u: (d,) the adversarial configuration.
-        images: of both scenes.
+        images: images of both scenes.
         artifacts: images that the controls make of `u`.
     """
     save_images(run, problem, findings, images)
@@ -223,10 +223,10 @@ def _summarize(
 
     Args:
         findings: what the attack found.
-        journal: of the run.
+        journal: journal of the run.
         clean: image of the clean scene.
         adversarial: image of the adversarial scene.
-        **fields: of the summary that follow from none of these.
+        **fields: fields of the summary that follow from none of these.
     """
     problem = journal.problem
     task = problem.task
@@ -475,7 +475,7 @@ def name_objective(task: Task, objective: str | None) -> str:
     "score" means to a detector without a goal, so it stays "score".
 
     Args:
-        task: of the search.
+        task: task of the search.
         objective: None for the task's own.
     """
     name = objective or task.objective
@@ -533,7 +533,7 @@ def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
     coordinate in u is 0 to that where it is 1.
 
     Args:
-        problem: of the attack.
+        problem: problem of the attack.
         u: (d,) the configuration.
     """
     start = problem.domain.start
@@ -634,8 +634,8 @@ def _renders(findings: RunState, problem: Problem) -> dict[str, int]:
     the predictor counts for the search.
 
     Args:
-        findings: of the attack.
-        problem: of the attack.
+        findings: findings of the attack.
+        problem: problem of the attack.
 
     Returns:
         Numbers of images by "search", "gradient", "baseline", "verification",
@@ -749,9 +749,9 @@ def _describe_failure(
     """Return one of the different failures, as a result lists it.
 
     Args:
-        problem: of the attack.
+        problem: problem of the attack.
         failure: as the search found it.
-        number: in the list.
+        number: number in the list.
         verification: None if it was not tried.
     """
     configuration = {
@@ -789,8 +789,8 @@ def _ranges_of(
     number, else in u. A discrete choice has the name of its option instead.
 
     Args:
-        problem: of the attack.
-        failure: with the bounds of its ranges by column of u.
+        problem: problem of the attack.
+        failure: failure with the bounds of its ranges by column of u.
     """
     ranges: dict[str, tuple[float, float] | str] = {}
     for column, bounds in failure.ranges.items():

@@ -51,7 +51,7 @@ def make_page(run: Path, result: Result) -> str | None:
 
     Args:
         run: the run directory.
-        result: of the attack.
+        result: result of the attack.
 
     Raises:
         FileFormatError: the rows are corrupt.
@@ -127,7 +127,7 @@ def _frames_data(frames: list[str], objectives: Sequence[float | None]) -> Html:
 
     Args:
         frames: data addresses.
-        objectives: of all evaluations of the search.
+        objectives: objectives of all evaluations of the search.
     """
     last_step = max(len(objectives) - 1, 0)
     steps = [round(step) for step in np.linspace(0, last_step, len(frames) - 1)]
@@ -145,7 +145,7 @@ def _image_parts(
 
     Args:
         run: the run directory.
-        summary: of the attack.
+        summary: summary of the attack.
         animated: whether there are frames of the search.
     """
     images = run / directory.IMAGES
@@ -324,7 +324,7 @@ def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
     phone cuts what is on the right.
 
     Args:
-        summary: of the attack.
+        summary: summary of the attack.
         table: the same without bars.
     """
     average = summary.average
@@ -353,8 +353,8 @@ def _search_part(
     """Return the chart of the objective over evaluations; empty without any.
 
     Args:
-        summary: of the attack.
-        objectives: of the search and of the baseline.
+        summary: summary of the attack.
+        objectives: objectives of the search and of the baseline.
     """
     curves = {
         name: values

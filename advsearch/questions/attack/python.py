@@ -84,8 +84,8 @@ def attack(
     loaded.
 
     Args:
-        scene: from `load_scene`, or what that takes.
-        model: from `load_model`, or what that takes; with `ensemble`, several.
+        scene: scene from `load_scene`, or what that takes.
+        model: model from `load_model`, or what that takes; with `ensemble`, several.
         object: the node or shape that is the object, where `scene` is a file or
             dictionary that holds several.
         task: what judges the model's output: a name, a mapping with a `name` and
@@ -252,9 +252,9 @@ def _find_python_only(
         config: the settings.
         scene: loaded.
         model: as the caller passed it, and so on.
-        task: of the model.
-        objective: of the search.
-        policy: of the search.
+        task: task of the model.
+        objective: objective of the search.
+        policy: policy of the search.
         session_controls: names of the controls that exist in this session only.
     """
     parts = [
@@ -288,7 +288,7 @@ def _load_scene(
     Args:
         scene: loaded, a file, a name, or a dictionary of Mitsuba.
         shape: its object, if it has several.
-        options: of the attack.
+        options: options of the attack.
     """
     if isinstance(scene, Scene):
         naming.check_no_scene_settings({**options, "object": shape})

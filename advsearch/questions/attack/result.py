@@ -264,7 +264,7 @@ class AttackResult:
         """Draw the objective over evaluations, and return the matplotlib axes.
 
         Args:
-            axes: to draw on; None makes new ones.
+            axes: axes to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
         draw_searches({self.summary.policy: self.history}, self.summary.objective, axes)
@@ -304,7 +304,7 @@ class StoredImage:
         full_configuration: the configuration of the full space.
         radiance: (H, W, 3) linear.
         image: (H, W, 3) sRGB, 8-bit values in [0, 1].
-        judgement: of the image.
+        judgement: judgement of the image.
         trial: whose image it is; None if there were no trials.
     """
 
@@ -321,8 +321,8 @@ class StoredImage:
         """Render a configuration as in a trial.
 
         Args:
-            problem: of the attack.
-            findings: of the attack.
+            problem: problem of the attack.
+            findings: findings of the attack.
             u: (d,) of the searched controls.
             trial: None renders the conditions as the scene comes.
         """
@@ -397,8 +397,8 @@ def save_images(
 
     Args:
         run: where they are saved.
-        problem: of the attack.
-        findings: of the attack.
+        problem: problem of the attack.
+        findings: findings of the attack.
         scene_images: those of the scenes, `clean` and `adversarial`.
     """
     for name, image in scene_images.items():
@@ -460,10 +460,11 @@ def save_trial(
 
     Args:
         run: where it is saved.
-        problem: of the attack.
-        findings: of the attack; an image that it does not have is rendered again.
+        problem: problem of the attack.
+        findings: findings of the attack; an image that it does not have is rendered
+            again.
         trial: its kind and its number.
-        name: of the file.
+        name: name of the file.
         u: (d,) the configuration.
     """
     seed = seeds.stream(problem.seed, "verification", trial[1])
@@ -492,7 +493,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
 
     Args:
         run: where it is written.
-        problem: of the attack.
+        problem: problem of the attack.
         u: (d,) the adversarial configuration.
     """
     scene = problem.space.scene
@@ -582,7 +583,7 @@ def evaluate_drive(
     The images are saved. Other conditions are as the scene comes.
 
     Args:
-        problem: of the attack.
+        problem: problem of the attack.
         u: (d,) the adversarial configuration; None evaluates the clean scene only.
         spp: samples per pixel.
         run: where the images are saved; None saves none.
@@ -641,9 +642,9 @@ def _make_frames(
     """Return the names of several paths, and the configurations of all frames.
 
     Args:
-        problem: of the attack.
+        problem: problem of the attack.
         path: the control that travels.
-        time_column: of its time.
+        time_column: time column of its time.
 
     Returns:
         Names, none of a single path; and (paths * FRAMES, d) of the full space.
@@ -699,9 +700,9 @@ def save_drive(
 
     Args:
         run: where they are saved.
-        name: of the files.
+        name: name of the files.
         images: (h, w, 3) in sRGB.
-        seconds: from the first frame to the last.
+        seconds: seconds from the first frame to the last.
     """
     frames = [Image.fromarray(files.to_8bit(picture)) for picture in images]
     stream = io.BytesIO()
@@ -728,8 +729,8 @@ def select_evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
     """Return indices of evenly spaced frames, the first and the last among them.
 
     Args:
-        count: of all frames.
-        max_count: of the indices.
+        count: count of all frames.
+        max_count: max count of the indices.
     """
     indices = np.linspace(0, count - 1, min(count, max_count)).round()
     return np.unique(indices.astype(np.int64))

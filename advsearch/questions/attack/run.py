@@ -234,12 +234,12 @@ def search_and_verify(
 
     Args:
         policy: proposes configurations.
-        journal: of the problem; it replays what is stored of the run.
+        journal: journal of the problem; it replays what is stored of the run.
         stages: reports what is done.
         clean: the matrix of the clean scene, of attacks that share it.
         smallest: search the smallest budget in which the model is wrong instead of the
             worst configuration.
-        seconds: that the search may take; None for no limit.
+        seconds: seconds that the search may take; None for no limit.
         baseline: whether a random search with as many renders is made.
         printable: whether the objective includes print terms; then a search without
             them is made, too.
@@ -310,15 +310,15 @@ def search_with_baselines(
     """Search with a policy, then without print terms, if any, and at random.
 
     Args:
-        searches: of the attack.
-        policy: that searches.
-        seconds: that its search may take; None for no limit.
+        searches: searches of the attack.
+        policy: policy that searches.
+        seconds: seconds that its search may take; None for no limit.
         baseline: whether a random search is made.
     """
     problem = searches.problem
     findings = searches.findings
     steps = problem.steps
-    searches.begin(
+    searches.start(
         "search",
         f"searching with {policy.name}",
         steps,
@@ -333,12 +333,12 @@ def search_with_baselines(
         steps = max(1, history[-1].renders) if history else 1
     if searches.printable:
         title = "searching without print terms, to see what they cost"
-        searches.begin(
+        searches.start(
             "without print terms", title, steps, "`printable=false` leaves both out"
         )
         findings.unprinted = searches.search(UNPRINTED, policy, steps, problem.seed)
     if baseline and policy.name != "random":
-        searches.begin(
+        searches.start(
             "baseline",
             "searching at random, to compare",
             steps,

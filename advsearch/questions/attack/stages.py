@@ -92,7 +92,7 @@ def plan_renders(
 
     Args:
         policy: what searches; only one that uses gradients has them measured.
-        journal: of the run.
+        journal: journal of the run.
         stages: reports what is measured.
         specialise: whether what the search does not need may be left out.
         measure: which gradient estimators are measured.
@@ -265,9 +265,9 @@ def choose_predictor(
 
     Args:
         policy: what searches.
-        journal: of the run.
+        journal: journal of the run.
         stages: reports the preparation.
-        findings: of the attack.
+        findings: findings of the attack.
         specialise: whether images may be predicted.
         clean: the matrix of the clean scene, of attacks that share it.
     """
@@ -376,13 +376,13 @@ class Searches:
     def problem(self) -> Problem:
         return self.journal.problem
 
-    def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
+    def start(self, name: str, title: str, steps: int, shorter: str) -> None:
         """Begin the stage of a search.
 
         Args:
-            name: of the stage.
-            title: for the progress.
-            steps: of the search.
+            name: name of the stage.
+            title: title for the progress.
+            steps: steps of the search.
             shorter: which settings shorten it.
         """
         n_renders = count_planned_renders(steps, max_extra_repeats=self.close_looks)
@@ -409,14 +409,14 @@ class Searches:
         """Search with one policy, reading back what is stored already.
 
         Args:
-            kind: of its rows.
+            kind: kind of its rows.
             policy: proposes configurations.
             steps: evaluations.
-            seed: of the policy.
+            seed: seed of the policy.
             frames: is filled with images on the way, (H, W, 3) 8-bit values in [0, 1],
                 at most `MAX_FRAMES` and evenly spaced; None for none.
-            seconds: that it may take; None for no limit.
-            domain: to search; None for the problem's.
+            seconds: seconds that it may take; None for no limit.
+            domain: domain to search; None for the problem's.
             ranked: whether the best configurations are rendered again.
 
         Raises:
@@ -440,7 +440,7 @@ class Searches:
             renders_before = record.renders
 
         def request_image(query: Query) -> Query:
-            is_due = query.phase == "search" and query.number % frame_interval == 0
+            is_due = query.phase == "search" and query.index % frame_interval == 0
             return replace(query, with_image=is_due)
 
         def ignore_replay(query: Query) -> None:
@@ -514,7 +514,7 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     equal seeds.
 
     Args:
-        verifier: of the attack, whose state gets the results.
+        verifier: verifier of the attack, whose state gets the results.
         is_smallest: whether the smallest change was searched.
     """
     findings = verifier.state
@@ -572,8 +572,8 @@ def _replace_if_random_is_worse(
     again, and has to be worse in the fresh trials, too.
 
     Args:
-        verifier: of the attack, whose state is changed.
-        result: of the policy's search.
+        verifier: verifier of the attack, whose state is changed.
+        result: result of the policy's search.
         baseline: result of the random search.
     """
     findings = verifier.state
@@ -618,9 +618,9 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     result of the search becomes the configuration there.
 
     Args:
-        searches: of the attack.
-        policy: that searches.
-        verifier: that tries what was found.
+        searches: searches of the attack.
+        policy: policy that searches.
+        verifier: verifier that tries what was found.
     """
     problem = searches.problem
     findings = searches.findings
@@ -633,7 +633,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     def search_inside(domain: Domain, number: int) -> Tensor:
         """Search a smaller domain, and return the best configuration (d,)."""
         title = f"search {number + 1} of at most {MAX_SEARCHES}"
-        searches.begin("search", title, problem.steps, "`steps` shortens each search")
+        searches.start("search", title, problem.steps, "`steps` shortens each search")
         result = searches.search(
             f"search {number}" if number else "search",
             policy,
@@ -730,8 +730,8 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     vary a failure takes hundreds of trials, and nothing is tried here.
 
     Args:
-        verifier: of the attack.
-        result: of the search.
+        verifier: verifier of the attack.
+        result: result of the search.
     """
     problem = verifier.problem
     findings = verifier.state

@@ -75,9 +75,9 @@ class StudyAttack:
 
     Attributes:
         config: its settings.
-        name: of its directory.
+        name: name of its directory.
         subject: the object or the model that tells it from the others.
-        epsilon: of a curve; None otherwise.
+        epsilon: epsilon of a curve; None otherwise.
     """
 
     config: AttackConfig
@@ -141,7 +141,7 @@ def attacks_of(settings: JsonObject) -> BatchFunction:
     where that was, and its files.
 
     Args:
-        settings: of the study.
+        settings: settings of the study.
     """
     chains = make_chains(AttackConfig(**settings))
 
@@ -179,7 +179,7 @@ def distribute_attacks(
     """Have workers make the attacks of a study that have not begun, if requested.
 
     Args:
-        config: of the study.
+        config: config of the study.
         chains: all of its attacks.
         run: its run directory, which gets the files.
         progress: reports it.
@@ -235,9 +235,9 @@ def _write_part(
 
     Args:
         run: the run directory of the study.
-        name: of the attack's directory in it.
+        name: name of the attack's directory in it.
         worker_path: the directory on the worker, which texts may name.
-        files: by their relative paths.
+        files: files by their relative paths.
     """
     path = run / PARTS / name
     unfinished = run / PARTS / f"{PART}{name}"
@@ -258,8 +258,8 @@ class StudyRun:
 
     Attributes:
         chains: all attacks.
-        names: of the attacks so far.
-        warnings: of these, each sentence once.
+        names: names of the attacks so far.
+        warnings: warnings of these, each sentence once.
     """
 
     def __init__(self, context: RunContext[AttackConfig]) -> None:
@@ -329,8 +329,8 @@ class StudyRun:
         """Return the result of the study.
 
         Args:
-            kind: of the result.
-            **fields: of it, besides those that all results have.
+            kind: kind of the result.
+            **fields: fields of it, besides those that all results have.
         """
         return self.context.result(
             kind, parts=self.names, warnings=self.warnings, **fields
@@ -407,7 +407,7 @@ def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
     noise alone makes the clean scene wrong so often that no scene can be verified.
 
     Args:
-        row: of the last attack on the object.
+        row: row of the last attack on the object.
         epsilon: None for the controls' own ones.
     """
     if row.ending in (None, "non-finite objective"):
@@ -536,8 +536,8 @@ def _try_on_models(
     """Try the clean scene and all adversarial ones on every model.
 
     Args:
-        study: of the attacks.
-        names: of the models.
+        study: study of the attacks.
+        names: names of the models.
         spp: samples per pixel of the trials.
         configurations: (d,) the adversarial ones, by the model that was attacked.
         models: is filled: what each model predicts of the clean scene.
@@ -608,7 +608,7 @@ def models_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker evaluates queries of several models.
 
     Args:
-        settings: of the study.
+        settings: settings of the study.
     """
     config = AttackConfig(**settings)
 

@@ -312,7 +312,7 @@ def _error_clause(
     action.
 
     Args:
-        summary: of the attack.
+        summary: summary of the attack.
         verified: the rate of the trials.
         thing: what is evaluated.
         claim: what a trial counts as.
@@ -356,7 +356,7 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
     goal comes before it in a sentence.
 
     Args:
-        summary: of the attack.
+        summary: summary of the attack.
         thing: what is evaluated.
     """
     target = summary.target or []

@@ -47,8 +47,8 @@ class CheckedPart:
     """What is checked in one go: a scene with its controls, and a loss.
 
     Attributes:
-        number: from 1.
-        config: of the scene and its controls.
+        number: number from 1.
+        config: config of the scene and its controls.
         loss: "linear" or "model".
     """
 
@@ -199,7 +199,7 @@ class GradientCheck:
 
         Args:
             part: what is measured, by every estimator.
-            title: for the progress.
+            title: title for the progress.
         """
         config = part.config
         problem, _ = workbench.problem_from_config(config, denoise="none")
@@ -228,7 +228,7 @@ class GradientCheck:
 
         Args:
             part: what is measured.
-            title: for the progress.
+            title: title for the progress.
         """
         config = part.config
         problem, _ = workbench.problem_from_config(config)
@@ -303,8 +303,8 @@ class GradientCheck:
 
         Args:
             part: what is measured.
-            renderer: of the scene.
-            loss: that is differentiated.
+            renderer: renderer of the scene.
+            loss: loss that is differentiated.
             spp: samples per pixel.
         """
 
@@ -334,7 +334,7 @@ class GradientCheck:
         are visible; nothing where nothing is left out.
 
         Args:
-            problem: of the scene.
+            problem: problem of the scene.
             part: what is measured.
             spp: samples per pixel of the search.
         """

@@ -61,10 +61,10 @@ def measure_gains(
     changes; then gradients are timed in rounds over all variants.
 
     Args:
-        renderer: of a search.
-        loss: that is differentiated.
+        renderer: renderer of a search.
+        loss: loss that is differentiated.
         u: (d,) where.
-        seed: of the renders.
+        seed: seed of the renders.
         spp: samples per pixel.
         repeats: timed gradients of each.
         depth: the longest light path of the search; None for the scene's.
@@ -141,9 +141,9 @@ def _compare_item(
 
     Args:
         item: its name.
-        images: at two seeds.
+        images: images at two seeds.
         slopes: gradients at two seeds.
-        times: of gradients, in seconds.
+        times: times of gradients, in seconds.
     """
     image_difference = _relative_difference(images[""], images[item])
     gradient_difference = _relative_difference(slopes[""], slopes[item])
@@ -177,8 +177,8 @@ def _relative_difference(without: list[Tensor], with_item: list[Tensor]) -> floa
     differences between the two seeds; not divided if seeds make no difference.
 
     Args:
-        without: at two seeds, without the item.
-        with_item: at the same seeds.
+        without: without at two seeds, without the item.
+        with_item: with item at the same seeds.
     """
     noise = math.sqrt(
         statistics.fmean(_difference(pair) ** 2 for pair in (without, with_item))
@@ -193,9 +193,9 @@ def measure_texels(
     """Compare the texels of every searched texture with the pixels that show them.
 
     Args:
-        renderer: of a search.
+        renderer: renderer of a search.
         u: (d,) the configuration.
-        seed: of the renders.
+        seed: seed of the renders.
         spp: samples per pixel.
     """
     inputs = renderer.compute_scene_inputs(u)
@@ -258,10 +258,10 @@ def _count_visible_texels(
     have just two segments: from the light to the surface, and on to the camera.
 
     Args:
-        renderer: of the scene.
-        inputs: of the scene.
-        name: of the input that is the texture.
-        seed: of the render.
+        renderer: renderer of the scene.
+        inputs: inputs of the scene.
+        name: name of the input that is the texture.
+        seed: seed of the render.
         spp: samples per pixel.
     """
     scene = renderer.scene

@@ -17,8 +17,8 @@ class MissingImage(NamedTuple):
     """An image that has to be rendered.
 
     Attributes:
-        side: that it belongs to.
-        number: of the image in the side's sweep.
+        side: side that it belongs to.
+        number: number of the image in the side's sweep.
         file: relative to the run directory.
     """
 
@@ -32,7 +32,7 @@ class PairImages:
     """Copies images of pairs into the run directory, or renders them again.
 
     Attributes:
-        context: of the experiment.
+        context: context of the experiment.
         n_rendered: images that were rendered.
         warnings: sentences about images that could not be rendered.
     """

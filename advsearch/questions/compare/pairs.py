@@ -81,7 +81,7 @@ def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPar
 
     Args:
         first, second: the sides, with rows in the same order.
-        name: of the parameter.
+        name: name of the parameter.
     """
     column = first.rows[name]
     unit = "" if column.dtype == "category" else first.rows.attrs["units"][name]
@@ -154,8 +154,9 @@ def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
     """Find rules under which only one side is right more often; None for too few pairs.
 
     Args:
-        table: of pairs (`rules`); `correct` is False where that side alone is right.
-        seed: of the halves that choose and count.
+        table: table of pairs (`rules`); `correct` is False where that side alone is
+            right.
+        seed: seed of the halves that choose and count.
     """
     if len(table) < rules.MIN_ROWS or not table.attrs["units"]:
         return None

@@ -362,10 +362,10 @@ def _worse_texts(
     """Yield the rules under which one side is worse than another.
 
     Args:
-        rules: under which only `name` is right; None if they were not sought.
+        rules: rules under which only `name` is right; None if they were not sought.
         n_alone: pairs that only `name` gets right.
-        name: of the better side.
-        other: of the worse side.
+        name: name of the better side.
+        other: other of the worse side.
     """
     if rules is None or not n_alone:
         return
@@ -407,8 +407,8 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     image; and lines of pairs without images.
 
     Args:
-        name: of the side.
-        pair: of both sides.
+        name: name of the side.
+        pair: pair of both sides.
     """
     title = f"Only {name} gets right:"
     lines: list[list[str]] = []

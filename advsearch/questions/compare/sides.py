@@ -54,7 +54,7 @@ class Side:
 
     Attributes:
         name: what tells it from the others.
-        sweep: that has its rows.
+        sweep: sweep that has its rows.
         labels: its object, model and adversarial scene, by `SIDE_COLUMNS`.
         rows: one for each image in their order (`StoredSweep.read_rows`), with the
             `number` of the image.

@@ -38,8 +38,8 @@ def harden(context: RunContext[HardenConfig], **arguments: Any) -> HardenResult:
         beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3)
             sRGB in [0, 1], class indices (N,). One is taken with each step. Not of a
             detector, which `data` is for.
-        loss: of a detector whose network returns none in training: a function of the
-            network, its input (N, 3, H, W) and, for each picture, a mapping with
+        loss: loss of a detector whose network returns none in training: a function of
+            the network, its input (N, 3, H, W) and, for each picture, a mapping with
             "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels" (K,),
             indices of the model's labels; of a segmenter with "classes" (h, w) int64,
             the class that each pixel of its output should have, and "object" (h, w)

@@ -126,7 +126,7 @@ def check_settings(
     Args:
         config: the settings.
         beside: further batches of images; for classifiers only.
-        loss: for detectors and segmenters only.
+        loss: loss for detectors and segmenters only.
 
     Raises:
         InputError: one of them does not.
@@ -178,7 +178,7 @@ def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> Non
 
     Args:
         run: the run.
-        arguments: by name; None for those that were not passed.
+        arguments: arguments by name; None for those that were not passed.
 
     Raises:
         InputError: the run began with others.
@@ -324,8 +324,8 @@ class Hardening:
 
         Args:
             measurement: a key of `MEASUREMENTS`.
-            control: that was searched.
-            number: of the scene.
+            control: control that was searched.
+            number: number of the scene.
             is_wrong: whether it found one.
         """
         kind = f"{measurement} {control}"
@@ -348,7 +348,7 @@ class Hardening:
 
         Args:
             measurement: a key of `MEASUREMENTS`.
-            controls: of the searches.
+            controls: controls of the searches.
         """
         is_robust = []
         for number in range(self.config.measured):

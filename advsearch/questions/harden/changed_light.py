@@ -54,7 +54,8 @@ def sample_lobe(
     middle. Values are relative to the mean of the environment that it is added to.
 
     Args:
-        height, width: of the map, which has the zenith at the top and azimuths across.
+        height, width: height and width of the map, which has the zenith at the top and
+            azimuths across.
         rng: samples its direction, its size and its strength.
     """
     theta = (np.arange(height) + 0.5)[:, None] * math.pi / height

@@ -90,8 +90,8 @@ class Example(NamedTuple):
         """Render a configuration, or the plain scene, under conditions of a seed.
 
         Args:
-            problem: of the scene.
-            seed: of the conditions and the noise.
+            problem: problem of the scene.
+            seed: seed of the conditions and the noise.
             u: (d,) the configuration that a search has found; None for the plain scene.
         """
         configuration = problem.domain.start if u is None else u
@@ -200,9 +200,9 @@ def _locate_image(directory: Path, name: str, coco_file: Path) -> Path:
     """Return the path of an image that a COCO file names.
 
     Args:
-        directory: of the images, resolved.
-        name: in the file, which is not trusted.
-        coco_file: for messages.
+        directory: directory of the images, resolved.
+        name: name in the file, which is not trusted.
+        coco_file: coco file for messages.
 
     Raises:
         FileFormatError: it is outside of the directory.
@@ -232,7 +232,7 @@ def compute_network_loss(
     losses is summed.
 
     Args:
-        network: in training mode.
+        network: network in training mode.
         x: the network's input.
         targets: the ground truth of each image.
 
@@ -313,7 +313,7 @@ class DetectorTrainer(Trainer):
         wrong or not.
 
         Args:
-            title: of the stage that the progress reports.
+            title: title of the stage that the progress reports.
             split: name of the split that the scenes belong to.
             scene_numbers: numbers of the scenes.
         """
@@ -344,10 +344,10 @@ class DetectorTrainer(Trainer):
         """Attack the student in a scene; return a plain image and the worst one.
 
         Args:
-            scene: to attack.
-            name: of its object.
-            control: that is searched.
-            seed: of the search and of the conditions of both images.
+            scene: scene to attack.
+            name: name of its object.
+            control: control that is searched.
+            seed: seed of the search and of the conditions of both images.
         """
         model = self.student.model
         config = self.work.make_attack_config(
@@ -434,7 +434,7 @@ class DetectorTrainer(Trainer):
 
         Args:
             run: gets the files.
-            number: of the round.
+            number: number of the round.
             new: its new items.
         """
         directory = f"{IMAGE_DIRECTORY}/round-{number:03d}"
@@ -530,7 +530,7 @@ class SegmenterTrainer(DetectorTrainer):
         model predicts.
 
         Args:
-            item: with a `Region` as truth.
+            item: item with a `Region` as truth.
             is_mirrored: whether image and target are mirrored.
         """
         region: Any = item.truth
@@ -567,7 +567,7 @@ def compute_pixel_loss(
 
     Args:
         task: reads the network's output.
-        network: in training mode.
+        network: network in training mode.
         x: the network's input.
         targets: "classes" and "object" of each image.
     """

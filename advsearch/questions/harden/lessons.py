@@ -161,7 +161,7 @@ def make_lessons(
 
     Args:
         problem: the scene with the controls that make it harder.
-        n_views: that have worst images.
+        n_views: number of views that have worst images.
         seed: root of the samples.
         n_plain: further views without worst images.
         n_tries: random configurations of each view that are rendered where a matrix of
@@ -266,8 +266,8 @@ def _sample_lesson_configurations(
     """Sample the configurations (d,) of a lesson, that of the plain image first.
 
     Args:
-        problem: of the scene.
-        seed: of the samples.
+        problem: problem of the scene.
+        seed: seed of the samples.
         n_tries: number of further configurations after the start; None for two only: a
             random control changed by itself, and all of them.
     """
@@ -369,8 +369,8 @@ def search_worse_images(
 
     Args:
         selected: the lessons.
-        model: that the images are to be hard for.
-        steps: of the search of textures.
+        model: model that the images are to be hard for.
+        steps: steps of the search of textures.
     """
     for start in range(0, len(selected), BATCH_SIZE):
         batch = selected[start : start + BATCH_SIZE]

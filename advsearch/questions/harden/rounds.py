@@ -101,8 +101,8 @@ class Trainer(ABC):
         """Sample the items of scenes.
 
         Args:
-            title: of the stage that the progress reports.
-            split: that the scenes belong to.
+            title: title of the stage that the progress reports.
+            split: split that the scenes belong to.
             scene_numbers: numbers of the scenes.
         """
 
@@ -145,7 +145,7 @@ class Trainer(ABC):
         It ends with the running average of its weights.
 
         Args:
-            number: of the round, which decides the order of the items.
+            number: number of the round, which decides the order of the items.
             pool: all items.
             new: those that no earlier round has used.
             tick: is called after each step.
@@ -203,8 +203,8 @@ class Trainer(ABC):
         """Create the optimizer of a round, and its schedule of learning rates.
 
         Args:
-            parameters: that are trained.
-            n_steps: of the round.
+            parameters: parameters that are trained.
+            n_steps: number of steps of the round.
         """
         make_optimizer = self.optimiser or partial(
             torch.optim.AdamW, lr=self.config.rate, weight_decay=self.weight_decay
@@ -404,11 +404,11 @@ class Rounds:
         """Store the weights of a round, its new images and its result.
 
         Args:
-            number: of the round.
+            number: number of the round.
             new_items: its new items.
             score: the score of the weights.
             n_trained: number of items that it was trained on.
-            interpolation: of the weights; see `select_interpolation`.
+            interpolation: interpolation of the weights; see `select_interpolation`.
         """
         self.write_weights(ROUND_FILE.format(number))
         self.trainer.save_images(self.run, number, new_items)

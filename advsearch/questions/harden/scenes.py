@@ -85,7 +85,7 @@ class SceneJobs:
     Attributes:
         config: the settings.
         model: the original model.
-        splits: by name.
+        splits: splits by name.
         progress: reports the jobs.
         executor: runs the jobs on workers; None runs them here.
     """
@@ -105,7 +105,7 @@ class SceneJobs:
         """Run jobs, and yield the index and the result of each in any order.
 
         Args:
-            title: of the stage that the progress reports.
+            title: title of the stage that the progress reports.
             jobs: the jobs.
             hint: how to shorten the stage.
         """
@@ -136,8 +136,8 @@ class SceneJobs:
 
         Args:
             split: name of the split.
-            number: of the scene.
-            controls: that make the views harder together.
+            number: number of the scene.
+            controls: controls that make the views harder together.
             views: number of views that are made harder.
             plain: number of further views of the plain scene.
             shared: whether the views share one adversarial texture.
@@ -165,11 +165,11 @@ class SceneJobs:
         an adversarial scene would have to be wrong in.
 
         Args:
-            control: that is searched.
-            number: of the scene.
+            control: control that is searched.
+            number: number of the scene.
             steps_factor: multiple of the usual steps; more than one is the stronger
                 search.
-            weights: of the model, safetensors; None for the original ones.
+            weights: weights of the model, safetensors; None for the original ones.
         """
         name, scene = self.splits[HELD_OUT].load_scene(
             number, workbench.collect_scene_parameters(self.config)
@@ -286,9 +286,9 @@ class SceneJobs:
 
         Args:
             split: the split.
-            number: of the scene.
-            controls: that are searched.
-            varying_controls: that vary at random.
+            number: number of the scene.
+            controls: controls that are searched.
+            varying_controls: varying controls that vary at random.
 
         Raises:
             InputError: its object is held out.
@@ -319,9 +319,9 @@ class SceneJobs:
         """Return the settings of an attack.
 
         Args:
-            controls: that are searched.
-            name: of the object.
-            changes: to the settings.
+            controls: controls that are searched.
+            name: name of the object.
+            changes: changes to the settings.
         """
         searched = {control: self.config.controls[control] for control in controls}
         # A setting of the run that some of these controls take has their values; it is
@@ -405,7 +405,7 @@ class SceneSplit:
     """One part of the split, which has scenes by number.
 
     Attributes:
-        name: of the part.
+        name: name of the part.
         objects: names of bundled objects, or files.
         environments: names or files.
         seed: root of the samples.
@@ -427,7 +427,7 @@ class SceneSplit:
         file: ``coffee-mug.glb`` is a "coffee mug".
 
         Args:
-            number: of the scene, from 0.
+            number: number of the scene, from 0.
             fixed_settings: parameters with fixed values.
         """
         name = self.objects[number % len(self.objects)]

@@ -147,7 +147,7 @@ class ClassifierTrainer(Trainer):
 
         Args:
             split: name of the split.
-            scene_numbers: of its scenes.
+            scene_numbers: scene numbers of its scenes.
         """
         is_training = split == TRAINING
         n_views = self.n_views[0] if is_training else self.n_views[1]
@@ -335,7 +335,7 @@ class GradientComputer:
         Args:
             batch: the lessons.
             further_batch: further images (N, H, W, 3) and class indices (N,).
-            seed: of the augmentation.
+            seed: seed of the augmentation.
         """
         # Textures come first, so that both passes have the same parts.
         batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
@@ -424,7 +424,7 @@ class GradientComputer:
             part: the lessons, textures first.
             plain_weight: of each plain image.
             worst_weight: of each worst image.
-            seed: of the augmentation and the mixing.
+            seed: seed of the augmentation and the mixing.
         """
         # of each image: first all plain ones, then the worst ones
         lesson_of_image: list[Lesson] = [*part, *select_hard_lessons(part)]
@@ -483,7 +483,8 @@ def _mix_images(
     Args:
         images: (N, H, W, 3), which are changed.
         lesson_of_image: N of them.
-        seed: of the choice whether they are mixed, of the partners and of the weight.
+        seed: seed of the choice whether they are mixed, of the partners and of the
+            weight.
 
     Returns:
         The indices of the images that are mixed, none if it was decided so; the index

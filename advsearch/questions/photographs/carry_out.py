@@ -153,9 +153,9 @@ def _summarize_rendering(
     """Summarise the photographs of one rendering, as one model predicts them.
 
     Args:
-        name: of the rendering.
+        name: name of the rendering.
         model: its name.
-        photos: from `_read_photos`; the last one states what the rendering is.
+        photos: photos from `_read_photos`; the last one states what the rendering is.
     """
     n_photos = len(photos)
     n_agreeing = int(photos["agrees"].sum())
@@ -324,8 +324,8 @@ def _add_prediction(
     """Return a row with a model's prediction on a photograph.
 
     Args:
-        row: with the values of the rendering, if there is one.
-        evaluator: of the model, whose name is added to the values.
+        row: row with the values of the rendering, if there is one.
+        evaluator: evaluator of the model, whose name is added to the values.
         rendering: name of the rendering that the photograph was aligned with, if any.
         cut_photo: the image file.
     """
@@ -359,7 +359,7 @@ class _PhotoEvaluator:
         find_truth: returns the ground truth of a photograph by the name of the
             rendering that it was aligned with and of the object; None for a photograph
             that was aligned with none, and for the only object.
-        index: of the model, among `n_models` of the run.
+        index: index of the model, among `n_models` of the run.
     """
 
     model: Model
@@ -456,11 +456,11 @@ def _find_sweep_truth(
 
     Args:
         sweep: the loaded scenes (`SceneLoader`).
-        model_index: of the model.
+        model_index: model index of the model.
         image_number: number of the image as text; None for a photograph that was
             aligned with none.
-        object_name: of the object; None, or one that the sweep does not have, for its
-            first one, which is the only one then.
+        object_name: object name of the object; None, or one that the sweep does not
+            have, for its first one, which is the only one then.
 
     Raises:
         InputError: the sweep has no such image.

@@ -70,7 +70,7 @@ class PhotographPages:
         Args:
             kind: "rendering" or "photo".
             run: the directory of the run.
-            name: of the image.
+            name: name of the image.
 
         Raises:
             Refused: there is no such image.
@@ -95,9 +95,9 @@ class PhotographPages:
 
         Args:
             run: the directory of the run.
-            name: of the rendering.
-            headers: of the request.
-            key: that this server's own page sends. Other pages send no origin, or
+            name: name of the rendering.
+            headers: headers of the request.
+            key: key that this server's own page sends. Other pages send no origin, or
                 another key.
             read_data: reads the photograph, once the rendering is known to exist.
 

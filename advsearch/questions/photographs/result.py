@@ -193,8 +193,8 @@ def make_align_page(
     Args:
         run: name of the run.
         renderings: names of its renderings, of which the page shows the first.
-        table: of agreement, below.
-        key: that the server expects with a photograph.
+        table: table of agreement, below.
+        key: key that the server expects with a photograph.
         phone_address: address by which another device opens the page; None if none can.
     """
     main = markup.make_element(

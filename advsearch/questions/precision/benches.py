@@ -99,7 +99,7 @@ class MeasuredRounds:
 
         Args:
             setting: the new one.
-            seconds_left: of the budget.
+            seconds_left: seconds left of the budget.
         """
         extra_of_first_calls = list[float]()
         earlier_seconds = 0.0
@@ -320,7 +320,7 @@ class PictureBench:
 
         Args:
             budget: divided evenly among the denoisers that are left.
-            seed: of the renders.
+            seed: seed of the renders.
             on_done: called after each render.
 
         Returns:
@@ -415,9 +415,9 @@ class GradientPart:
     """Coordinates of a control whose gradient one call computes.
 
     Attributes:
-        name: of the control, with the parameters if a control has several parts.
+        name: name of the control, with the parameters if a control has several parts.
         groups: which have the coordinates.
-        estimators: that are valid for all of them.
+        estimators: estimators that are valid for all of them.
     """
 
     name: str
@@ -452,7 +452,7 @@ def list_gradient_parts(
     control has several parts, their names list the parameters.
 
     Args:
-        groups: of all coordinates.
+        groups: groups of all coordinates.
         linear: whether the loss is linear; then differences of the loss ("secant")
             equal those of the picture, and are left out.
     """
@@ -486,7 +486,7 @@ class GradientBench:
 
     Attributes:
         part: the coordinates.
-        reference: of the gradient; None before it is computed.
+        reference: reference of the gradient; None before it is computed.
         settings: all estimators with all of their sample counts.
     """
 

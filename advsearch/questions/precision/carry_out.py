@@ -429,7 +429,8 @@ def recommend_settings(
         confirmations: gradient settings that were measured again.
         goal: the relative error.
         round_up: gives the next sample count that a setting takes.
-        or_steeper: of a point, whether the error may fall faster; see `fit_line`.
+        or_steeper: or steeper of a point, whether the error may fall faster; see
+            `fit_line`.
     """
     candidates: dict[tuple[str, ...], list[Recommended]] = {}
     for (quantity, control, family, _), line in group_by_line(points).items():

@@ -611,10 +611,10 @@ def _draw_line(
     A known error is a filled marker. An open one with an arrow down is an upper limit.
 
     Args:
-        axes: of matplotlib, logarithmic.
+        axes: axes of matplotlib, logarithmic.
         line: the points, by ascending samples.
-        number: of the estimator, which chooses color and marker.
-        label: in the legend.
+        number: number of the estimator, which chooses color and marker.
+        label: label in the legend.
     """
     color = COLORS[number % len(COLORS)]
     marker = MARKERS[number % len(MARKERS)]

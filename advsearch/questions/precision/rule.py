@@ -70,7 +70,7 @@ class SampleSetting:
         estimator: name of the sampler with the denoiser, or of the gradient estimator.
         spp: samples per pixel.
         cost: the expected time in any unit.
-        control: of a gradient, the name of its part; else empty.
+        control: control of a gradient, the name of its part; else empty.
         family: settings are compared and recommended within one: the denoiser.
     """
 
@@ -229,8 +229,8 @@ def _interval_factor(deviation: float, mean_square: float, count: int) -> float:
 
     Args:
         deviation: standard error of the mean square.
-        mean_square: of the errors.
-        count: of errors.
+        mean_square: mean square of the errors.
+        count: count of errors.
     """
     quantile = float(stdtrit(count - 1, (1.0 + CONFIDENCE) / 2.0))
     # 0.5: the logarithm of a root is half as wide; 50: so that exp does not overflow.
@@ -278,7 +278,7 @@ def fit_line(
     excludes theory as well. Otherwise `agrees` is None: not known.
 
     Args:
-        points: of one estimator.
+        points: points of one estimator.
         or_steeper: whether a steeper slope agrees, too. None if theory says nothing;
             then `agrees` is None.
     """
@@ -382,7 +382,7 @@ def recommend_count(
     proportional to the samples beyond the last point.
 
     Args:
-        points: of one estimator.
+        points: points of one estimator.
         goal: the relative error.
         round_up: returns a sample count that the estimator accepts.
         or_steeper: see `fit_line`.
@@ -482,7 +482,7 @@ def confirm_recommendation(
     `MAX_EXTRAPOLATION`.
 
     Args:
-        recommendation: with a goal and a sample count.
+        recommendation: recommendation with a goal and a sample count.
         point: the new measurement of it.
         round_up: returns a sample count that the estimator accepts.
     """
@@ -579,8 +579,8 @@ def _interpolate_value(
     Args:
         ordered: points by ascending samples.
         spp: the sample count.
-        values: of the points, at least 0.
-        slope: of the logarithm of the value against that of the samples.
+        values: values of the points, at least 0.
+        slope: slope of the logarithm of the value against that of the samples.
     """
     log_counts = np.log([float(point.spp) for point in ordered])
     log_values = np.log([max(1e-300, value) for value in values])  # no log of 0

@@ -349,11 +349,11 @@ def _check_column(
     """Check that all parts of a figure have a column.
 
     Args:
-        recipe: with groups, all parts have a column of the group.
-        name: of the column.
-        option: of the figure, which names it.
+        recipe: recipe with groups, all parts have a column of the group.
+        name: name of the column.
+        option: option of the figure, which names it.
         columns_of_part: names of columns of each part of the figure.
-        location: of the figure, for messages.
+        location: location of the figure, for messages.
 
     Raises:
         InputError: if no part has it, or only some have.

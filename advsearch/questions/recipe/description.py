@@ -250,8 +250,8 @@ class PlannedRun:
     """A run of a recipe.
 
     Attributes:
-        name: of its directory.
-        part: of the recipe.
+        name: name of its directory.
+        part: part of the recipe.
         config: its settings.
         around: the directory of the run whose result it samples around; None of others.
     """

@@ -116,8 +116,8 @@ def _draw_stacked_bar(
     A prediction is blue if it is right in at least half of its cases, else red.
 
     Args:
-        axes: of matplotlib.
-        position: of the bar on the vertical axis.
+        axes: axes of matplotlib.
+        position: position of the bar on the vertical axis.
         counts: of each prediction its tally, and how often it is right.
     """
     left = 0.0
@@ -296,7 +296,7 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
 
     Args:
         rows: predictions with object and texture.
-        options: of the figure, which name the columns of both.
+        options: options of the figure, which name the columns of both.
 
     Returns:
         For each pair of object and texture: the number of predictions, those that the
@@ -487,7 +487,7 @@ def _make_panels(
     with `by_margin` the mean margin; None where no mixture lies.
 
     Args:
-        rows: of one mixture each.
+        rows: rows of one mixture each.
         ranking: the predictions with their counts.
         by_margin: whether margins are shown; then there is a single prediction.
         in_triangle: for each triangle, which rows (n,) lie in it.
@@ -560,7 +560,8 @@ def _describe_margins(
 
     Args:
         label: the only prediction that is given.
-        margins: of the mixtures in which each ingredient is the largest, by its name.
+        margins: margins of the mixtures in which each ingredient is the largest, by its
+            name.
 
     Returns:
         Sentences, and the heads and rows of a table.
@@ -588,9 +589,9 @@ def _describe_ingredients(
     """Describe how often each prediction is given, by the main ingredient.
 
     Args:
-        rows: of one mixture each.
+        rows: rows of one mixture each.
         ranking: the predictions with their counts, the most frequent first.
-        names: of the ingredients.
+        names: names of the ingredients.
         main_ingredient: (n,) index of the largest ingredient in each row.
 
     Returns:
@@ -636,12 +637,13 @@ def _draw_panels(
     """Draw a ternary diagram for each prediction, with one or several color bars.
 
     Args:
-        figure: of matplotlib.
+        figure: figure of matplotlib.
         panels: the value of each triangle, by prediction.
         corners: mixtures at the corners of the triangles.
-        names: of the ingredients.
+        names: names of the ingredients.
         by_margin: whether values are margins, not fractions.
-        options: with `normalised`, each diagram has colors and a bar of its own.
+        options: options with `normalised`, each diagram has colors and a bar of its
+            own.
     """
     all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axes, (prediction, values) in zip(all_axes, panels.items(), strict=True):
@@ -726,7 +728,8 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     among all ingredients (Bonferroni).
 
     Args:
-        margins: of the mixtures in which each ingredient is the largest, by its name.
+        margins: margins of the mixtures in which each ingredient is the largest, by its
+            name.
 
     Returns:
         A text with both means, their 95 % intervals and the verdict.

@@ -189,7 +189,7 @@ class ClusteredFraction:
     A unit is what rows share that are not independent, such as a draw of a seed.
 
     Attributes:
-        name: of what the rows are of, for tables and sentences.
+        name: name of what the rows are of, for tables and sentences.
         unit_counts: (n,) rows that are counted in each unit.
         unit_sizes: (n,) rows of each unit.
         n_counted: rows that are counted in all.
@@ -214,8 +214,8 @@ class ClusteredFraction:
         """Count rows by unit.
 
         Args:
-            name: of the tally.
-            rows: with a column "unit".
+            name: name of the tally.
+            rows: rows with a column "unit".
             flags: (n,) whether each is counted; by default those that are correct.
         """
         if flags is None:
@@ -539,7 +539,7 @@ def _describe_cells(
         cells: for each row by its name, a tally for each series.
         series: names of the series.
         is_binned: whether the rows are bins of a number.
-        options: of the figure.
+        options: options of the figure.
     """
     verb = "wrong" if options.wrong else "right"
     if options.form == "map":
@@ -590,7 +590,7 @@ def _describe_series(
         cells: for each row a tally for each series.
         totals: of each series over all rows.
         series: their names.
-        options: of the figure.
+        options: options of the figure.
     """
     if not options.series or len(series) < 2:
         return []
@@ -637,9 +637,9 @@ def _compare_with_baseline(
     A difference is shown if the intervals do not overlap.
 
     Args:
-        name: of the part.
-        tallies: of the part, for each series.
-        totals: of the others, for each series.
+        name: name of the part.
+        tallies: tallies of the part, for each series.
+        totals: totals of the others, for each series.
         series: their names.
         verb: what is counted.
     """
@@ -789,10 +789,10 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
     """Draw the fractions as a matrix of colors with percentages in it.
 
     Args:
-        axes: of matplotlib.
+        axes: axes of matplotlib.
         cells: for each row of the matrix a tally for each series.
         series: names of the columns.
-        label: of the color bar.
+        label: label of the color bar.
     """
     shares = [
         [math.nan if tally.fraction is None else tally.fraction for tally in tallies]
@@ -831,10 +831,10 @@ def _draw_lines(
     """Draw the fractions of each series as a line, with their 95 % intervals as bands.
 
     Args:
-        axes: of matplotlib.
+        axes: axes of matplotlib.
         cells: for each bin a tally for each series.
         series: names for the legend.
-        bin_positions: of the bins along the horizontal axis.
+        bin_positions: bin positions of the bins along the horizontal axis.
     """
     for index, name in enumerate(series):
         positions = list[float]()
@@ -965,7 +965,7 @@ def _add_agreement(
 
     Args:
         bars: tallies by object, or `ALL_OBJECTS`; each gets one more.
-        pairs: of renderings and other images.
+        pairs: pairs of renderings and other images.
         table: which gets a row for each object.
         series_name: what the other images are.
     """
@@ -1007,8 +1007,9 @@ def _count_agreement(name: str, pairs: Rows) -> tuple[ClusteredFraction, list[Ce
     """Count the pairs in which both predictions are right, or both are wrong.
 
     Args:
-        name: of the tally.
-        pairs: with "correct rendered" for the rendering, "correct" for the other image.
+        name: name of the tally.
+        pairs: pairs with "correct rendered" for the rendering, "correct" for the other
+            image.
 
     Returns:
         The tally of these pairs; and the cells of the table's row: pairs by whether the
@@ -1066,7 +1067,7 @@ def _describe_where(right: bool, pairs: Rows) -> str:
 
     Args:
         right: whether the first is right.
-        pairs: of both.
+        pairs: pairs of both.
     """
     verb = "right" if right else "wrong"
     is_selected = pairs["correct rendered"] == right

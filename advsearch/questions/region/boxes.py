@@ -86,8 +86,8 @@ def grow_box(
 
     Args:
         is_same: whether a point has the prediction of the centre.
-        center: in [0, 1] (d,).
-        seed: of the random points.
+        center: center in [0, 1] (d,).
+        seed: seed of the random points.
         samples: of each check.
         on_check: called at the beginning of each check.
 
@@ -192,7 +192,7 @@ class GrowingBox:
 
         Args:
             face: its index: 2 * axis, and 1 more for the upper face.
-            fraction: of the distance to the bound, 0 or 1.
+            fraction: fraction of the distance to the bound, 0 or 1.
 
         Returns:
             Whether it moved.

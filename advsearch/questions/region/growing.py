@@ -41,7 +41,7 @@ class VariedParameters:
     """The parameters in which the box grows.
 
     Attributes:
-        names: of the parameters.
+        names: names of the parameters.
         coordinates: their indices in u (k,).
         centre: the configuration around which the box grows (d,).
     """
@@ -263,8 +263,8 @@ class RegionSearch:
         predicted.
 
         Args:
-            values: of the parameters that vary.
-            number: of the point, which seeds its noise.
+            values: values of the parameters that vary.
+            number: number of the point, which seeds its noise.
         """
         predictor = None if self._is_checking else self._verifier.state.predictor
         u = self._varied.with_values(values)
@@ -322,7 +322,7 @@ def describe_box(
     component of a vector is named ``NAME.INDEX``.
 
     Args:
-        problem: of the scene.
+        problem: problem of the scene.
         grown: the box.
         varied: its parameters.
     """
@@ -371,7 +371,7 @@ def draw_map(
     """Draw the margin over two parameters, its zero line, and the box.
 
     Args:
-        verifier: that evaluates the points.
+        verifier: verifier that evaluates the points.
         size: points along each axis.
         varied: the parameters.
         box: its sides.

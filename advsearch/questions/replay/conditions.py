@@ -251,9 +251,10 @@ def apply_sensor(
     """Return an image (H, W, 3) as a camera's sensor records it.
 
     Args:
-        sensor_values: of the control `sensor`; all other parameters are 0.
+        sensor_values: sensor values of the control `sensor`; all other parameters are
+            0.
         image: sRGB in [0, 1].
-        seed: of the sensor's noise.
+        seed: seed of the sensor's noise.
     """
     control = workbench.CONTROLS["sensor"]()
     control.chosen["seed"] = seed
@@ -293,9 +294,9 @@ def model_condition(
     which are shared by their key (`RUN_LIGHT`); else it has renders of its own.
 
     Args:
-        problem: of the run.
+        problem: problem of the run.
         other_problem: the same with the other model.
-        name: of the other model.
+        name: name of the other model.
         spp: samples per pixel.
     """
     shared_key = name
@@ -481,7 +482,7 @@ class _Table:
 
     Attributes:
         u: the adversarial configuration (d,).
-        trials: of the clean and of the adversarial scene under each condition.
+        trials: trials of the clean and of the adversarial scene under each condition.
         seed: root of the seeds of the trials.
         run: stores the trials.
         progress: reports them.

@@ -287,7 +287,7 @@ class Cycles:
 
         Args:
             values: the scene's inputs; what is missing is as the scene has it.
-            width, height: of the image, pixels.
+            width, height: width and height of the image, pixels.
             has_environment: whether an environment map lights the scene.
         """
         scene = self._description
@@ -296,7 +296,7 @@ class Cycles:
             torch.from_numpy(geometry.camera_to_world(scene, width / height)),
         )
         fov = float(
-            values.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0]
+            values.get("camera.fov", torch.tensor([scene.get_number("camera.fov")]))[0]
         )
         shift_x = float(values.get("camera.shift_x", torch.zeros(1))[0])
         shift_y = float(values.get("camera.shift_y", torch.zeros(1))[0])
@@ -309,8 +309,9 @@ class Cycles:
             "shift": [shift_x * width / longer_side, -shift_y * height / longer_side],
             "lamps": _describe_lamps(scene, values),
             "environment": has_environment,
-            "turn": math.pi / 2.0 - math.radians(scene.number("environment.rotation")),
-            "strength": 2.0 ** scene.number("environment.exposure"),
+            "turn": math.pi / 2.0
+            - math.radians(scene.get_number("environment.rotation")),
+            "strength": 2.0 ** scene.get_number("environment.exposure"),
             # A path of two segments has none: light, surface, camera.
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
@@ -399,7 +400,7 @@ def _make_ground(
         texture = color.linear_to_srgb(base.clamp(0.0, 1.0)).numpy()
         return [assets.Shape("ground", photograph.mesh, texture, MATT)]
 
-    half_size = np.float32(scene.number("ground.size") / 2.0)
+    half_size = np.float32(scene.get_number("ground.size") / 2.0)
     if half_size <= 0.0 or workbench.is_paved(scene):
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
@@ -416,9 +417,9 @@ class _Process:
 
     Args:
         program: the command that starts Blender with a script.
-        blender_settings: for `RENDER_SCRIPT`.
+        blender_settings: blender settings for `RENDER_SCRIPT`.
         meshes: the scene as glTF.
-        radiance: of the environment, linear (H, W, 3); None without.
+        radiance: radiance of the environment, linear (H, W, 3); None without.
 
     Raises:
         BlenderError: Blender can't be started.

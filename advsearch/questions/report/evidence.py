@@ -343,7 +343,7 @@ def _weighted_mean(
 
     Args:
         rows: counts of right predictions by the value of an axis.
-        weights: by value; they need not add up to 1.
+        weights: weights by value; they need not add up to 1.
 
     Returns:
         Mean, lower and upper bound.
@@ -435,7 +435,7 @@ def _fixed_domain(
     """Return what does not vary in a run, by the part of an operational design domain.
 
     Args:
-        result: of the run.
+        result: result of the run.
         recorded: the settings that it recorded, its own first.
     """
     fixed = defaultdict[str, list[str]](list)
@@ -637,7 +637,7 @@ def _describe_subject(
     out.
 
     Args:
-        result: of the run.
+        result: result of the run.
         recorded: the settings that it recorded, its own first.
     """
     values = {field: getattr(result, field) for field in type(result).model_fields}
@@ -678,8 +678,8 @@ def describe_searched(
     its parameters, it varied over its defaults.
 
     Args:
-        result: of the run.
-        settings: of the run.
+        result: result of the run.
+        settings: settings of the run.
     """
     lines = []
     if is_attack(result):
@@ -960,8 +960,8 @@ def _find_twins(
     """Return how far a run's verdict holds for photographs; None if nobody states it.
 
     Args:
-        folder: of the run.
-        result: of the run.
+        folder: folder of the run.
+        result: result of the run.
         twins: a run of twins; None for that which the run named.
     """
     stored: results.TwinEvidence | None = getattr(result, "twins", None)

@@ -39,7 +39,7 @@ class RecordedSettings:
 
     Attributes:
         source: name of the note or the run that has them; empty for the run's own.
-        values: by name, as a file has them.
+        values: values by name, as a file has them.
     """
 
     source: str

@@ -68,7 +68,7 @@ def make_renderer(
         controls: what varies.
         thing: the object, its name, or what makes it.
         environment: a plain one by default.
-        settings: of the scene.
+        settings: settings of the scene.
         plugins: further shapes, as Mitsuba's dictionaries by name.
         denoise: the denoiser.
     """
@@ -192,7 +192,7 @@ def check_scene(
         compare: whether to compare the gradient with differences.
         seeds: minimum and maximum number of seeds of the differences.
         repeats: gradients that are compared.
-        evaluations: of the search.
+        evaluations: evaluations of the search.
         mean: bounds of the image's mean.
         gradient: bounds of the largest absolute entry of the gradient.
         ending: expected status of the search.
@@ -328,11 +328,11 @@ def search_scene(
     increased by 1 / `LOGIT_SCALE`.
 
     Args:
-        renderer: of the scene.
-        loss: of an image.
+        renderer: renderer of the scene.
+        loss: loss of an image.
         start: (d,) configuration.
         spp: samples per pixel.
-        evaluations: with gradients, that the search makes.
+        evaluations: evaluations with gradients, that the search makes.
     """
     loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
     gradient_cost = make_domain(renderer, start).gradient_cost
@@ -408,10 +408,10 @@ def measure_inward_slope(
     that increase the loss this way by `factor` into the range, and leaves all others.
 
     Args:
-        renderer: of the scene.
+        renderer: renderer of the scene.
         gradient: (d,) of the loss at the start.
-        factor: on the direction.
-        seeds: over which differences are averaged.
+        factor: factor on the direction.
+        seeds: seeds over which differences are averaged.
         spp: samples per pixel.
 
     Returns:
@@ -451,10 +451,10 @@ def evaluate(
     gradient = None
     if query.gradient:
         value, gradient = renderer.gradient(
-            loss, query.u, query.number, spp, free=query.gradient == "free"
+            loss, query.u, query.index, spp, free=query.gradient == "free"
         )
     else:
-        value = loss(render_image(renderer, query.u, query.number, spp))
+        value = loss(render_image(renderer, query.u, query.index, spp))
     objective = float(value)
     cost = (renderer.renders - renders_before) * query.samples
     return policies.Evaluation(
@@ -479,13 +479,14 @@ def run_search(
     """Search for an image with a loss above 0.
 
     Args:
-        renderer: of the scene.
-        loss: of the image, which is maximised.
-        steps: of the search.
+        renderer: renderer of the scene.
+        loss: loss of the image, which is maximised.
+        steps: steps of the search.
         spp: samples per pixel.
         start: None for the renderer's.
         policy: None for "pgd".
-        **options: of `attacks.search`; without them no candidate is rendered again.
+        **options: options of `attacks.search`; without them no candidate is rendered
+            again.
     """
     evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
     policy = policy or workbench.make_policy("pgd")

@@ -262,9 +262,9 @@ def material_case(
     """Return arguments of `check_scene` for a material.
 
     Args:
-        parameters: of the material, which vary in [0, 1].
+        parameters: parameters of the material, which vary in [0, 1].
         slow: whether the case is slow.
-        **values: of the material where it starts.
+        **values: values of the material where it starts.
     """
     settings = {f"material.{name}": value for name, value in values.items()}
     return {
@@ -441,7 +441,7 @@ register_cases(
 @register_case("light", "projector-through-glass")
 def project_through_glass() -> Outcome:
     """Light that meets glass on its way leaves picture and gradient finite."""
-    arguments = projector_case(azimuth=describe_mug().number("camera.azimuth"))
+    arguments = projector_case(azimuth=describe_mug().get_number("camera.azimuth"))
     return check_scene(**arguments, plugins=make_glass_ball())  # type: ignore[arg-type]
 
 

@@ -126,8 +126,8 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     """Parse one axis; see `parse_axes`.
 
     Args:
-        name: of the parameter, as the user wrote it.
-        values: of it.
+        name: name of the parameter, as the user wrote it.
+        values: values of it.
         instances: the sampled controls by name.
     """
     where = f"`grid` {name}"
@@ -205,10 +205,10 @@ def _find_parameters(
     """Return the parameters of a control by name.
 
     Args:
-        values: of the axis; a class may declare a parameter by its values.
+        values: values of the axis; a class may declare a parameter by its values.
         instances: the sampled controls by name.
         control: the class of the control.
-        parameter_name: of the axis.
+        parameter_name: parameter name of the axis.
         instance: name of the control; a sampled one adds the parameters that it alone
             has.
     """
@@ -395,7 +395,7 @@ def add_grid_axes(
 
     Args:
         controls: the sampled ones.
-        axes: of the grid.
+        axes: axes of the grid.
         scene: which decides the default ranges of a control.
     """
     control_by_name = {control.name: control for control in controls}
@@ -439,8 +439,8 @@ class SampledNumber:
     """A sampled number, as the table shows it.
 
     Attributes:
-        name: of the parameter, with the index of a component.
-        unit: of the values.
+        name: name of the parameter, with the index of a component.
+        unit: unit of the values.
         column: its index among the draws.
         parts: what equal parts of [0, 1] stand for: bounds [low, high] of a range each,
             or values of a list.
@@ -525,10 +525,10 @@ class Points:
     Args:
         space: the controls, bound to the scene; it starts from the scene as it is.
         domain: the budgets of the controls.
-        axes: of the grid.
+        axes: axes of the grid.
         samples: at each point of the grid.
         sampler: how the draws are made, "sobol" or "random".
-        seed: of the draws.
+        seed: seed of the draws.
         repeat_after_scenes: after so many scenes the draws repeat, so that scenes that
             are compared have the same ones; 0 for never.
         n_scenes: scenes of the sweep.
@@ -648,8 +648,8 @@ class Points:
 
         Args:
             control: bound to the scene.
-            name: of its parameter.
-            coordinates: of the parameter in a configuration.
+            name: name of its parameter.
+            coordinates: coordinates of the parameter in a configuration.
             begin: index of its first number among the draws.
         """
         parameter, spec = _find_spec(control, name)
@@ -684,7 +684,7 @@ class Points:
 
         Args:
             first: number of the first image in the full sweep.
-            count: of neighbouring images of a scene.
+            count: count of neighbouring images of a scene.
 
         Returns:
             (count, k) indices among `parts` of each of `sampled_numbers`.
@@ -708,9 +708,9 @@ class Points:
         have the same draw.
 
         Args:
-            draws: of k numbers.
+            draws: draws of k numbers.
             first: number of the first image in the full sweep.
-            count: of images.
+            count: count of images.
         """
         if self.units.frames is None:
             return draws.points(self.units.find_draw(first), count)
@@ -725,7 +725,7 @@ class Points:
 
         Args:
             first: number of the first image in the scene.
-            count: of images.
+            count: count of images.
         """
         if not self._axes:
             return ()
@@ -737,7 +737,7 @@ class Points:
 
         Args:
             first: number of the first image in the scene.
-            count: of images.
+            count: count of images.
             before: images of the scenes before this one.
         """
         u = np.repeat(self._start[None], count, axis=0)
@@ -883,7 +883,7 @@ class Points:
         Args:
             control: which describes itself as `Control` does.
             coordinates: (n, k) of the control.
-            indices: from `_axis_indices`.
+            indices: indices from `_axis_indices`.
         """
         begin = 0
         for group in control.groups:

@@ -126,11 +126,11 @@ def sweep(
     are the settings of `advsearch sweep`.
 
     Args:
-        scene: from `load_scene`, or what that takes; or several. None takes that of
-            `adversarial_of`.
-        model: from `load_model`, or what that takes; or several, which are shown the
-            same pictures. None takes that of `adversarial_of`, and the reference model
-            without.
+        scene: scene from `load_scene`, or what that takes; or several. None takes that
+            of `adversarial_of`.
+        model: model from `load_model`, or what that takes; or several, which are shown
+            the same pictures. None takes that of `adversarial_of`, and the reference
+            model without.
         task: what judges the models' outputs: a name, a mapping with a `name` and
             options, an instance, or a function (output, truth) that says how wrong it
             is, over 0 where it is wrong (docs/tasks.md).
@@ -462,7 +462,7 @@ def _add_adversarial_arm(
         config: the settings.
         named_scenes: the scenes.
         sampled: controls that are sampled.
-        axes: of the grid.
+        axes: axes of the grid.
 
     Raises:
         InputError: the attack has no adversarial configuration, or what it sets varies.
@@ -550,7 +550,7 @@ def _make_job(
         config: the settings.
         named_scenes: the clean scenes.
         models: names, files or modules.
-        task: of all models.
+        task: task of all models.
         controls: which are sampled.
 
     Raises:
@@ -604,7 +604,7 @@ def _with_camera_units(
 ) -> tuple[Axis, ...]:
     """Return the axes, those of cameras in metres if all objects have a size."""
     are_sized = all(
-        named_scene.scene.description.object.metres is not None
+        named_scene.scene.description.object.size_in_metres is not None
         for named_scene in named_scenes
     )
     return tuple(
@@ -737,6 +737,6 @@ def sweep_worker(settings: JsonObject) -> BatchFunction:
     """Return the function by which a worker evaluates queries of a sweep.
 
     Args:
-        settings: of the sweep.
+        settings: settings of the sweep.
     """
     return make_worker_call(SceneLoader(load_job(SweepConfig(**settings))).load_by_name)

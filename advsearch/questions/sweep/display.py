@@ -311,8 +311,8 @@ def _text_sections(
     """Yield the sections of text and tables.
 
     Args:
-        summary: of the sweep.
-        axes: from `_group_axes`.
+        summary: summary of the sweep.
+        axes: axes from `_group_axes`.
     """
     if summary.beside is not None and summary.ending != INTERRUPTED:
         for pair in summary.beside.pairs:
@@ -347,7 +347,7 @@ def _arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
 
     Args:
         answer: name of the adversarial run.
-        pair: of the model.
+        pair: pair of the model.
         task: its name.
     """
     arms = (("clean", pair.clean), (answer, pair.answer))
@@ -397,8 +397,8 @@ def _page_parts(
     numbers.
 
     Args:
-        summary: of the sweep.
-        axes: from `_group_axes`.
+        summary: summary of the sweep.
+        axes: axes from `_group_axes`.
     """
     distance = find_detection_distance(summary)
     if distance:
@@ -498,7 +498,7 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     """Return a table of the accuracy by the values of an axis, with bars.
 
     Args:
-        name: of the axis.
+        name: name of the axis.
         rows: its values; of very many, only the worst are listed.
         task: name of the task.
     """
@@ -610,7 +610,7 @@ def _arm_claims(
 
     Args:
         answer: name of the adversarial run.
-        pair: of one model.
+        pair: pair of one model.
         population: what the rates are over.
         note: a caution about the interval.
     """
@@ -637,7 +637,7 @@ def _accuracy_claims(
     """Yield the accuracy of each model.
 
     Args:
-        result: of the sweep.
+        result: result of the sweep.
         population: what the rates are over.
         note: a caution about the interval.
     """
@@ -919,7 +919,7 @@ def _bound_distance(
         distance: (m,) ascending.
         k: (m,) images that are right.
         n: (m,) images.
-        significance: of a one-sided binomial test of one half.
+        significance: significance of a one-sided binomial test of one half.
     """
     from scipy.special import bdtr, bdtrc  # takes a tenth of a second
 
@@ -1029,8 +1029,8 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     images right, nearer than the estimated distance or before a rise to at least half.
 
     Args:
-        estimate: of the detection distance.
-        unit: of distances.
+        estimate: estimate of the detection distance.
+        unit: unit of distances.
 
     Returns:
         One sentence, or nothing.

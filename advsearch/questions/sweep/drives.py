@@ -63,7 +63,7 @@ def add_frames(
     chooses among them and nothing is sampled, then all are swept.
 
     Args:
-        config: with a `path`.
+        config: config with a `path`.
         sampled: the controls that are sampled.
 
     Returns:
@@ -167,7 +167,7 @@ class Drives:
 
     Attributes:
         times: (frames,) of the frames, ascending, in seconds.
-        seconds: from the first frame to the last.
+        seconds: seconds from the first frame to the last.
     """
 
     _units = Units()
@@ -220,7 +220,7 @@ class Drives:
         Boxes, the name of the path and the unit of distances are kept, too.
 
         Args:
-            rows: of the sweep.
+            rows: rows of the sweep.
             instance: name of the control that travels.
             flags: (scenes, ..., models), which is filled; a row's number is its index
                 in the flat array.
@@ -448,7 +448,7 @@ class Drives:
         task.
 
         Args:
-            scenes: of the sweep.
+            scenes: scenes of the sweep.
             run: where they are written.
         """
         drives = self._select_complete([*range(len(self._job.scenes))], 0)
@@ -478,7 +478,7 @@ def _compute_lost_loosely(
     than the `iou` of the task.
 
     Args:
-        task: of the model; a track is on the object from its `iou` on.
+        task: task of the model; a track is on the object from its `iou` on.
         tracker: makes the tracker.
         frames: of each of n drives.
     """

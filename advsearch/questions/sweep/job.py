@@ -89,12 +89,12 @@ class Job:
         models: all of which get the same images.
         tasks: one for each model.
         controls: the sampled ones.
-        axes: of the grid.
+        axes: axes of the grid.
         aovs: layers of ground truth that are stored of every image of the first model
             (`scene.formation.AOVS`).
-        warnings: of loading.
+        warnings: warnings of loading.
         metrics: columns of the rows, by name.
-        tracker: of drives.
+        tracker: tracker of drives.
     """
 
     config: SweepConfig
@@ -170,7 +170,7 @@ class Job:
         its model.
 
         Args:
-            numbers: of the images in the sweep.
+            numbers: numbers of the images in the sweep.
 
         Returns:
             The queries by ascending number, each as (name of the problem, None, query).
@@ -193,7 +193,7 @@ class Job:
                     for model, model_size in enumerate(self.image_sizes)
                     if model_size == size
                 ]
-        queries.sort(key=lambda query: query.number)
+        queries.sort(key=lambda query: query.index)
         return [(str(scene), None, query) for query in queries]
 
     def _make_query(
@@ -207,11 +207,11 @@ class Job:
         """Return the query of a model about an image.
 
         Args:
-            number: of the image in the sweep.
+            number: number of the image in the sweep.
             model: its index.
-            points: of the scene.
+            points: points of the scene.
             u: (d,) the configuration.
-            values: of the controls.
+            values: values of the controls.
         """
         scene = number // self.images_per_scene
         environment = points.space.find_environment(values)
@@ -219,7 +219,7 @@ class Job:
             u.clone(),
             seed=self.seeds(points.noise_number(number)),
             kind=KIND,
-            number=number * len(self.models) + model,
+            index=number * len(self.models) + model,
             spp=self.spp,
             draws_conditions=False,
             values=self._row_values(scene, model, environment, values),
@@ -242,7 +242,7 @@ class Job:
             scene: its index.
             model: its index.
             environment: what lights the scene instead of its own environment.
-            values: of the controls.
+            values: values of the controls.
         """
         named_scene = self.scenes[scene]
         fixed_names = {control.name for control in named_scene.fixed_controls}
@@ -521,7 +521,7 @@ class SweptScene:
         and how many values were not finite.
 
         Args:
-            queries: of this scene.
+            queries: queries of this scene.
             prepared: not used, since sweeps prepare nothing.
         """
         begin = time.perf_counter()
@@ -560,19 +560,19 @@ class SweptScene:
         size share an image; its cost counts for the first of them.
 
         Args:
-            queries: of this scene.
-            images: by size, then by the number of the image.
-            judgements: by the number of the query.
+            queries: queries of this scene.
+            images: images by size, then by the number of the image.
+            judgements: judgements by the number of the query.
             seconds: that each query took.
             wrong_images: numbers of the images in which any model is wrong.
         """
         evaluations = list[Evaluation]()
         for query in queries:
-            number, model = divmod(query.number, len(self.job.models))
+            number, model = divmod(query.index, len(self.job.models))
             image = images[self.job.image_sizes[model]][number]
             cost = image.n_traced if self.job.is_first_of_size[model] else 0
             evaluation = Evaluation.from_judgement(
-                judgements[query.number],
+                judgements[query.index],
                 cost=cost,
                 predicted=image.prediction_spp,
                 seconds=seconds,
@@ -594,8 +594,8 @@ class SweptScene:
         its model.
 
         Args:
-            queries: of all models.
-            images: by size, then by the number of the image.
+            queries: queries of all models.
+            images: images by size, then by the number of the image.
         """
         job = self.job
         n_models = len(job.models)
@@ -603,15 +603,12 @@ class SweptScene:
         for model, problem in enumerate(self.problems):
             size = job.image_sizes[model]
             model_queries = [
-                query for query in queries if query.number % n_models == model
+                query for query in queries if query.index % n_models == model
             ]
             if not model_queries:
                 continue
             batch = torch.stack(
-                [
-                    images[size][query.number // n_models].image
-                    for query in model_queries
-                ]
+                [images[size][query.index // n_models].image for query in model_queries]
             )
             judgements = problem.judge_images(
                 batch,
@@ -622,7 +619,7 @@ class SweptScene:
                 problem, size, model_queries, batch, judgements
             )
             for query, judgement in zip(model_queries, judgements, strict=True):
-                judgement_of_query[query.number] = judgement
+                judgement_of_query[query.index] = judgement
         return judgement_of_query
 
     def _attach_images(
@@ -633,7 +630,7 @@ class SweptScene:
         Args:
             evaluation: without them.
             query: what is evaluated.
-            image: of the query.
+            image: image of the query.
             is_wrong: whether the prediction of any model is wrong.
         """
         job = self.job
@@ -665,11 +662,11 @@ class SweptScene:
         change.
 
         Args:
-            problem: of the model.
+            problem: problem of the model.
             size: (height, width) of its images.
             queries: n of them.
             images: (n, H, W, 3).
-            judgements: of the unchanged images.
+            judgements: judgements of the unchanged images.
         """
         judgements = list(judgements)
         configurations = [query.u for query in queries]
@@ -737,9 +734,9 @@ class SweptScene:
         images_before = self.number * self.points[size].count
         # The predictor numbers the images of this scene from 0.
         query_of_image = {
-            query.number // n_models - images_before: query
+            query.index // n_models - images_before: query
             for query in queries
-            if self.job.image_sizes[query.number % n_models] == size
+            if self.job.image_sizes[query.index % n_models] == size
         }
         with torch.no_grad():
             images = self.predictors[size].make_images(query_of_image)
@@ -818,11 +815,11 @@ def verify_worst(
     the ladder has one step only. Renders that the run has stored are not made again.
 
     Args:
-        problem: of its scene and model.
-        config: of the sweep.
+        problem: problem of its scene and model.
+        config: config of the sweep.
         u: (d,) the configuration.
         run: None stores nothing.
-        stages: of the sweep.
+        stages: stages of the sweep.
 
     Returns:
         The rate of wrong predictions; None without trials.

@@ -247,16 +247,16 @@ class Sweep:
             self._add_costs(self.journal.store(evaluated, id_is_number=True))
             # Models of one size share an image, which counts for the first of them.
             self._n_rendered += sum(
-                self.job.is_first_of_size[query.number % self.n_models]
+                self.job.is_first_of_size[query.index % self.n_models]
                 for query in queries
             )
-            scene = self._scene_of(queries[0].number)
+            scene = self._scene_of(queries[0].index)
             # What concerns a batch stands in its last evaluation.
             self._transport[done.worker, scene] = evaluations[-1].light or []
             if any(evaluation.non_finite for evaluation in evaluations):
                 self._note_non_finite()
             for query, evaluation in evaluated:
-                predictions.add(query.number, evaluation.required_judgement)
+                predictions.add(query.index, evaluation.required_judgement)
             self._report(len(queries), predictions)
         self.journal.rows.sort(key=lambda row: row.step)
 
@@ -292,7 +292,7 @@ class Sweep:
         if self.run is None:
             return
         for query, evaluation in evaluated:
-            number = query.number // self.n_models
+            number = query.index // self.n_models
             if evaluation.jpeg is not None:
                 thumbnails.write_thumbnail(self.run.path, number, evaluation.jpeg)
             if evaluation.layers is not None:
@@ -335,7 +335,7 @@ class Sweep:
                     yield [
                         (problem_name, u, query)
                         for problem_name, u, query in items
-                        if query.number in rows
+                        if query.index in rows
                     ]
                 # the first image of the next scene
                 image = scene_begin + self.images_per_scene
@@ -526,7 +526,7 @@ class Sweep:
 
         Args:
             worst: as the sweep had it.
-            problem: of its scene and model.
+            problem: problem of its scene and model.
             u: (d,) the configuration.
         """
         verified = verify_worst(problem, self.job.config, u, self.run, self.stages)
@@ -808,7 +808,7 @@ def _make_axis_rows(
     """Return the rows of the tables of all axes.
 
     Args:
-        axes: of the tables.
+        axes: axes of the tables.
         right: (n,) whether each prediction is right.
         units: (n,) the unit of each.
         outcome: (n,) indices among `result.OUTCOMES`.

@@ -65,7 +65,7 @@ class SweepSource:
     """Where the page of a sweep gets its rows and images.
 
     Attributes:
-        name: of the run.
+        name: name of the run.
         rows: as columns, for a page that needs no other file, or the address they are
             fetched from; None if they are too many for such a page, which then has the
             tables only.
@@ -92,7 +92,7 @@ def write_sweep_page(run: Path, summary: SweepSummary) -> Path:
 
     Args:
         run: the run directory.
-        summary: of the sweep.
+        summary: summary of the sweep.
 
     Returns:
         The page's path.
@@ -114,7 +114,7 @@ def make_page(
 
     Args:
         run: the run directory.
-        summary: of the sweep.
+        summary: summary of the sweep.
         columns: its rows; None reads them. The page has them unless they are too many.
     """
     columns = read_columns(run) if columns is None else columns
@@ -334,7 +334,7 @@ def _still_html(path: Path, summary: SweepSummary) -> Html:
 
     Args:
         path: the run directory.
-        summary: of the sweep.
+        summary: summary of the sweep.
     """
     measure = "Accuracy"
     if summary.cells and max(map(max, summary.cells.configurations)) <= 1:
@@ -446,8 +446,8 @@ def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
 
     Args:
         run: the run directory.
-        index: of the sweep in the bundle.
-        folder: of the bundle.
+        index: index of the sweep in the bundle.
+        folder: folder of the bundle.
     """
     # A page that was opened by a double click may load images from files, but no rows.
     columns = read_columns(run)

@@ -70,7 +70,7 @@ class Groups:
     """How the images of a scene fall into groups that one predictor serves.
 
     Args:
-        grid: of the sweep.
+        grid: grid of the sweep.
         samples: at each point of the grid.
         within: whether images of a group may differ along each axis of the grid.
         is_sampled: whether they may differ in what is sampled. If not, they differ
@@ -143,8 +143,8 @@ class Groups:
         the member has what its index in the group says.
 
         Args:
-            number: of the image.
-            index: of the member in the group, in [0, group_size).
+            number: number of the image.
+            index: index of the member in the group, in [0, group_size).
         """
         member_digits = list(self._all_axes.digits(number))
         within_axes = [
@@ -219,7 +219,7 @@ class BasisPictures:
 
         Args:
             u: (d,) configuration of one of them.
-            seed: of its light paths.
+            seed: seed of its light paths.
         """
         return BasisRenderer(self._renderer, u, seed, changing=self._lighting)
 
@@ -242,7 +242,7 @@ def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> 
     samples per pixel; each image that is predicted saves `spp - PREDICTION_SPP`.
 
     Args:
-        renderer: of the images.
+        renderer: renderer of the images.
         spp: samples per pixel of the images.
         arrangements: arrangements that are found for each light.
     """
@@ -384,17 +384,17 @@ class SweepPredictor:
     """Makes the images of one scene at one size, by prediction where that pays.
 
     Attributes:
-        problem: of a model that gets these images.
+        problem: problem of a model that gets these images.
         points: the configurations of the scene.
-        axes: of the grid.
-        seed: of the predictors.
+        axes: axes of the grid.
+        seed: seed of the predictors.
         specialise: whether anything is predicted.
         images_before: images of the scenes before this one.
-        deviations: of the predictors that were compared with traced images.
-        seconds: that making and comparing them took.
+        deviations: deviations of the predictors that were compared with traced images.
+        seconds: seconds that making and comparing them took.
         rendered_groups: indices of the groups whose images are rendered because
             predictions deviated too much.
-        renderer: of the problem.
+        renderer: renderer of the problem.
         method: how images are predicted, or would be.
         refusal: why all images are rendered; None if they are predicted.
     """
@@ -410,7 +410,8 @@ class SweepPredictor:
     rendered_groups: set[int] = field(default_factory=set)
     # images that were traced for each group, by its index
     _traced: dict[int, int] = field(default_factory=dict)
-    # of the groups that are cached, by index; None where images are rendered
+    # Predictors of the groups that are cached, by index; None where images are
+    # rendered.
     _predictors: dict[int, Predictor | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -513,7 +514,7 @@ class SweepPredictor:
 
         Args:
             group: its index.
-            number: of an image of the group, in the scene.
+            number: number of an image of the group, in the scene.
         """
         if group in self._predictors:
             return self._predictors[group]
@@ -538,7 +539,7 @@ class SweepPredictor:
 
         Args:
             predictor: of the group.
-            number: of an image of the group, in the scene.
+            number: number of an image of the group, in the scene.
             seed: selects the images that are compared.
         """
 
@@ -646,9 +647,9 @@ def prepare_surface_light(
     rendered where cameras move.
 
     Args:
-        verifier: of the trials, whose sample count is known.
+        verifier: verifier of the trials, whose sample count is known.
         at: the configuration (d,).
-        coordinates: of the numbers that vary (k,).
+        coordinates: coordinates of the numbers that vary (k,).
         n_images: trials, about.
     """
     problem = verifier.problem

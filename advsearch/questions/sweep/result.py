@@ -273,8 +273,8 @@ class TableAxis:
     """Something that a table is by.
 
     Attributes:
-        name: of the axis.
-        unit: of its values.
+        name: name of the axis.
+        unit: unit of its values.
         values: or the bounds of parts of a range.
         value_index: (n,) the index of each row among these.
         kind: outside of the scene (object, environment, model), of the grid, or a
@@ -427,7 +427,7 @@ class SweepResult:
         the matplotlib axes.
 
         Args:
-            axes: to draw on; None makes new ones.
+            axes: axes to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
         draw_sweep_on(self.summary, axes)
@@ -458,7 +458,7 @@ def import_threedb(
     """Import a folder that 3DB wrote into a run directory, and return that.
 
     Args:
-        folder: of 3DB.
+        folder: folder of 3DB.
         run: by default ``runs/NAME-3db-NNN``.
         overwrite: whether another run may be there.
 
@@ -490,9 +490,9 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     """Return the summary of a sweep that 3DB made.
 
     Args:
-        rows: of the sweep.
+        rows: rows of the sweep.
         run: the run directory.
-        folder: of 3DB.
+        folder: folder of 3DB.
     """
     right = np.asarray(rows["correct"] == 1)
     tables = list[AxisRow]()

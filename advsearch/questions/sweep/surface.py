@@ -122,7 +122,7 @@ def compare_parts(
     likelihood ratio over permutations (Westfall and Young 1993).
 
     Args:
-        counts: of all parts.
+        counts: counts of all parts.
         part_slice: the parts that are compared.
         min_images: images of either kind that a comparison takes.
 
@@ -162,7 +162,7 @@ def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
     NaN.
 
     Args:
-        counts: of all parts.
+        counts: counts of all parts.
         parts: (m,) indices of those that are compared.
     """
     n = counts.visible_counts[parts]
@@ -186,7 +186,7 @@ def _permutation_p_value(
     reaches that of the part; the data themselves count as one more permutation.
 
     Args:
-        counts: with the permuted failures of all parts.
+        counts: counts with the permuted failures of all parts.
         k: (m,) failures among the images that show each compared part.
         n: (m,) these images.
         parts: (m,) indices of the compared parts.
@@ -327,9 +327,9 @@ class SurfaceCounts:
         Args:
             object_name: its name.
             model: its name.
-            counts: of the model.
-            kind: of the parts, a key of `SurfaceParts.kinds`.
-            compared: from `compare_parts`.
+            counts: counts of the model.
+            kind: kind of the parts, a key of `SurfaceParts.kinds`.
+            compared: compared from `compare_parts`.
         """
         strongest = list[SurfacePart]()
         for has_sign in (compared.difference > 0.0, compared.difference < 0.0):
@@ -377,8 +377,8 @@ class SurfaceCounts:
 
         Args:
             part: its index.
-            counts: of a model.
-            compared: from `compare_parts`.
+            counts: counts of a model.
+            compared: compared from `compare_parts`.
         """
         n_visible = int(counts.visible_counts[part])
         n_visible_wrong = int(counts.wrong_counts[part])
@@ -406,7 +406,7 @@ def map_surface(
     Writes the counts and their figure into the run directory.
 
     Args:
-        scenes: of the sweep.
+        scenes: scenes of the sweep.
         rows: all of its rows.
         run: where the files are written.
         progress: advances by the number of predictions.
@@ -447,9 +447,9 @@ def _make_counts(
     """Create the counts of each object, before any image is added.
 
     Args:
-        scenes: of the sweep.
+        scenes: scenes of the sweep.
         assets: the objects by name.
-        wrong: from `_read_wrong`.
+        wrong: wrong from `_read_wrong`.
     """
     job = scenes.job
     draws = _draw_of_images(scenes, wrong, job)
@@ -488,10 +488,10 @@ def _make_part_counts(
     """Create the counts of one object and one model, before any image is added.
 
     Args:
-        parts: of the object.
+        parts: parts of the object.
         wrong: (scenes, images) 1, 0 or UNKNOWN.
         draws: (scenes, images) the draw of each image.
-        seed: of the permutations.
+        seed: seed of the permutations.
     """
     permuted = permute_draws(wrong.ravel(), draws.ravel(), seed)
     n_known = int((wrong >= 0).sum())
@@ -512,10 +512,10 @@ def _count_scene(
     image size share them.
 
     Args:
-        scenes: of the sweep.
+        scenes: scenes of the sweep.
         scene: the index of the scene.
         wrong: (images, models) of the scene, from `_read_wrong`.
-        counts: of the scene's object.
+        counts: counts of the scene's object.
         progress: advances by the number of predictions.
     """
     job = scenes.job
@@ -555,7 +555,7 @@ def permute_draws(
         wrong: (n,) whether each prediction is wrong, or UNKNOWN; every draw has as many
             images.
         draws: (n,) the draw of each image.
-        seed: of the permutations.
+        seed: seed of the permutations.
 
     Returns:
         Whether the permuted predictions are wrong, without unknown ones, packed as
@@ -587,7 +587,7 @@ def _write_map(
     """Compare the counts of all objects, and write them with their figure.
 
     Args:
-        counts: by the name of the object.
+        counts: counts by the name of the object.
         assets: the objects by name.
         models: their names.
         run: where the files are written.
@@ -622,8 +622,8 @@ def _make_tables(
 
     Args:
         models: their names.
-        object_counts: of the object.
-        comparisons: from `_compare_kinds`, for each model.
+        object_counts: object counts of the object.
+        comparisons: comparisons from `_compare_kinds`, for each model.
         object_name: its name.
     """
     tables = list[SurfaceTable]()
@@ -665,8 +665,8 @@ def _make_panels(
 
     Args:
         asset: the object.
-        counts: of it.
-        comparisons: from `_compare_kinds`, for each model.
+        counts: counts of it.
+        comparisons: comparisons from `_compare_kinds`, for each model.
         object_name: its name.
         models: their names.
     """
@@ -696,8 +696,9 @@ def _stored_arrays(
     """Return the arrays that the file holds of an object, by their names.
 
     Args:
-        counts: of the object.
-        comparisons: from `compare_parts`, by the kind of part, for each model.
+        counts: counts of the object.
+        comparisons: comparisons from `compare_parts`, by the kind of part, for each
+            model.
 
     Returns:
         Arrays whose first axis is the models, (models,) or (models, parts); "map" has
@@ -729,9 +730,9 @@ def _grey_colors(
     light grey.
 
     Args:
-        parts: of the object.
-        counts: of one model.
-        cells: from `compare_parts`, of the cells.
+        parts: parts of the object.
+        counts: counts of one model.
+        cells: cells from `compare_parts`, of the cells.
     """
     was_visible = counts.visible_counts[parts.part_slices["cell"]] > 0
     has_surface = parts.is_covered.ravel() | was_visible
@@ -783,7 +784,7 @@ class Panel(NamedTuple):
         grey_colors: (cells, 3) of cells without a significant difference.
         difference: (cells,) by how much predictions are wrong more often where the
             cell is visible; NaN where that is not significant.
-        views: of the object.
+        views: views of the object.
     """
 
     title: str
@@ -817,8 +818,8 @@ def _draw(panels: Sequence[Panel], figure: Any) -> None:
     """Draw a row per panel, at one scale: the map, and the object from some sides.
 
     Args:
-        panels: from the first row on.
-        figure: of matplotlib.
+        panels: panels from the first row on.
+        figure: figure of matplotlib.
     """
     import matplotlib as mpl  # takes long to import
 
@@ -866,7 +867,7 @@ def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) 
     """Draw the views of an object, in rows, in the colors of its map.
 
     Args:
-        axes: of matplotlib.
+        axes: axes of matplotlib.
         views: each with the cell of the map, or -1, and the shade of every pixel.
         cell_colors: (cells, 3) color of each cell.
     """

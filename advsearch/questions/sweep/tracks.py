@@ -177,9 +177,9 @@ def read_frame(payload: Any, names: Collection[str]) -> DetectedFrame:
     """Return the boxes that a row of a detector stores.
 
     Args:
-        payload: of the row: "found" has the detected boxes with labels and scores,
-            "box" the true one, None if the object is not visible.
-        names: of the classes whose boxes count.
+        payload: payload of the row: "found" has the detected boxes with labels and
+            scores, "box" the true one, None if the object is not visible.
+        names: names of the classes whose boxes count.
     """
     found = [box for box in payload["found"] if box["label"] in names]
     boxes = np.array([box["box"] for box in found], dtype=float).reshape(-1, 4)
@@ -201,7 +201,7 @@ def track_drive(
     follows it from then on: its identity has switched.
 
     Args:
-        frames: of the drive, in their order.
+        frames: frames of the drive, in their order.
         tracker: makes the tracker.
         iou: intersection over union with the true box from which on a track is on the
             object.

@@ -72,7 +72,7 @@ def try_suite(
     unless the model fails on it.
 
     Args:
-        context: of the experiment; its settings name the suite.
+        context: context of the experiment; its settings name the suite.
         suite: instead of the one that the settings name.
 
     Raises:

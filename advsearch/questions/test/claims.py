@@ -81,7 +81,7 @@ class _PictureSample:
         wrong_payloads: what the task recorded of wrong predictions.
         n_hidden: pictures without the object in view, which do not count.
         verdict: what they decide.
-        worst: of the worst wrong picture: how bad it is, its query, and its text.
+        worst: worst of the worst wrong picture: how bad it is, its query, and its text.
     """
 
     scores: list[float] = field(default_factory=list)
@@ -307,10 +307,10 @@ class ClaimTester:
         other model, or the same one on changed pictures.
 
         Args:
-            name: of the claim.
+            name: name of the claim.
             claim: the claim.
             config: settings of its pictures.
-            problem: of the model under test.
+            problem: problem of the model under test.
         """
         worker_config = AttackConfig.from_config(
             config, workers=self.config.workers, cluster=self.config.cluster
@@ -393,7 +393,7 @@ class ClaimTester:
                 [replace(query, with_image=change is not None) for query in queries]
             )
             for query, evaluation in zip(queries, evaluations, strict=True):
-                pictures[query.number] = evaluation.picture
+                pictures[query.index] = evaluation.picture
                 yield evaluation
 
         def evaluate_other(
@@ -408,7 +408,7 @@ class ClaimTester:
             other = other_journal.evaluator.problem
             for query in queries:
                 # an evaluation that was read back has no picture
-                picture = pictures.get(query.number)
+                picture = pictures.get(query.index)
                 if picture is None:
                     picture = problem.picture(query.u, query.seed, query.spp)
                 changed_picture = change(query, picture)
@@ -496,7 +496,7 @@ class ClaimTester:
         Args:
             pending: the result without a verdict.
             example: the counterexample.
-            problem: of the model under test.
+            problem: problem of the model under test.
             over: whether conditions vary; then each trial has one of the clean scene
                 under the same conditions, and does not count if the model is wrong
                 there.
@@ -547,7 +547,7 @@ class ClaimTester:
 
         Args:
             journal: which evaluates and stores them.
-            kind: of their seeds and stored rows.
+            kind: kind of their seeds and stored rows.
             u: (d,) the configuration.
             spp: samples per pixel.
             over: whether the clean scene is evaluated as well, under the same
@@ -763,7 +763,7 @@ def _describe_sample(
     Args:
         claim: what is claimed.
         sample: the pictures.
-        interval: of the mean of their scores.
+        interval: interval of the mean of their scores.
         example: the worst example against the claim.
         task: name of the task.
     """
@@ -817,9 +817,9 @@ def _trials_result(
 
     Args:
         outcomes: whether the model is right in each; None does not count.
-        label: of the first wrong prediction; empty without one.
+        label: label of the first wrong prediction; empty without one.
         wrong_payloads: payloads of the wrong predictions.
-        problem: of the model.
+        problem: problem of the model.
         over: whether conditions vary.
     """
     n_right = outcomes.count(True)

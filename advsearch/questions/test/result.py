@@ -300,7 +300,7 @@ def evaluate_search(
     time ended the search; else it is held.
 
     Args:
-        summary: of the search.
+        summary: summary of the search.
         config: its settings, with the steps that were planned.
     """
     verified = summary.verified
@@ -373,7 +373,7 @@ def describe_trials(
         counts: trials in which the model is right, in which it is wrong, and which do
             not count.
         label: the first wrong prediction.
-        interval: of the fraction of right trials; None if no trial counts.
+        interval: interval of the fraction of right trials; None if no trial counts.
         over: whether conditions vary.
         outcomes: the outcomes of a detector in the wrong trials, or empty.
     """

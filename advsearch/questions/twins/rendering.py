@@ -192,7 +192,7 @@ class LayerRenderer:
             rendered = renderer.render_radiance(inputs, seed, self._spp, True)
             surfaces = renderer.scene.find_surfaces(inputs)
         radiance = rendered[..., :3] * renderer.formation.gain
-        sight = _make_sight(surfaces, self._asset.metres, model_size)
+        sight = _make_sight(surfaces, self._asset.size_in_metres, model_size)
         return Layer(radiance, rendered[..., 3], sight)
 
 

@@ -370,7 +370,7 @@ class Notes:
     and its name. Each warning is given once.
 
     Attributes:
-        path: of the file, for errors.
+        path: path of the file, for errors.
         source: what it is called in warnings: its name without the folder.
     """
 

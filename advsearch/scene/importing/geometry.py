@@ -1,6 +1,6 @@
 """Repair of imported geometry: welding, faces without area, winding, normals.
 
-Everything works on a `Soup`: welded points, and attributes of the corners of faces, so
+Everything works on a `TriangleSoup`: welded points, and attributes of the corners of faces, so
 that no step depends on how a file splits its vertices. Vertices are split again, where
 normals or UVs differ, when the mesh is assembled.
 """
@@ -40,7 +40,7 @@ normals to be used.
 
 
 @dataclass(frozen=True, eq=False)
-class Soup:
+class TriangleSoup:
     """Triangles with welded points and per-corner attributes.
 
     P points, F faces; the corner k of face f is entry (f, k).
@@ -48,17 +48,17 @@ class Soup:
 
     points: Float64Array  # (P, 3), the largest extent 1
     faces: IntArray  # (F, 3) points
-    part: IntArray  # (F,) the part of the file that the face belongs to
+    part_ids: IntArray  # (F,) the part of the file that the face belongs to
     normals: Float64Array  # (F, 3, 3) unit normals of the corners; NaN if unknown
     uvs: Float64Array  # (F, 3, 2); NaN if unknown
     # (F, 3, 3) linear factors of the base color; 1 if the file has none.
     colors: Float64Array
     # (F,) whether a face is shaded flat if it has no normals; None: none is.
-    flat: BoolArray | None = None
+    is_flat: BoolArray | None = None
     # (F, 3) for each corner its vertex in the concatenated parts; None if unknown.
-    stored: IntArray | None = None
+    stored_vertices: IntArray | None = None
 
-    def select_faces(self, mask: BoolArray) -> Soup:
+    def select_faces(self, mask: BoolArray) -> TriangleSoup:
         """Return the soup with the faces selected by a mask (F,)."""
         selected = {
             name: values[mask]
@@ -67,7 +67,7 @@ class Soup:
         }
         return replace(self, **selected)
 
-    def flip_faces(self, mask: BoolArray) -> Soup:
+    def flip_faces(self, mask: BoolArray) -> TriangleSoup:
         """Return the soup with the faces of a mask (F,) wound the other way.
 
         Normals stay as they are.
@@ -75,7 +75,7 @@ class Soup:
         order = np.where(mask[:, None], [0, 2, 1], [0, 1, 2])
         rows = np.arange(len(order))[:, None]
         names = ["faces", "normals", "uvs", "colors"]
-        if self.stored is not None:
+        if self.stored_vertices is not None:
             names.append("stored")
         return replace(
             self, **{name: getattr(self, name)[rows, order] for name in names}
@@ -99,7 +99,9 @@ def compute_rotation(up: str, front: str) -> Float64Array:
     return np.stack([front_axis, side_axis, up_axis]) + 0.0
 
 
-def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -> Soup:
+def join_parts(
+    parts: Sequence[ImportedPart], source: str, turn: Float64Array
+) -> TriangleSoup:
     """Join parts into one soup of unit extent with welded points.
 
     A vertex v becomes turn (v - low) / extent, with low the lowest corner of the
@@ -144,17 +146,17 @@ def join_parts(parts: Sequence[ImportedPart], source: str, turn: Float64Array) -
         for part in parts
     ]
     has_movable = any(part.movable is not None for part in parts)
-    return Soup(
+    return TriangleSoup(
         points=points,
         faces=point_of_vertex[faces],
-        part=np.arange(len(parts)).repeat(n_faces),
+        part_ids=np.arange(len(parts)).repeat(n_faces),
         normals=normalize_vectors(normals) @ turn.T,
         uvs=np.concatenate(
             [_gather_at_corners(part.uvs, part.faces, 2) for part in parts]
         ),
         colors=np.concatenate(colors),
-        flat=np.array([part.flat for part in parts]).repeat(n_faces),
-        stored=faces if has_movable else None,
+        is_flat=np.array([part.flat for part in parts]).repeat(n_faces),
+        stored_vertices=faces if has_movable else None,
     )
 
 
@@ -207,7 +209,7 @@ def compute_extent(parts: Sequence[ImportedPart]) -> float:
     return float((upper / 2 - lower / 2).max()) * 2
 
 
-def repair(soup: Soup, source: str, notes: Notes) -> Soup:
+def repair(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
     """Repair a soup that `join_parts` returned.
 
     Faces without area are removed, the winding becomes consistent and outward, and
@@ -230,7 +232,7 @@ def repair(soup: Soup, source: str, notes: Notes) -> Soup:
     return _fix_normals(_fix_winding(soup, notes), notes)
 
 
-def assemble(soup: Soup) -> tuple[Mesh, IntArray | None]:
+def assemble(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     """Return the soup as a mesh, and the stored vertex of each of its vertices.
 
     Corners with the same point, normal and UV, and the same stored vertex if that is
@@ -241,8 +243,8 @@ def assemble(soup: Soup) -> tuple[Mesh, IntArray | None]:
     uvs = (soup.uvs.astype(np.float32) + np.float32(0.0)).reshape(-1, 2)
     corners = soup.faces.reshape(-1)
     keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
-    if soup.stored is not None:
-        keys = np.column_stack([keys, soup.stored.reshape(-1)])
+    if soup.stored_vertices is not None:
+        keys = np.column_stack([keys, soup.stored_vertices.reshape(-1)])
     _, first_corner, vertex_of_corner = np.unique(
         keys, axis=0, return_index=True, return_inverse=True
     )
@@ -252,15 +254,15 @@ def assemble(soup: Soup) -> tuple[Mesh, IntArray | None]:
         normals=normals[first_corner],
         uvs=uvs[first_corner],
     )
-    if soup.stored is None:
+    if soup.stored_vertices is None:
         return mesh, None
-    return mesh, soup.stored.reshape(-1)[first_corner]
+    return mesh, soup.stored_vertices.reshape(-1)[first_corner]
 
 
 # ---- Winding ----
 
 
-def _fix_winding(soup: Soup, notes: Notes) -> Soup:
+def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with consistent and outward winding, and note the changes.
 
     Faces wound against their neighbours are turned over first, then shells that are
@@ -333,7 +335,7 @@ def _link_windings(
     return starts, ends
 
 
-def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
+def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     """Decide which faces to turn over so that neighbours agree in winding.
 
     Every face is two nodes of a graph, "as it is" (2 f) and "turned" (2 f + 1).
@@ -366,7 +368,7 @@ def _find_turned_faces(soup: Soup) -> tuple[BoolArray, IntArray, bool]:
 
 
 def _compute_shell_bounds(
-    soup: Soup, shell: IntArray, n_shells: int
+    soup: TriangleSoup, shell: IntArray, n_shells: int
 ) -> tuple[Float64Array, Float64Array]:
     """Return the lower and the upper corner (S, 3) of the box around each shell."""
     corners = soup.points[soup.faces]
@@ -378,7 +380,7 @@ def _compute_shell_bounds(
 
 
 def _find_closed_shells(
-    soup: Soup, shell: IntArray, face_counts: IntArray
+    soup: TriangleSoup, shell: IntArray, face_counts: IntArray
 ) -> BoolArray:
     """Return for each shell (S,) whether all its edges belong to two of its faces.
 
@@ -390,7 +392,7 @@ def _find_closed_shells(
     return np.equal(paired_edges, 3 * face_counts)
 
 
-def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
+def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     """Return for each shell (S,) whether it must be turned over.
 
     A closed shell, all of whose edges belong to exactly two of its faces, is turned if
@@ -435,7 +437,7 @@ def _find_inside_out_shells(soup: Soup, shell: IntArray) -> BoolArray:
 
 
 def _compute_signed_volumes(
-    soup: Soup, shell: IntArray, vectors: Float64Array, face_counts: IntArray
+    soup: TriangleSoup, shell: IntArray, vectors: Float64Array, face_counts: IntArray
 ) -> Float64Array:
     """Return six times the signed volume of each shell, (S,).
 
@@ -462,7 +464,7 @@ def _compute_signed_volumes(
 # ---- Normals ----
 
 
-def _fix_normals(soup: Soup, notes: Notes) -> Soup:
+def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with a normal on the front of its face at every corner.
 
     The file's normals are kept if they are on the front of their faces on most of the
@@ -487,14 +489,14 @@ def _fix_normals(soup: Soup, notes: Notes) -> Soup:
             is_front = np.zeros_like(is_front)
     if not is_front.all():
         computed = compute_smooth_normals(soup)
-        if soup.flat is not None:
+        if soup.is_flat is not None:
             face_normals = normalize_vectors(vectors)[:, None]
-            computed = np.where(soup.flat[:, None, None], face_normals, computed)
+            computed = np.where(soup.is_flat[:, None, None], face_normals, computed)
         normals = np.where((is_known & is_front)[:, :, None], normals, computed)
     return replace(soup, normals=normals)
 
 
-def compute_smooth_normals(soup: Soup) -> Float64Array:
+def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     """Compute unit normals of corners (F, 3, 3), smooth except across creases.
 
     At each point, the faces that can be reached from one another over edges with less
@@ -531,7 +533,7 @@ def _get_next_corner(corner: IntArray) -> IntArray:
     return corner - corner % 3 + (corner + 1) % 3
 
 
-def _compute_corner_angles(soup: Soup) -> Float64Array:
+def _compute_corner_angles(soup: TriangleSoup) -> Float64Array:
     """Return the angle in radians at each corner, (F, 3)."""
     # by arctan2, which is accurate for angles near 0 and 180 degrees too
     corners = soup.points[soup.faces]

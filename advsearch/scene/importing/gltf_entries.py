@@ -180,7 +180,7 @@ class Primitive(Entry):
 class MeshEntry(Entry):
     primitives: List[Primitive]
     name: str | None = None
-    weights: List[float] = []  # of its morph targets, unless a node has weights
+    weights: List[float] = []  # weights of its morph targets, unless a node has weights
     # Exporters write the names of morph targets to `targetNames`.
     extras: Unread = None
 
@@ -215,7 +215,8 @@ class ChannelTarget(Entry):
 
 
 class Channel(Entry):
-    curve: Index = Field(validation_alias="sampler")  # of the samplers of its animation
+    # Curve of the samplers of its animation.
+    curve: Index = Field(validation_alias="sampler")
     target: ChannelTarget
 
 

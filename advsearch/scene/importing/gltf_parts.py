@@ -292,7 +292,7 @@ class GltfSurfaces:
     """Converts the materials of one glTF file to surfaces."""
 
     file: GltfFile
-    notes: Notes  # about the file
+    notes: Notes  # notes about the file
     # Longest side of a texture; None: as `FileImages` limits those of an object.
     texture_limit: int | None = None
 
@@ -606,7 +606,7 @@ class GltfSurfaces:
         as they are, with a note.
 
         Args:
-            images: of one surface, perhaps of different sizes.
+            images: images of one surface, perhaps of different sizes.
             axis: axis of their arrays, 0 for rows.
             bounds: smallest and largest texture coordinate along the axis.
             normals_index: which of the images is a normal map.
@@ -922,7 +922,7 @@ def _pose_parts(
         parts_by_key: the primitives as parts, by the indices of mesh and primitive.
         with_faces: their data.
         skins: the skins of the nodes, by index.
-        skeleton: that of the file, None if nothing in it moves.
+        skeleton: skeleton that of the file, None if nothing in it moves.
     """
     parts = []
     for node, mesh, pose in instances:

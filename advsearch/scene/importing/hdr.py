@@ -413,7 +413,7 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
     """Return the pixels (H, W, 4) of a Radiance picture, row 0 on top.
 
     Args:
-        path: of the picture, for messages.
+        path: path of the picture, for messages.
         body: what follows its header: a line with its size, and scanlines.
 
     Raises:

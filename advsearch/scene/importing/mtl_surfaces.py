@@ -65,7 +65,7 @@ class MtlReader:
 
     Attributes:
         references: finds files beside the mesh file.
-        notes: about the file.
+        notes: notes about the file.
         find_mapped_faces: returns UVs (F, 3, 2) and areas (F,) of the faces with a
             material, by its name and a UDIM square.
         n_libraries: how many material files were read.
@@ -476,7 +476,7 @@ class MtlReader:
             material: the material.
             key: "pr" or "pm".
             use: its map, or None.
-            name: by which the mesh file uses the material.
+            name: name by which the mesh file uses the material.
             square: the UDIM square.
         """
         note_template = (
@@ -756,7 +756,7 @@ class MtlMaterial:
 class MapUse:
     """A statement that names a picture."""
 
-    name: str  # of the picture, as the file has it
+    name: str  # name of the picture, as the file has it
     # its options by their names, in lower case, as (name, value)
     options: dict[str, str]
     # How often the image repeats over a unit of u and of v (``-s``).

@@ -38,7 +38,7 @@ from advsearch.scene.assets import (
 from advsearch.scene.importing import gltf, gltf_parts
 from advsearch.scene.importing.files import Notes, format_name, make_safe_name
 from advsearch.scene.importing.geometry import (
-    Soup,
+    TriangleSoup,
     assemble,
     compute_extent,
     compute_rotation,
@@ -182,7 +182,7 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
 
     Args:
         path: the file.
-        header: that of a glTF file, or of a file that was converted to glTF.
+        header: header that of a glTF file, or of a file that was converted to glTF.
         up: the axis that points up, if the user named it.
     """
     suffix = path.suffix.lower()
@@ -263,7 +263,7 @@ def make_object(
         opacity=opacity,
         normal_map=maps.normals,
         emission=_compute_emitted(maps.emission, opacity),
-        metres=extent if has_unit else None,
+        size_in_metres=extent if has_unit else None,
         extent=extent,
         file_to_mesh=_compute_file_to_mesh(parts, soup, rotation),
     )
@@ -304,7 +304,7 @@ def _find_up(
 
 
 def _compute_mean_material(
-    soup: Soup, surfaces: list[ImportedSurface], notes: Notes
+    soup: TriangleSoup, surfaces: list[ImportedSurface], notes: Notes
 ) -> Material:
     """Return the roughness and metallic of all surfaces, averaged by area.
 
@@ -312,7 +312,7 @@ def _compute_mean_material(
     are the same. Surfaces without faces do not count.
     """
     visible_area = np.bincount(
-        soup.part,
+        soup.part_ids,
         weights=np.linalg.norm(soup.compute_face_vectors(), axis=1),
         minlength=len(surfaces),
     )
@@ -342,7 +342,7 @@ def _limit_warnings(warnings: list[str], file: Path) -> tuple[str, ...]:
 
 
 def _make_mesh(
-    soup: Soup,
+    soup: TriangleSoup,
     surfaces: list[ImportedSurface],
     file: Path,
     parts: list[ImportedPart],
@@ -380,7 +380,7 @@ def _make_mesh(
 
 
 def _compute_file_to_mesh(
-    parts: list[ImportedPart], soup: Soup, turn: Float64Array
+    parts: list[ImportedPart], soup: TriangleSoup, turn: Float64Array
 ) -> Float64Array:
     """Return the map (4, 4) from the file's coordinates to the normalised mesh's.
 

@@ -100,12 +100,12 @@ class ImportedSurface:
     color: Float32Array | None = None
     # (H, W, 3) base colour, or (H, W, 4) with the opacity
     texture: Float32Array | None = None
-    roughness: float | None = None  # in [0, 1]
-    metallic: float | None = None  # in [0, 1]
+    roughness: float | None = None  # roughness in [0, 1]
+    metallic: float | None = None  # metallic in [0, 1]
     normal_map: Float32Array | None = None  # (H, W, 3) of this module
     # (H, W, 3) linear radiance; (1, 1, 3) where it is the same everywhere
     emission: Float32Array | None = None
-    name: str = ""  # of the material in the file; empty where it has none
+    name: str = ""  # name of the material in the file; empty where it has none
 
     @property
     def images(self) -> tuple[Float32Array, ...]:
@@ -162,7 +162,7 @@ def compute_radiance(
     Args:
         factor: (3,) linear; it is cut to `MAX_RADIANCE`, with a note.
         picture: (H, W, 3) display-referred factors, or None.
-        notes: about the file.
+        notes: notes about the file.
     """
     if factor.max() > MAX_RADIANCE:
         notes.warn(f"emission brighter than {MAX_RADIANCE:g} is cut to that")

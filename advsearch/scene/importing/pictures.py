@@ -231,7 +231,7 @@ class FileImages:
 
     materials: int  # how many the file has
     references: References  # finds the files that it names
-    notes: Notes  # about the file: images made smaller, or missing
+    notes: Notes  # notes about the file: images made smaller, or missing
     # Longest side of a texture; None: that of an object with so many materials.
     limit: int | None = None
     # Values, or the reason why there are none, by image and kind.

@@ -77,7 +77,7 @@ class Element:
     """A table of a file: its properties, their types and their values."""
 
     name: str
-    count: int  # of its rows
+    count: int  # count of its rows
     # Types of properties; of a list, that of its values.
     types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
     # Types of the counts of lists.
@@ -185,7 +185,7 @@ def _read_rows(
     walked one by one instead.
 
     Args:
-        notes: about the file.
+        notes: notes about the file.
         element: its values are filled in.
         cells: the bytes of the file's body; of an ASCII file, those of its numbers as
             float64.
@@ -281,10 +281,10 @@ def _store_values(
 
     Args:
         element: its scalars and lists are set.
-        starts: by property, the bytes (rows,) at which it begins in each row.
-        values: by property, the number of its type that begins at each byte.
-        counts: by property that is a list, the count that begins at each byte. A list
-            is its count and then its values.
+        starts: starts by property, the bytes (rows,) at which it begins in each row.
+        values: values by property, the number of its type that begins at each byte.
+        counts: counts by property that is a list, the count that begins at each byte. A
+            list is its count and then its values.
     """
     for name, property_starts in starts.items():
         if name in counts:

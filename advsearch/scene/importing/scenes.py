@@ -81,7 +81,7 @@ class ImportedScene:
 
     object: ObjectAsset  # the requested node, with all its descendants
     surroundings: tuple[ScenePart, ...] = ()  # the other meshes, and lamps
-    cameras: Mapping[str, PosedCamera] = field(default_factory=dict)  # by name
+    cameras: Mapping[str, PosedCamera] = field(default_factory=dict)  # cameras by name
 
 
 def split_node(spec: str) -> tuple[str, str | None]:
@@ -171,12 +171,12 @@ def _make_surrounding_meshes(
 
     Args:
         path: the file, for messages.
-        header: of the file.
+        header: header of the file.
         parts: what its nodes draw.
         object_nodes: the nodes of the object.
-        names: from which the meshes get theirs.
+        names: names from which the meshes get theirs.
         front: the axis of the file that is the front.
-        frame: that of the object.
+        frame: frame that of the object.
         notes: warnings are added to it.
     """
     meshes: list[ScenePart] = []
@@ -262,12 +262,12 @@ def _make_surrounding_mesh(
 
     Args:
         path: the file, for messages.
-        name: of the part.
+        name: name of the part.
         parts: what the node draws.
         front: the axis of the file that is the front.
-        object_frame: that of the object.
+        object_frame: object frame that of the object.
     """
-    frame = _compute_frame(parts, object_frame.turn)
+    frame = _compute_frame(parts, object_frame.rotation)
     shape = make_object(parts, notes=[], file=path, name=name, up="y", front=front)
     mesh_to_object = np.eye(4)
     mesh_to_object[:3, :3] *= frame.size / object_frame.size
@@ -317,7 +317,7 @@ def _make_camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
 class NodeContents:
     """A node with geometry."""
 
-    name: str  # that `import_scene` accepts
+    name: str  # name that `import_scene` accepts
     mesh_name: str  # its name in controls if another node is the object
     triangles: int  # number of them in its own mesh
     # Bounding box in the file's axes and units, (3,).
@@ -329,7 +329,7 @@ class Contents:
     """What can be imported from a file."""
 
     object: ObjectAsset  # everything with geometry, as one object
-    nodes: tuple[NodeContents, ...] = ()  # of a glTF file, in their order
+    nodes: tuple[NodeContents, ...] = ()  # nodes of a glTF file, in their order
     lights: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
 
@@ -400,7 +400,7 @@ class FileFrame:
 
     size: float
     origin: Float64Array
-    turn: Float64Array  # (3, 3) from the file's axes to ours
+    rotation: Float64Array  # (3, 3) from the file's axes to ours
 
     def to_frame(self, points: Float64Array) -> Float64Array:
         """Return points (..., 3) of the file, in our axes, in this frame."""
@@ -489,19 +489,19 @@ def _make_lamp(
         light: its entry in the header.
         candela_per_unit: how many candela are one unit of radiant intensity.
         pose: (4, 4) of its node.
-        frame: that of the object.
+        frame: frame that of the object.
 
     Raises:
         InputError: it is too far away or too bright.
     """
     intensity = np.array(light.color) * light.intensity / candela_per_unit
     if light.type == "directional":
-        direction = frame.turn @ pose[:3, 2]  # it shines along its -z
+        direction = frame.rotation @ pose[:3, 2]  # it shines along its -z
         length = max(float(np.linalg.norm(direction)), 1e-12)
         position = gltf_parts.DIRECTIONAL_LIGHT_DISTANCE * direction / length
         intensity = intensity * gltf_parts.DIRECTIONAL_LIGHT_DISTANCE**2
     else:
-        position = frame.to_frame(frame.turn @ pose[:3, 3])
+        position = frame.to_frame(frame.rotation @ pose[:3, 3])
         intensity = intensity / frame.size**2
     is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE  # NaN is not
     if not is_in_range.all():
@@ -520,7 +520,7 @@ def _make_lamp(
         return lamp
     return SpotLamp(
         **vars(lamp),
-        direction=_normalize_axis(frame.turn @ -pose[:3, 2]),
+        direction=_normalize_axis(frame.rotation @ -pose[:3, 2]),
         cutoff=math.degrees(light.spot.outerConeAngle),
         beam=math.degrees(light.spot.innerConeAngle),
     )
@@ -548,11 +548,11 @@ def _make_camera(
     """
     assert camera.perspective is not None
     # columns are the camera's axes in ours, made unit vectors: the scale does not count
-    axes = frame.turn @ pose[:3, :3] @ GLTF_CAMERA_AXES
+    axes = frame.rotation @ pose[:3, :3] @ GLTF_CAMERA_AXES
     axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)
     matrix[:3, :3] = axes
-    matrix[:3, 3] = frame.to_frame(frame.turn @ pose[:3, 3])
+    matrix[:3, 3] = frame.to_frame(frame.rotation @ pose[:3, 3])
     # Without one, the aspect ratio is that of the image (section 5.13), and the field
     # of view is that of the height.
     aspect_ratio = camera.perspective.aspectRatio

@@ -122,7 +122,7 @@ def _read_colors(
     Args:
         head: the header of the file.
         attributes: (F,) attribute bytes of the facets.
-        notes: about the file.
+        notes: notes about the file.
     """
     magics_position = head.find(b"COLOR=")
     channels = [(attributes >> shift) & 31 for shift in (10, 5, 0)]

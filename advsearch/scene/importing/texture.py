@@ -17,7 +17,11 @@ from scipy.ndimage import distance_transform_edt
 from advsearch.scene.assets import Float32Array, Float64Array, IntArray, group_indices
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import Notes
-from advsearch.scene.importing.geometry import Soup, find_components, normalize_vectors
+from advsearch.scene.importing.geometry import (
+    TriangleSoup,
+    find_components,
+    normalize_vectors,
+)
 from advsearch.scene.importing.parts import (
     FLAT_TEXEL,
     NEUTRAL_GREY,
@@ -65,16 +69,18 @@ class SurfaceMaps:
 
 
 def _list_used_surfaces(
-    soup: Soup, surfaces: Sequence[ImportedSurface]
+    soup: TriangleSoup, surfaces: Sequence[ImportedSurface]
 ) -> list[ImportedSurface]:
     """Return the distinct surfaces of parts that have faces."""
-    used_by_id = {id(surfaces[part]): surfaces[part] for part in np.unique(soup.part)}
+    used_by_id = {
+        id(surfaces[part]): surfaces[part] for part in np.unique(soup.part_ids)
+    }
     return list(used_by_id.values())
 
 
 def apply_textures(
-    soup: Soup, surfaces: Sequence[ImportedSurface], notes: Notes
-) -> tuple[Soup, SurfaceMaps]:
+    soup: TriangleSoup, surfaces: Sequence[ImportedSurface], notes: Notes
+) -> tuple[TriangleSoup, SurfaceMaps]:
     """Give every corner of a repaired soup UVs in [0, 1], and make the maps that fit.
 
     The file's UVs and images are used if all faces share them and they can be used
@@ -125,7 +131,9 @@ def apply_textures(
     return unwrapped_soup, maps
 
 
-def _describe_size(size: int, soup: Soup, surfaces: Sequence[ImportedSurface]) -> str:
+def _describe_size(
+    size: int, soup: TriangleSoup, surfaces: Sequence[ImportedSurface]
+) -> str:
     """Describe the size of baked maps, and how much coarser they are than the images."""
     ratio = _count_texels(soup, surfaces) / (size * size * _FILL_FRACTION)
     ratio_text = ""
@@ -135,8 +143,8 @@ def _describe_size(size: int, soup: Soup, surfaces: Sequence[ImportedSurface]) -
 
 
 def _texture_plain(
-    soup: Soup, surface: ImportedSurface, material: IntArray
-) -> tuple[Soup, SurfaceMaps]:
+    soup: TriangleSoup, surface: ImportedSurface, material: IntArray
+) -> tuple[TriangleSoup, SurfaceMaps]:
     """Return a soup of one color with UVs, the file's if they do not overlap."""
     keeps_uvs = _is_usable(soup, soup.uvs) and not _has_overlap(soup.uvs, material)
     if keeps_uvs:
@@ -150,8 +158,8 @@ def _texture_plain(
 
 
 def _texture_with_images(
-    soup: Soup, uvs: Float64Array, surface: ImportedSurface
-) -> tuple[Soup, SurfaceMaps]:
+    soup: TriangleSoup, uvs: Float64Array, surface: ImportedSurface
+) -> tuple[TriangleSoup, SurfaceMaps]:
     """Return a soup with the images of its only surface, for UVs (F, 3, 2)."""
     color = surface.texture
     if color is None:
@@ -161,13 +169,13 @@ def _texture_with_images(
 
 
 def index_materials(
-    soup: Soup, surfaces: Sequence[ImportedSurface]
+    soup: TriangleSoup, surfaces: Sequence[ImportedSurface]
 ) -> tuple[list[str], IntArray]:
     """Return the names of materials, "" for none, and the index of each face's (F,)."""
     names = list(dict.fromkeys(surface.name for surface in surfaces))
     index_of_name = {name: index for index, name in enumerate(names)}
     index_of_part = np.array([index_of_name[surface.name] for surface in surfaces])
-    return names, index_of_part[soup.part]
+    return names, index_of_part[soup.part_ids]
 
 
 def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
@@ -193,7 +201,7 @@ def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     return bool(n_shared > _MAX_SHARED * (last_material >= 0).sum())
 
 
-def _make_plain_map(soup: Soup, surface: ImportedSurface) -> Float32Array:
+def _make_plain_map(soup: TriangleSoup, surface: ImportedSurface) -> Float32Array:
     """Return a small map of the only color of a soup."""
     color = _get_plain_color(surface)
     if soup.colors.min() != 1.0:
@@ -235,7 +243,7 @@ def _to_texels(uvs: Float64Array, shape: tuple[int, int]) -> Float64Array:
 
 
 def _describe_reason(
-    soup: Soup,
+    soup: TriangleSoup,
     used: Sequence[ImportedSurface],
     is_uniform: bool,
     has_uniform_factor: bool,
@@ -293,7 +301,7 @@ def _tint(
 # ---- The file's UVs ----
 
 
-def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
+def _is_usable(soup: TriangleSoup, uvs: Float64Array) -> bool:
     """Return whether UVs (F, 3, 2) are in [0, 1], and neither squashed nor tiny.
 
     Of the surface's area at most the fraction `_MAX_SQUASHED` may have none in UV
@@ -315,7 +323,7 @@ def _is_usable(soup: Soup, uvs: Float64Array) -> bool:
     )
 
 
-def _move_into_unit_square(soup: Soup) -> Float64Array:
+def _move_into_unit_square(soup: TriangleSoup) -> Float64Array:
     """Move each chart by an integer offset so that it starts in the unit square.
 
     A repeating texture looks the same. A chart is a set of faces that are connected by
@@ -401,7 +409,7 @@ def _choose_size(n_texels: float) -> int:
 
 
 def bake(
-    uvs: Float64Array, soup: Soup, surfaces: Sequence[ImportedSurface]
+    uvs: Float64Array, soup: TriangleSoup, surfaces: Sequence[ImportedSurface]
 ) -> SurfaceMaps:
     """Bake the colors, normals and emission of a soup into maps for new UVs.
 
@@ -424,7 +432,9 @@ def bake(
     maps = _make_blank_maps(surfaces, size)
     # (T, 3) factor of the base color at each texel
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
-    for surface, texel in zip(surfaces, group_indices(soup.part[face]), strict=False):
+    for surface, texel in zip(
+        surfaces, group_indices(soup.part_ids[face]), strict=False
+    ):
         if not len(texel):
             continue
         y = rows[texel]
@@ -487,7 +497,7 @@ def _fill_gaps(maps: SurfaceMaps, is_inside: npt.NDArray[np.bool_]) -> SurfaceMa
 def _sample_base_color(
     surface: ImportedSurface,
     uvs: Float64Array,
-    soup: Soup,
+    soup: TriangleSoup,
     surfaces: Sequence[ImportedSurface],
 ) -> Float32Array:
     """Return the base color (T, 3 or 4) of a surface at UVs (T, 2).
@@ -500,7 +510,7 @@ def _sample_base_color(
     color = _get_plain_color(surface)
     if surface.texture is not None:
         shows_texture = [other.texture is surface.texture for other in surfaces]
-        is_selected = np.array(shows_texture)[soup.part]
+        is_selected = np.array(shows_texture)[soup.part_ids]
         areas = np.linalg.norm(soup.compute_face_vectors(), axis=1)[is_selected]
         mean = average_over_faces(
             _to_linear(surface.texture), soup.uvs[is_selected], areas
@@ -509,7 +519,7 @@ def _sample_base_color(
     return np.broadcast_to(color[None], (len(uvs), len(color)))
 
 
-def _count_texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
+def _count_texels(soup: TriangleSoup, surfaces: Sequence[ImportedSurface]) -> float:
     """Return how many texels of the file's images an object shows.
 
     Of a part that is the area of its UVs times the texels of the largest of its images;
@@ -517,7 +527,7 @@ def _count_texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
     """
     n_texels = 0.0
     uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
-    for part, area in enumerate(np.bincount(soup.part, uv_areas)):
+    for part, area in enumerate(np.bincount(soup.part_ids, uv_areas)):
         sizes = (image.shape[0] * image.shape[1] for image in surfaces[part].images)
         n_texels += float(area) * max(sizes, default=0)
     return n_texels
@@ -647,8 +657,8 @@ MIN_MIRRORED_FRACTION = 1e-3
 
 
 def _unmirror(
-    soup: Soup, uvs: Float64Array, maps: SurfaceMaps
-) -> tuple[Soup, SurfaceMaps]:
+    soup: TriangleSoup, uvs: Float64Array, maps: SurfaceMaps
+) -> tuple[TriangleSoup, SurfaceMaps]:
     """Return a soup whose UVs mirror no face, and the maps for it.
 
     Only a normal map needs it, as the renderer's bitangent differs from the file's on
@@ -693,7 +703,7 @@ def _unmirror(
 
 def convert_normals(
     texels: Float32Array,
-    old_soup: Soup,
+    old_soup: TriangleSoup,
     new_uvs: Float64Array,
     face: IntArray,
     weights: Float64Array,
@@ -731,7 +741,9 @@ def convert_normals(
     return encode_normals(np.where(is_valid, bumps, [0.0, 0.0, 1.0]))
 
 
-def _compute_tangents(soup: Soup, normal: Float64Array, face: IntArray) -> Float64Array:
+def _compute_tangents(
+    soup: TriangleSoup, normal: Float64Array, face: IntArray
+) -> Float64Array:
     """Return unit tangents (T, 3) along u on faces (T,), orthogonal to normals (T, 3).
 
     Each is the direction on its face in which u grows and v stays, without the part

@@ -81,7 +81,7 @@ def _triangulate_faces(
         tables: the rows of the file's points, UVs and normals.
         corners: (C, 3) rows in these tables of the corners of all polygons.
         corner_counts: the number of corners of each polygon.
-        notes: about the file.
+        notes: notes about the file.
     """
     points = tables["v"][:, :3]
     triangles, polygon = triangulate_and_note(
@@ -247,8 +247,8 @@ def _find_squares(
     from 1001. Only squares for which the material has an image count.
 
     Args:
-        reader: of the materials.
-        names: of the materials.
+        reader: reader of the materials.
+        names: names of the materials.
         material: (T,) the material of each triangle; -1: none.
         uv: the texture coordinates of the triangles.
     """
@@ -391,7 +391,7 @@ def _read_colors(
     in [0, 255]. Vertices without a color are neutral grey in a file with colors.
 
     Args:
-        lines: of the file.
+        lines: lines of the file.
         table: (V, 7) the numbers of ``v`` lines, NaN where there are none.
         notes: where weights and opacities are recorded, which are not read.
     """

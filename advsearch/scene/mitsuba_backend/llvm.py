@@ -87,7 +87,7 @@ def find_libraries(
     `DRJIT_LIBLLVM_PATH` is not read. Tests give another root of the file system.
 
     Args:
-        root: of the file system.
+        root: root of the file system.
         environ: environment variables, of which ``CONDA_PREFIX`` is read.
 
     Returns:
@@ -132,7 +132,7 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
     otherwise the library is loaded.
 
     Args:
-        path: of the file, symbolic links resolved.
+        path: path of the file, symbolic links resolved.
         name_hint: the link through which it was found.
     """
     interpreter_header = read_interpreter_header()

@@ -122,7 +122,7 @@ def material_adjoint(
             world units, as the scene has them.
         cotangent: (H, W, 3) float32, derivative of the loss by the radiance of
             box-filtered pixels.
-        seed: of all random numbers.
+        seed: seed of all random numbers.
         spp: samples per pixel of the interior term.
         boundary_spp, shadow_spp: samples of the outlines of each mesh and of the edges
             that cast shadows, in multiples of the number of pixels; 0 leaves them out.

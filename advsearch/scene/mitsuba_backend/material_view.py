@@ -25,7 +25,8 @@ class Camera:
     """A pinhole camera, from Mitsuba's sensor.
 
     Attributes:
-        width, height, pixels: of the film, in pixels, and their product.
+        width, height, pixels: width, height and pixels of the film, in pixels, and
+            their product.
         eye: where it stands.
         forward: unit vector of the viewing axis.
         to_film: projection from its local axes to the film, fractions of its size.
@@ -364,7 +365,7 @@ def compute_outline_term(
     Args:
         view: the scene.
         mesh: one that moves, or one that stands still and may hide it.
-        seed: of the samples.
+        seed: seed of the samples.
         mesh_index: index of the mesh.
         spp: samples, in multiples of the number of pixels.
     """
@@ -708,7 +709,7 @@ def _sample_radiance_difference(
         si: the lit point.
         p: the point on the edge.
         offset: the step from the edge to just past it.
-        stream: of random numbers; both sides have the same.
+        stream: stream of random numbers; both sides have the same.
     """
 
     def make_ray(target: Any) -> Any:

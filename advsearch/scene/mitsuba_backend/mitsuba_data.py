@@ -43,8 +43,8 @@ def find_plugin_numbers(
 
     Args:
         description: the scene.
-        name: of the part that will hold them: an input is called `name.KEY`, unless the
-            scene has an input for this number already.
+        name: name of the part that will hold them: an input is called `name.KEY`,
+            unless the scene has an input for this number already.
         keys: Mitsuba's keys.
 
     Raises:

@@ -49,7 +49,7 @@ def sample_raindrops(
     Args:
         count: how many drops.
         size: median radius of a drop on the sheet, millimetres.
-        seed: of the positions and radii.
+        seed: seed of the positions and radii.
         tangent: tangent of half the camera's field of view along its larger side.
 
     Returns:
@@ -77,9 +77,9 @@ def _compute_cap_height(
     """Return the height of a drop over the sheet: of a cap of a sphere over its cut.
 
     Args:
-        distance_squared: of points from the middle of the drop.
-        radius: of the drop's circle on the sheet.
-        curvature_radius: of the sphere.
+        distance_squared: distance squared of points from the middle of the drop.
+        radius: radius of the drop's circle on the sheet.
+        curvature_radius: curvature radius of the sphere.
     """
     cut_height = math.sqrt(curvature_radius**2 - radius**2)
     sphere_height = np.sqrt(np.maximum(curvature_radius**2 - distance_squared, 0.0))
@@ -151,7 +151,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
 
     Attributes:
         haze: the medium.
-        radius: of the ball that it fills.
+        radius: radius of the ball that it fills.
 
     Properties in addition to those of `prb`: `medium`, a homogeneous medium with grey
     extinction, and `radius`, that of the ball around the origin which the medium fills.
@@ -313,7 +313,8 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         """Find where a segment is in the haze, a ball around the coordinates' origin.
 
         Args:
-            origin, direction: of the segment; the direction has length 1.
+            origin, direction: origin and direction of the segment; the direction has
+                length 1.
             max_distance: length of the segment.
 
         Returns:
@@ -414,9 +415,10 @@ class _PlaneHits:
 
     Attributes:
         is_hit: whether a ray meets the plane first.
-        direct_change: of its radiance by what hides the environment, and by lamps.
-        weight: of the light that comes along the path's next segment.
-        path_ray: that segment; of other rays, the camera ray.
+        direct_change: direct change of its radiance by what hides the environment, and
+            by lamps.
+        weight: weight of the light that comes along the path's next segment.
+        path_ray: path ray that segment; of other rays, the camera ray.
         is_traced: whether there is such a segment.
     """
 

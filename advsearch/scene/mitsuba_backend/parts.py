@@ -102,7 +102,7 @@ class SceneInput:
     is_interior: bool = (
         False  # the interior adjoint (`prb`) differentiates it correctly
     )
-    # of the tensor; None takes it from Mitsuba's own value
+    # Shape of the tensor; None takes it from Mitsuba's own value.
     shape: tuple[int, ...] | None = None
     # Mitsuba's object that has the parameter, where `key` alone may mean several
     owner: Any = None
@@ -496,11 +496,11 @@ def make_scene_dict(
     scene: Plugin = {"type": "scene", "camera": camera}
     if description.environment is not None:
         radiance = description.environment.radiance
-        rotation = description.number("environment.rotation")
+        rotation = description.get_number("environment.rotation")
         scene["environment"] = {
             "type": "envmap",
             "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32)),
-            "scale": 2.0 ** description.number("environment.exposure"),
+            "scale": 2.0 ** description.get_number("environment.exposure"),
             "to_world": mi.ScalarTransform4f()
             .rotate([0, 0, 1], rotation)
             .rotate([1, 0, 0], 90),
@@ -523,14 +523,14 @@ def _make_ground(description: SceneDescription) -> Any:
         return meshes.make_mitsuba_mesh(
             GROUND_NAME, photograph.mesh, np.eye(4), surface
         )
-    size = description.number("ground.size")
+    size = description.get_number("ground.size")
     if not size > 0.0 or is_paved(description):
         return None
     level = 0.0
     if description.backdrop_photograph is not None:
         if not has_plane(description):
             return None
-        level = description.number("ground.level")
+        level = description.get_number("ground.level")
     srgb = np.array(description.ground_color, np.float32)
     reflectance = _make_rgb(srgb_to_linear(srgb).tolist())
     return {
@@ -583,11 +583,11 @@ def _make_lens(description: SceneDescription) -> Plugin:
             of the image black.
     """
     model = description.camera_model
-    drops = description.number("camera.drops")
+    drops = description.get_number("camera.drops")
     if model is None:
         pinhole: Plugin = {
             "type": "perspective",
-            "fov": description.number("camera.fov"),
+            "fov": description.get_number("camera.fov"),
             "fov_axis": "larger",
         }
         thin_lens = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
@@ -613,10 +613,10 @@ def _make_lens(description: SceneDescription) -> Plugin:
     }
     if drops > 0.0:
         camera |= {
-            name: description.number(f"camera.{name}")
+            name: description.get_number(f"camera.{name}")
             for name in ("drops", "drop_size", "drop_seed")
         }
-        half_fov = math.radians(description.number("camera.fov")) / 2.0
+        half_fov = math.radians(description.get_number("camera.fov")) / 2.0
         if model.name:
             camera["drop_tangent"] = max(model.visible_tangents)
         else:

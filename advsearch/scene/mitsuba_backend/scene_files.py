@@ -327,9 +327,9 @@ def _paint(
     where its own do not tell its points apart, as on a cube.
 
     Args:
-        mesh: of the shape.
+        mesh: mesh of the shape.
         has_uvs: whether the file has texture coordinates.
-        surface: of the shape.
+        surface: surface of the shape.
         kind: Mitsuba's type of the shape.
         where: the scene, for errors.
     """

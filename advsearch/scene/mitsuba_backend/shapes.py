@@ -98,7 +98,7 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
 
     Args:
         shape: the shape's dictionary.
-        name: of the object, for errors.
+        name: name of the object, for errors.
 
     Returns:
         The mesh, with its attributes and the file's texture coordinates, which may

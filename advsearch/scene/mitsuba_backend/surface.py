@@ -436,7 +436,7 @@ class ViewTracer:
             si: the hit.
             d: unit direction of the ray.
             n: unit shading normal, towards the viewer.
-            cosine: of the angle of view.
+            cosine: cosine of the angle of view.
             lobe: gloss, up, along, core and tail of `Lobes`.
             active: whether there is any gloss.
         """
@@ -609,7 +609,7 @@ def _look_up_bilinear(
     Args:
         values: flat array with three numbers for each cell.
         first_cell: index of the grid's first cell in it.
-        n_rows, n_columns: of the grid.
+        n_rows, n_columns: number of rows and number of columns of the grid.
         y, x: row and column, integers at the centers of cells.
         wraps: columns go round; otherwise the grid ends at its border.
     """

@@ -42,7 +42,7 @@ class TexelGrid:
     # rate) of a level plane whose cells are small about its center: coordinate = center
     # + scale sinh(rate s), s in [-1, 1]
     warp: tuple[float, float, float, float] | None = None
-    side: int = 0  # of the faces that it lies on: 1 the front, -1 the back, 0 both
+    side: int = 0  # side of the faces that it lies on: 1 the front, -1 the back, 0 both
 
     @property
     def n_cells(self) -> int:
@@ -70,7 +70,7 @@ def trace_texel_rays(
         sky_shape: rows and columns of the cells of the environment.
         positions, normals: (n, 3) of the texels, with unit shading normals.
         n_rays: rays from each texel.
-        seed: of the shifts.
+        seed: seed of the shifts.
 
     Returns:
         (n, n_rays) indices of cells of all grids; from the number of those on, of cells
@@ -146,9 +146,9 @@ def _trace_batch(
 
     Args:
         scene, grids, sky_shape: as there.
-        normal, position: of the texel, for each ray.
+        normal, position: normal and position of the texel, for each ray.
         square: point of the unit square from which the direction is made, for each ray.
-        seed: of the random numbers that decide whether a ray passes a cut-out.
+        seed: seed of the random numbers that decide whether a ray passes a cut-out.
     """
     mitsuba_scene = scene._scene
     n_layers = count_cut_out_layers(scene)
@@ -410,7 +410,7 @@ class _BsdfSamples(NamedTuple):
 
     grey: Float64Array  # value over a cosine density, for a base color of 0.5
     black: Float64Array  # the same for a base color of 0
-    weight: Float64Array  # of a sampled direction, for a base color of 0
+    weight: Float64Array  # weight of a sampled direction, for a base color of 0
     x: Float64Array  # its component in the plane of view, towards the viewer
     z: Float64Array  # its component along the normal
 
@@ -429,8 +429,8 @@ def measure_lobes(
 
     Args:
         scene: the scene.
-        inputs: of the scene; the base color is replaced.
-        grid: of the shape.
+        inputs: inputs of the scene; the base color is replaced.
+        grid: grid of the shape.
         position, normal: (3,) of the texel; the normal has length 1.
     """
     cosine = (np.arange(N_ANGLES) + 0.5) / N_ANGLES

@@ -71,7 +71,7 @@ class Paths:
     # (H, W, 3), reflectance in [0, 1] of the first hit that light does not pass
     albedo: Tensor
     normal: Tensor  # (H, W, 3), and its shading normal
-    vertices: list[Vertices]  # by their index in the path
+    vertices: list[Vertices]  # vertices by their index in the path
 
 
 def average_passes(passes: Sequence[Paths]) -> Paths:
@@ -176,7 +176,7 @@ def _accumulate_radiance(
     """Accumulate radiance from the last vertex back to the camera.
 
     Args:
-        bounces: of the vertices but for the last, from the camera on.
+        bounces: bounces of the vertices but for the last, from the camera on.
         emitted: what each vertex emits; one more than bounces.
         slopes: derivatives of both BSDF values of each bounce by the base color.
 
@@ -225,8 +225,8 @@ def _fetch_paths(
     """Evaluate the kernel of a pass and fetch images and vertices into torch.
 
     Args:
-        channels: of the radiance and of the other images of `Paths`, in their order,
-            for each sample.
+        channels: channels of the radiance and of the other images of `Paths`, in their
+            order, for each sample.
         vertices: texture coordinates, weight and sharpness of each vertex.
         size: height and width of the image.
         spp: samples per pixel, which follow one another.
@@ -284,15 +284,15 @@ class Bounce:
 
     si: Any  # surface interaction
     bsdf: Any  # its BSDF
-    throughput: Any  # of the path before it
+    throughput: Any  # throughput of the path before it
     sharp: Any  # no vertex before it scatters light
     wo_em: Any  # direction to the light that was sampled
-    active_em: Any  # in which lanes there is one
+    active_em: Any  # active em in which lanes there is one
     # radiance from there over the density, with its MIS weight against BSDF sampling
     em_weight: Any
     bsdf_value_em: Any  # the BSDF times the cosine for the direction to the light
     bsdf_sample: Any  # the path's direction
-    active_bsdf: Any  # in which lanes it has a density
+    active_bsdf: Any  # active bsdf in which lanes it has a density
     # the same for the path's direction over its density: the throughput of the vertex
     bsdf_weight: Any
 
@@ -454,7 +454,7 @@ def _sample_bounce(
     Args:
         scene: Mitsuba's scene.
         si, bsdf: the vertex and its BSDF.
-        throughput: of the path before it.
+        throughput: throughput of the path before it.
         sharp: whether no vertex before it scatters light.
         noise: the sampler.
         active: lanes whose path goes on here.

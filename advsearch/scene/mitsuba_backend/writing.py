@@ -69,7 +69,7 @@ def write_scene(
     Args:
         scene: the scene.
         inputs: as for `MitsubaScene.render_images`.
-        path: of the XML file, in a folder that exists.
+        path: path of the XML file, in a folder that exists.
         note: becomes a comment.
         hide_environment: hide the visible environment.
 
@@ -276,7 +276,7 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
     The files' names begin with that of the XML file.
 
     Args:
-        path: of the XML file, in a folder that exists.
+        path: path of the XML file, in a folder that exists.
         scene: the dictionary.
         meshes: Mitsuba's meshes, by the names of the entries of the type "ply".
         note: a comment at the beginning.

@@ -109,9 +109,9 @@ class _SceneText:
     """The text of a scene file and of the files that it includes.
 
     Attributes:
-        path: of the scene file.
+        path: path of the scene file.
         references: finds files in its folder.
-        values: of `$names`, by name; the first default of a name counts.
+        values: values of `$names`, by name; the first default of a name counts.
         size, elements, included: bytes, elements and included files so far.
         lines_before: lines before the scene's first one.
     """
@@ -282,7 +282,7 @@ def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> P
     """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it.
 
     Args:
-        path: of the file, for errors.
+        path: path of the file, for errors.
         state: what Mitsuba's parser returns.
         index: index of the plugin in it; 0 is the scene.
         referred: is extended by the ids that the plugin refers to.
@@ -430,7 +430,7 @@ def check_and_read_files(
     """Return a file's dictionary with images read and full names of checked meshes.
 
     Args:
-        path: of the file.
+        path: path of the file.
         scene: its dictionary.
         notes: is extended by warnings about images.
 
@@ -446,7 +446,7 @@ class _FileReader:
     """Check the plugins of a scene file, and read the files that they name.
 
     Args:
-        path: of the scene file.
+        path: path of the scene file.
         notes: is extended by warnings about images.
     """
 

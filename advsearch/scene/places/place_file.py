@@ -166,7 +166,7 @@ def make_place_parts(
 
     Args:
         place: the place, whose lengths are in metres and whose emission is in cd/m2.
-        metres: of one object size.
+        metres: size in metres of one object size.
         candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit,
             and its lamps stay off.
         is_dark: whether its lamps shine.

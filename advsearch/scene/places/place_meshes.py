@@ -286,7 +286,7 @@ def _read_primitives(
     Args:
         file: the glTF file.
         variant: index of a variant of its materials; None for none.
-        notes: to which what is left out is added.
+        notes: notes to which what is left out is added.
 
     Returns:
         The primitives in the pose of each node, and the surface of each material.
@@ -472,8 +472,8 @@ def _with_finish(
 
     Args:
         path: the file, for messages.
-        header: of the file.
-        index: of the material; None: the mesh has none.
+        header: header of the file.
+        index: index of the material; None: the mesh has none.
         part: the mesh.
     """
     entry = MaterialEntry() if index is None else header.materials[index]

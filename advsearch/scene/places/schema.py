@@ -66,7 +66,7 @@ class SolidEntry(_Entry):
         | None
     ) = None
     radius: Positive | None = None
-    heights: Bounds  # from and to
+    heights: Bounds  # heights from and to
 
     @model_validator(mode="after")
     def _check_form(self) -> SolidEntry:
@@ -132,7 +132,7 @@ class PictureEntry(_Entry):
     """
 
     height: Positive  # above the ground from which the maps were taken
-    x: Bounds  # from and to, of what stands nearest
+    x: Bounds  # position from and to, of what stands nearest
     y: Bounds
 
     @model_validator(mode="after")
@@ -151,8 +151,8 @@ class PlaceLight(_Entry):
 
     # an .hdr or .exr file in the folder, or the name of a bundled environment
     map: Name
-    lux: Illuminance | None = None  # of level ground under open sky
-    variant: Name | None = None  # of the materials
+    lux: Illuminance | None = None  # lux of level ground under open sky
+    variant: Name | None = None  # variant of the materials
 
 
 class PlaceFile(_Entry):
@@ -163,7 +163,7 @@ class PlaceFile(_Entry):
     ground: Annotated[list[Name], Field(min_length=1, max_length=64)]
     # the first is taken by itself
     lights: Annotated[dict[Name, PlaceLight], Field(min_length=1, max_length=64)]
-    # of the lane that the object drives in; None: there is none
+    # Lane width of the lane that the object drives in; None: there is none.
     lane_width: Positive | None = None
     # height of the floor that cameras stand on, where the object stands on something
     floor: Length = 0.0

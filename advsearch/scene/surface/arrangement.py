@@ -63,10 +63,10 @@ class SurfaceView:
             there are 2 sides with light of their own, from its back.
 
     Args:
-        samples: of all cameras.
+        samples: samples of all cameras.
         camera_index: index of the camera.
         shape: rows and columns of the fine grid.
-        sides: of the object that have light of their own.
+        sides: sides of the object that have light of their own.
     """
 
     def __init__(
@@ -187,10 +187,10 @@ class Arrangement:
     """Object and surroundings in fixed positions, and what their surfaces see.
 
     Args:
-        renderer: of the scene.
+        renderer: renderer of the scene.
         inputs: the scene's own, assembled, without those that may change.
         texture: rows and columns of the base color.
-        seed: of the rays.
+        seed: seed of the rays.
 
     Attributes:
         inputs: scene inputs that stay.
@@ -226,7 +226,7 @@ class Arrangement:
         # The ground goes on from the center of the object; a photographed one shows
         # what was taken from `capture_height`.
         photograph = description.photograph
-        self._has_ground = description.number("ground.size") > 0.0
+        self._has_ground = description.get_number("ground.size") > 0.0
         if self._has_ground:
             ground_center = (float(object_center[0]), float(object_center[1]))
             reach = self._compute_ground_reach(photograph is not None)
@@ -342,7 +342,7 @@ class Arrangement:
         """Return half the width of the ground; a photographed one has no end."""
         if is_photographed:
             return math.inf
-        return self._scene.definition[0].number("ground.size") / 2.0
+        return self._scene.definition[0].get_number("ground.size") / 2.0
 
     def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
         """Return which texels (n,) of one side of the object lie inside something.

@@ -90,7 +90,7 @@ class SurfaceRenderer(Predictor):
         traced: renderer of the scene.
         u: (d,) configuration; all but cameras, environment and base color stays as it
             is there.
-        seed: of the rays from texels.
+        seed: seed of the rays from texels.
 
     Attributes:
         base_color: (h, w, 3) base color.
@@ -270,7 +270,7 @@ class SurfaceRenderer(Predictor):
         """Return the images (n, H, W, 3) sRGB of what cameras see of a base color.
 
         Args:
-            views: of the cameras.
+            views: views of the cameras.
             inputs: scene inputs for each, whose base color is ignored.
             color: (h, w, 3); the images are differentiable in it.
             full_configurations: full configurations (d,), for what controls do to the
@@ -326,7 +326,7 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
     None does not say how good the prediction is: that is measured afterwards.
 
     Args:
-        renderer: of the space.
+        renderer: renderer of the space.
         varying: names of the controls that vary, which may change cameras and the
             environment. The others are searched, and may change base colors alone.
     """
@@ -368,7 +368,7 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
         )
     if renderer.scene.is_volumetric or description.thin_lens or description.backdrop:
         return Refusal("there is haze, a lens with an aperture, or a plain background")
-    if description.number("camera.drops") > 0.0:
+    if description.get_number("camera.drops") > 0.0:
         return Refusal("there are raindrops before the camera")
     return None if renderer.formation.denoiser == "oidn" else NOISE
 

@@ -53,13 +53,14 @@ BINOMIAL = (1, 4, 6, 4, 1)
 class LitTexels:
     """The texels that store light: those cells of all grids that lie on a surface."""
 
-    grids: tuple[TexelGrid, ...]  # of each surface, the searched one first
+    grids: tuple[TexelGrid, ...]  # grids of each surface, the searched one first
     positions: Float32Array  # (n, 3) positions in world space
     normals: Float32Array  # (n, 3)
     cells: IntArray  # (n,) index of the cell of all grids that each lies in
     # (cells of all grids,) index of the texel whose light each cell has, the nearest
     texel_of_cell: IntArray
-    first_texels: tuple[int, ...]  # of each grid its first texel, and the number of all
+    # First texels of each grid its first texel, and the number of all.
+    first_texels: tuple[int, ...]
 
     def select_grid(self, grid_index: int) -> slice:
         """Return the texels of a grid, by its index."""
@@ -102,10 +103,10 @@ def make_mesh_texels(
     """Return the texels over a mesh.
 
     Args:
-        name: of the mesh.
+        name: name of the mesh.
         charts: its rasterised texture coordinates.
         vertices, normals: (V, 3) in world space.
-        side: of its faces, as `TexelGrid` has it.
+        side: side of its faces, as `TexelGrid` has it.
     """
     position, normal = _interpolate(charts, vertices, normals)
     # number of the texel in each covered cell: row by row; elsewhere it means nothing
@@ -129,8 +130,8 @@ def make_ground_texels(
     An axis position p from -1 to 1 lies `scale * sinh(rate * p)` from the center.
 
     Args:
-        name: of the ground.
-        height: of the plane.
+        name: name of the ground.
+        height: height of the plane.
         reach: half its width, cut to `MAX_GROUND_REACH`.
         center: x and y of the object's center.
     """
@@ -187,12 +188,12 @@ def _weigh_neighbours(
     """Return the texels around points and their weights in a joint bilateral filter.
 
     Args:
-        texels: of the mesh.
-        charts: of the mesh.
+        texels: texels of the mesh.
+        charts: charts of the mesh.
         grid_position: rows and columns (N,) of the points in the grid of the charts.
         points: (N, 3) in world space.
         normals: (N, 3) at the points.
-        texel_width: in world space.
+        texel_width: texel width in world space.
         buried: (n,) texels that do not count.
 
     Returns:
@@ -265,8 +266,8 @@ def make_lookup_matrix(
     4.1): near in the grid, near in space, facing the same direction.
 
     Args:
-        texels: of the mesh; it is the only surface, or the first one.
-        charts: of the mesh.
+        texels: texels of the mesh; it is the only surface, or the first one.
+        charts: charts of the mesh.
         shape: rows and columns of the finer grid.
         vertices, normals: (V, 3) in world space.
         buried: (n,) texels that lie inside something; their darkness does not count
@@ -637,7 +638,7 @@ def make_view_matrices(
             `len(texel_of_cell)` on a cell of the sky, or negative for nothing that
             shines.
         texel_of_cell: index of the texel of each cell, see `LitTexels`.
-        n_texels: of all grids.
+        n_texels: number of texels of all grids.
     """
     count, n_rays = met_cells.shape
     row = np.repeat(np.arange(count), n_rays)

@@ -83,13 +83,14 @@ def has_fixed_lights(renderer: Renderer) -> bool:
 class Lighting:
     """Which groups of a space change only light, exposure or the finished image."""
 
-    # by `control.parameter`, the inputs changed; none if it changes the finished image
+    # Groups by `control.parameter`, the inputs changed; none if it changes the finished
+    # image.
     groups: Mapping[str, frozenset[str]]
     harmonic_groups: frozenset[
         str
     ]  # groups that add spherical harmonics to the environment
-    # of the others that change a map, their coordinates and the values where it is
-    # brightest: a basis map must not be black in a channel
+    # Brightest values of the others that change a map, their coordinates and the values
+    # where it is brightest: a basis map must not be black in a channel.
     brightest_values: Sequence[tuple[slice, Tensor]] = ()
 
     @property
@@ -322,7 +323,7 @@ class LightBasis:
     """The lights of a scene of which some change, each separately.
 
     Args:
-        renderer: of the scene.
+        renderer: renderer of the scene.
         lighting: what changes.
         inputs: scene inputs whose map is the environment's first basis map.
 
@@ -504,7 +505,7 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
     where nothing else is.
 
     Args:
-        renderer: of the space.
+        renderer: renderer of the space.
         varying: names of controls that vary. They are fixed for each matrix, whatever
             they change; if there are any, light may not change.
     """

@@ -282,7 +282,7 @@ class TextureTransport:
         look-up; another one for the cell that it lies in.
 
         Args:
-            vertices: by their index in the path.
+            vertices: vertices by their index in the path.
             fraction: the fraction of all samples that the pass has.
         """
         n_rows, n_columns = self._cell_shape
@@ -472,7 +472,7 @@ class TransportTooLargeError(Exception):
 class LinearizedScene:
     """What a `LinearRenderer` has collected; it can be sent to another process."""
 
-    transports: Mapping[str, TextureTransport]  # by input, finished
+    transports: Mapping[str, TextureTransport]  # transports by input, finished
     linearized_at: dict[str, Tensor]  # the inputs where it was linearised
     image_inputs: Inputs  # those that belong to the finished image, not to the scene
     # the image there, linear radiance, and coverage where there is a backdrop
@@ -486,7 +486,7 @@ class LinearRenderer(Predictor):
     Args:
         traced: renderer of the scene.
         u: (d,) configuration at which it is linearised.
-        seed: of the noise.
+        seed: seed of the noise.
         tick: is called with samples per pixel as they are traced; there are
             `count_samples` in all.
         spp: samples per pixel.

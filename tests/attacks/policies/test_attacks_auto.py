@@ -64,7 +64,7 @@ class Smooth:
         assert u.dtype == torch.float32
         self.asked.append(gradient)
         self.seen.append(u.clone())
-        rng = np.random.default_rng([self.seed, query.number, zlib.crc32(u.numpy().tobytes())])
+        rng = np.random.default_rng([self.seed, query.index, zlib.crc32(u.numpy().tobytes())])
         value = self.value(u) + self.noise * rng.normal()
         slope = None
         if gradient:
@@ -203,7 +203,7 @@ def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:
 
     def reached(policy: Policy[Any]) -> float:
         def evaluate(query: Query) -> Evaluation:
-            rng = np.random.default_rng([seed, query.number, zlib.crc32(query.u.numpy().tobytes())])
+            rng = np.random.default_rng([seed, query.index, zlib.crc32(query.u.numpy().tobytes())])
             value = function(query.u.double().numpy()) + noise * rng.normal()
             return Evaluation(value, None, value > 0)
 

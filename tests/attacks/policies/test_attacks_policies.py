@@ -56,7 +56,7 @@ class Problem:
         `noise` x the gradient's root mean square (so with noise 1 half of the gradient's energy is noise)."""
 
         def evaluate(query: Query) -> Evaluation:
-            rng = seeded(seed, query.number)
+            rng = seeded(seed, query.index)
             exact = self.gradient(query.u)
             rough = exact + noise * exact.square().mean().sqrt() * torch.randn(exact.shape, generator=rng)
             value = self.value(query.u) + noise * 0.05 * self.optimum * float(torch.randn(1, generator=rng))
@@ -179,7 +179,7 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
     climbing = Domain(torch.zeros(4), (Block(4),))
 
     def evaluate(query: Query) -> Evaluation:
-        return Evaluation(float(query.number), torch.ones(4), False)
+        return Evaluation(float(query.index), torch.ones(4), False)
 
     assert search(partial(map, evaluate), climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
 
@@ -188,7 +188,7 @@ def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
     """A peak that only the first steps see; then the gradient leads away from it, downhill."""
 
     def evaluate(query: Query) -> Evaluation:
-        return Evaluation(5.0 if query.number == 2 else -0.1 * query.number, torch.ones(2), False)
+        return Evaluation(5.0 if query.index == 2 else -0.1 * query.index, torch.ones(2), False)
 
     seen: list[Tensor] = []
     domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
@@ -293,13 +293,13 @@ def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1) -> Eval
 
     def evaluate(query: Query) -> Evaluation:
         x = query.u.clone().requires_grad_(bool(query.gradient))
-        noise = 0.01 / math.sqrt(query.samples) * torch.randn(d, generator=seeded(7, query.number))
+        noise = 0.01 / math.sqrt(query.samples) * torch.randn(d, generator=seeded(7, query.index))
         logits = (((x + noise) @ first).tanh() @ second)[None]
         value = get_objective(objective)(logits, torch.zeros(1, 1, 1, 3), (0, 2))[0]
         slope = torch.autograd.grad(value, x)[0] if query.gradient else None
-        if slope is not None and query.number % 3 == 1:
-            slope[query.number % d] = math.nan
-        number = math.nan if query.number == nan_at else float(value.detach())
+        if slope is not None and query.index % 3 == 1:
+            slope[query.index % d] = math.nan
+        number = math.nan if query.index == nan_at else float(value.detach())
         return Evaluation(number, slope, bool(logits.argmax() % 2), cost=query.samples)
 
     return partial(map, evaluate)
@@ -345,7 +345,7 @@ def test_half_of_the_domain_cannot_be_evaluated(policy: Policy[Any], bad: float)
 
     def evaluate(query: Query) -> Evaluation:
         (evaluation,) = inner([query])
-        if float(query.u[-1]) <= float(domain.start[-1]) + 1e-3 or query.number % 3 == 0:
+        if float(query.u[-1]) <= float(domain.start[-1]) + 1e-3 or query.index % 3 == 0:
             return evaluation
         return replace(evaluation, objective=bad, gradient=query.u * math.nan if query.gradient else None)
 
@@ -389,7 +389,7 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
         for k in range(index, index + steps):
             (proposal,), state = policy.propose(state, 1)
             seen.append(proposal.u)
-            query = Query(proposal.u, k, number=3 * k, gradient=proposal.gradient, samples=proposal.samples)
+            query = Query(proposal.u, k, index=3 * k, gradient=proposal.gradient, samples=proposal.samples)
             (evaluation,) = evaluate([query])
             state = policy.update(state, [(proposal.u, evaluation)])
         return state, torch.stack(seen)
@@ -451,7 +451,7 @@ def test_options_out_of_range_are_refused(options: dict[str, float], message: st
 
 def told(policy: Policy[Any], objective: Callable[[int, Tensor], Evaluation], domain: Domain, steps: int) -> Any:
     def evaluate(query: Query) -> Evaluation:
-        found = objective(query.number, query.u)
+        found = objective(query.index, query.u)
         return found if query.gradient else replace(found, gradient=None)
 
     return search(partial(map, evaluate), domain, policy, steps=steps, seed=1, candidates=0)

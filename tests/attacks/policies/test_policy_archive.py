@@ -52,7 +52,7 @@ def failing_cells(scene: str, policy: str, renders: int, noise: float, seed: int
     cells = set()
 
     def evaluate(query: Query) -> Evaluation:
-        generator = torch.Generator().manual_seed(100_003 * seed + query.number)
+        generator = torch.Generator().manual_seed(100_003 * seed + query.index)
         exact = margin(query.u)
         if exact > 0.0:
             first, second = (min(int(SIDE * float(value)), SIDE - 1) for value in query.u[:2])

@@ -33,7 +33,7 @@ both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: po
 
 def evaluator(value: Callable[[Tensor], float], noise: float = 0.0) -> Evaluate:
     def evaluate(query: Query) -> Evaluation:
-        error = noise * float(torch.randn(1, generator=seeded(5, query.number)))
+        error = noise * float(torch.randn(1, generator=seeded(5, query.index)))
         return Evaluation(value(query.u) + error, None, False)
 
     return partial(map, evaluate)

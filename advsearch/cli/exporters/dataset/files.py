@@ -88,7 +88,7 @@ def write_dataset(
     It is written whole or not at all; where there are no pictures, nothing is written.
 
     Args:
-        run: of `sweep` or `attack`, or with such parts (a suite, a study).
+        run: run of `sweep` or `attack`, or with such parts (a suite, a study).
         out: the folder, which is made, or empty.
         format: "coco" or "yolo".
         every: also write pictures that all models are right about.

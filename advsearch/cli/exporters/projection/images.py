@@ -73,7 +73,7 @@ def write_projector(
     """Write the files of one projector, and return sentences about what to set.
 
     Args:
-        folder: to write into.
+        folder: folder to write into.
         adversarial: the `AdversarialRun` with the scene.
         control: the projector.
         values: its values by name; "pattern" is (rows, columns, 3) in sRGB.
@@ -112,7 +112,7 @@ def write_projector(
 def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
     """Return what to set at a projector and around it, a sentence each."""
     number = {name: float(value) for name, value in values.items() if value.ndim == 0}
-    unit = "m" if control.scene.object.metres is not None else "object sizes"
+    unit = "m" if control.scene.object.size_in_metres is not None else "object sizes"
     fov = control.part.fov
     white = control.measured(values, {})["white"]["value"]
     # half the width of the picture at distance 1; the throw ratio is distance by width
@@ -213,7 +213,7 @@ def draw_cross(
 
     Args:
         draw: draws on the picture.
-        center: of the cross (x, y) in pixels.
+        center: center of the cross (x, y) in pixels.
         arm: length of an arm in pixels, also the size of the number.
         line: width of the lines in pixels.
         text: the number.

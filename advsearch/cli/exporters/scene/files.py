@@ -118,7 +118,7 @@ def describe_formation(renderer: Any, gain: float, backdrop: Any) -> list[str]:
     picture.
 
     Args:
-        renderer: of the run.
+        renderer: renderer of the run.
         gain: factor from radiance to the value that the sRGB curve takes.
         backdrop: the colour (3,) behind the scene, already times the gain; None
             without.
@@ -180,7 +180,7 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     adversarial = exports.AdversarialRun.load(run)
     part, found = adversarial.posed_object()
     description = adversarial.problem.space.scene
-    metres = None if description is None else description.object.metres
+    metres = None if description is None else description.object.size_in_metres
     if metres is not None:
         # lengths of our scenes are in object sizes, those of glTF in metres
         found = replace(

@@ -50,7 +50,7 @@ def _outline(
         angle: parameters of the points (N,), from -pi to pi; 0 is the front end.
         front, rear: x of its ends.
         half: its extent along y and -y.
-        power: of the superellipse.
+        power: power of the superellipse.
         middle: x of its center.
     """
     cosine = np.cos(angle)
@@ -71,7 +71,7 @@ def _shell(
     Args:
         rows: (R, 4), for each superellipse the fraction of the height, half the width,
             and x of the front and of the rear end.
-        power: of the superellipses.
+        power: power of the superellipses.
         middle: x of their center.
         height: returns z from fractions of the height, x and y.
         corner: where charts are cut: at this fraction of all columns to both sides of
@@ -670,20 +670,20 @@ FINISHES = {
 
 
 @family(metres=1.0, texels=384)
-def car(draw: ParameterSampler) -> Instance:
+def car(sampler: ParameterSampler) -> Instance:
     """Make a car of random proportions and paint."""
-    color = draw.sample_color(
+    color = sampler.sample_color(
         "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2
     )
     stretch = np.array(
         [
-            draw(1.0, low=0.94, high=1.07),
-            draw(1.0, low=0.96, high=1.05),
-            draw(1.0, low=0.95, high=1.1),
+            sampler(1.0, low=0.94, high=1.07),
+            sampler(1.0, low=0.96, high=1.05),
+            sampler(1.0, low=0.95, high=1.1),
         ]
     )
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
-    metal = draw.sample_color("c4c7ca", "8d9094", "2d2f31", wild=0.0)
+    metal = sampler.sample_color("c4c7ca", "8d9094", "2d2f31", wild=0.0)
     paints: dict[str, Paint] = {
         "paint": _lacquer(color),
         "glass": _panes,
@@ -692,7 +692,7 @@ def car(draw: ParameterSampler) -> Instance:
         "rubber": solid("1c1c1d"),
         "rim": solid(metal),
         "trim": _slats,
-        "plate": _plate(draw.sample_color("f2f2ec", "f0d264", wild=0.0)),
+        "plate": _plate(sampler.sample_color("f2f2ec", "f0d264", wild=0.0)),
         "well": solid("0a0a0b"),
     }
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}

@@ -32,7 +32,7 @@ class AtlasRectangle:
 
     Attributes:
         x, y: left and bottom in texels.
-        width, height: in texels, gutters included.
+        width, height: width and height in texels, gutters included.
         is_rotated: whether the chart is rotated by 90 degrees.
     """
 
@@ -64,7 +64,7 @@ def _shelves(
     Args:
         sizes: (width, height) of each, width >= height, in object units.
         scale: texels per unit.
-        side: of the square in texels.
+        side: side of the square in texels.
 
     Returns:
         The rectangles in the order of `sizes`, with gutters, in texels.
@@ -151,10 +151,10 @@ def paint_atlas(
     It is display-referred sRGB; values are multiples of 1/255.
 
     Args:
-        patches: of the object.
+        patches: patches of the object.
         rectangles: where the chart of each patch is.
-        paints: by the tags of patches.
-        side: of the texture, in texels.
+        paints: paints by the tags of patches.
+        side: side of the texture, in texels.
     """
     image = np.zeros((side, side, 3))
     is_used = np.zeros((side, side), dtype=bool)
@@ -198,9 +198,9 @@ def join_patches(
     Every value is rounded to `DECIMALS`.
 
     Args:
-        patches: of the object.
+        patches: patches of the object.
         rectangles: where the chart of each patch is in the atlas.
-        side: of the atlas, in texels.
+        side: side of the atlas, in texels.
     """
     first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
     vertices = np.concatenate([patch.vertices for patch in patches])
@@ -279,15 +279,15 @@ class ObjectFamily:
     """A class of objects whose members differ in proportions, texture and material.
 
     Attributes:
-        name: of the class, usable on the command line.
+        name: name of the class, usable on the command line.
         make: builds an instance from a `ParameterSampler`.
-        metres: length of the unit in which it is built.
+        size_in_metres: length of the unit in which it is built.
         texels: width of its texture.
     """
 
     name: str
     make: Callable[[ParameterSampler], Instance]
-    metres: float
+    size_in_metres: float
     texels: int = DEFAULT_ATLAS_SIZE
 
     @property
@@ -329,7 +329,7 @@ class ObjectFamily:
             source=workbench.library.BUNDLED_OBJECT,
             surface=surface,
             finishes=instance.finishes,
-            metres=round(float(extent) * self.metres, 4),
+            size_in_metres=round(float(extent) * self.size_in_metres, 4),
             drives=instance.drives,
         )
 
@@ -364,7 +364,7 @@ def family(
 
 
 def sample_material(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     roughness: float,
     clearcoat: float = 0.0,
     spread: float = 0.2,
@@ -373,20 +373,22 @@ def sample_material(
         metal.
 
     Args:
-        draw: samples it; the canonical instance has the values that are passed.
+        sampler: samples it; the canonical instance has the values that are passed.
         roughness: canonical value.
         clearcoat: canonical value.
         spread: how far the roughness may be from its canonical value.
     """
-    sampled_roughness = draw(roughness, low=roughness - spread, high=roughness + spread)
-    sampled_clearcoat = (
-        draw(clearcoat, low=0.0, high=1.0) if draw.chance(0.3) else clearcoat
+    sampled_roughness = sampler(
+        roughness, low=roughness - spread, high=roughness + spread
     )
-    metallic = draw(0.0, low=0.3, high=0.8) if draw.chance(0.06) else 0.0
+    sampled_clearcoat = (
+        sampler(clearcoat, low=0.0, high=1.0) if sampler.chance(0.3) else clearcoat
+    )
+    metallic = sampler(0.0, low=0.3, high=0.8) if sampler.chance(0.06) else 0.0
     values = {
         "roughness": min(max(sampled_roughness, 0.12), 0.95),
         "metallic": metallic,
-        "specular": draw(0.5, low=0.3, high=0.7),
+        "specular": sampler(0.5, low=0.3, high=0.7),
         "clearcoat": sampled_clearcoat,
     }
     return assets.Material(**{name: round(value, 4) for name, value in values.items()})

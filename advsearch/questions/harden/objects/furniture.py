@@ -37,7 +37,7 @@ def _post(
     """Create a straight post between two points, with slightly beveled ends.
 
     Args:
-        tag: of its paint.
+        tag: tag of its paint.
         low, high: its ends.
         section: (M, 2), for a radius of 1.
         ends: radii at `low` and at `high`; the radius changes evenly between them.
@@ -59,18 +59,18 @@ def _post(
 
 
 @family(metres=0.01)
-def chair(draw: ParameterSampler) -> Instance:
+def chair(sampler: ParameterSampler) -> Instance:
     """Make a chair that faces +x, with its back at -x."""
-    width = draw(43.0, low=36.0, high=50.0)
-    depth = draw(42.0, low=36.0, high=48.0)
-    seat_height = draw(45.0, low=40.0, high=50.0)
-    total_height = draw(92.0, low=78.0, high=108.0)
-    seat_thickness = draw(3.6, low=2.4, high=5.5)
-    leg_radius = draw(2.1, low=1.5, high=3.0)
-    splay = draw(1.5, low=0.0, high=6.0)
-    lean = draw(5.0, low=1.0, high=11.0)
-    section = _leg_section(draw)
-    taper = (leg_radius * draw(0.75, low=0.55, high=1.0), leg_radius)
+    width = sampler(43.0, low=36.0, high=50.0)
+    depth = sampler(42.0, low=36.0, high=48.0)
+    seat_height = sampler(45.0, low=40.0, high=50.0)
+    total_height = sampler(92.0, low=78.0, high=108.0)
+    seat_thickness = sampler(3.6, low=2.4, high=5.5)
+    leg_radius = sampler(2.1, low=1.5, high=3.0)
+    splay = sampler(1.5, low=0.0, high=6.0)
+    lean = sampler(5.0, low=1.0, high=11.0)
+    section = _leg_section(sampler)
+    taper = (leg_radius * sampler(0.75, low=0.55, high=1.0), leg_radius)
     x = depth / 2 - leg_radius - 0.4
     y = width / 2 - leg_radius - 0.4
     patches: list[Patch] = []
@@ -91,7 +91,7 @@ def chair(draw: ParameterSampler) -> Instance:
         steps=3,
         cells=2,
     )
-    if draw.chance(0.35):
+    if sampler.chance(0.35):
         patches += shapes.box(
             "cushion",
             (0.5, 0.0, seat_height + 1.4),
@@ -100,9 +100,9 @@ def chair(draw: ParameterSampler) -> Instance:
             steps=3,
             cells=2,
         )
-    if draw.chance(0.55, canonical=True):
+    if sampler.chance(0.55, canonical=True):
         patches += _chair_rungs(
-            draw,
+            sampler,
             seat_height=seat_height,
             splay=splay,
             x=x,
@@ -111,7 +111,7 @@ def chair(draw: ParameterSampler) -> Instance:
             section=section,
         )
     patches += _chair_back(
-        draw,
+        sampler,
         x=x,
         y=y,
         seat_height=seat_height,
@@ -121,18 +121,18 @@ def chair(draw: ParameterSampler) -> Instance:
         section=section,
     )
     rotated = shapes.transform_patches(
-        patches, shapes.rotation("z", draw(8.0, low=-25.0, high=25.0))
+        patches, shapes.rotation("z", sampler(8.0, low=-25.0, high=25.0))
     )
     return Instance(
         rotated,
-        _chair_paints(draw, total_height),
-        sample_material(draw, roughness=0.45, clearcoat=0.2),
+        _chair_paints(sampler, total_height),
+        sample_material(sampler, roughness=0.45, clearcoat=0.2),
     )
 
 
-def _leg_section(draw: ParameterSampler) -> Array:
+def _leg_section(sampler: ParameterSampler) -> Array:
     """Sample the section (M, 2) of the legs of a chair: square or round."""
-    square = draw.chance(0.5, canonical=True)
+    square = sampler.chance(0.5, canonical=True)
     return (
         shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
         if square
@@ -152,10 +152,10 @@ def _chair_legs(
     """Create the four legs of a chair, which stand wider apart at the floor.
 
     Args:
-        x, y: of the top of the leg at +x and +y; the others mirror it.
+        x, y: x and y of the top of the leg at +x and +y; the others mirror it.
         splay: by how much a foot lies farther out than its top, along x and y.
-        seat_height: of the upper side of the seat.
-        seat_thickness: of the seat.
+        seat_height: seat height of the upper side of the seat.
+        seat_thickness: seat thickness of the seat.
         section: (M, 2), for a radius of 1.
         taper: radii at the floor and at the top.
     """
@@ -173,7 +173,7 @@ def _chair_legs(
 
 
 def _chair_rungs(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     seat_height: float,
     splay: float,
     x: float,
@@ -184,13 +184,13 @@ def _chair_rungs(
     """Create the rungs of a chair: one along each side, and one across between them.
 
     Args:
-        draw: samples their height.
-        seat_height: of the upper side of the seat.
+        sampler: samples their height.
+        seat_height: seat height of the upper side of the seat.
         splay, x, y, section: as in `_chair_legs`.
-        leg_radius: of the legs; rungs are thinner.
+        leg_radius: leg radius of the legs; rungs are thinner.
     """
     patches = list[Patch]()
-    low = seat_height * draw(0.36, low=0.25, high=0.6)
+    low = seat_height * sampler(0.36, low=0.25, high=0.6)
     # how far out the legs are at that height
     spread = splay * (1.0 - low / seat_height)
     front_x = x + spread
@@ -209,25 +209,25 @@ def _chair_rungs(
     return patches
 
 
-def _chair_paints(draw: ParameterSampler, total_height: float) -> dict[str, Paint]:
+def _chair_paints(sampler: ParameterSampler, total_height: float) -> dict[str, Paint]:
     """Sample the paints of a chair by the tags of its parts.
 
     All wood is painted with one paint, or else shows its grain along each part.
     Cushions, and sometimes the seat, have a fabric.
 
     Args:
-        draw: samples the paints.
-        total_height: of the chair.
+        sampler: samples the paints.
+        total_height: total height of the chair.
     """
-    offset = draw.offset()
-    timber = draw.sample_color(
+    offset = sampler.offset()
+    timber = sampler.sample_color(
         "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0
     )
-    paint_color = draw.sample_color(
+    paint_color = sampler.sample_color(
         "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040"
     )
-    painted = draw.chance(0.4)
-    wood_paint = paint_or_random(draw, total_height, solid(paint_color), wild=0.5)
+    painted = sampler.chance(0.4)
+    wood_paint = paint_or_random(sampler, total_height, solid(paint_color), wild=0.5)
 
     def grain(axis: int) -> Paint:
         """Return the paint of a part whose grain, if any, runs along an axis."""
@@ -237,14 +237,14 @@ def _chair_paints(draw: ParameterSampler, total_height: float) -> dict[str, Pain
             else wood(timber, scale=3.2, offset=offset, axis=axis, contrast=0.36)
         )
 
-    fabric = draw.sample_color("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
-    cover = draw.pick(
+    fabric = sampler.sample_color("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
+    cover = sampler.pick(
         clouded(fabric, factor=0.8, scale=1.5, offset=offset),
         stripes(fabric, shade(fabric, 1.5), cell=6.0),
         checks(fabric, parse_hex_color("efe6d4"), cell=4.0),
         dots(solid(fabric), parse_hex_color("f4efe4"), cell=6.0),
     )
-    seat_paint = cover if draw.chance(0.25) else grain(0)
+    seat_paint = cover if sampler.chance(0.25) else grain(0)
     return {
         "up": grain(2),
         "along": grain(0),
@@ -255,7 +255,7 @@ def _chair_paints(draw: ParameterSampler, total_height: float) -> dict[str, Pain
 
 
 def _chair_back(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     x: float,
     y: float,
     seat_height: float,
@@ -270,15 +270,15 @@ def _chair_back(
     without), horizontal bars ("ladder"), or one board ("panel").
 
     Args:
-        draw: samples the kind and its proportions.
-        x, y: of the tops of the legs, which the posts continue upwards.
-        seat_height: of the upper side of the seat.
-        total_height: of the top of the back.
+        sampler: samples the kind and its proportions.
+        x, y: x and y of the tops of the legs, which the posts continue upwards.
+        seat_height: seat height of the upper side of the seat.
+        total_height: total height of the top of the back.
         lean: by how much the top lies farther back than the seat.
         leg_radius: radius of the posts, at their lower end.
         section: (M, 2) of the posts, for a radius of 1.
     """
-    style = draw.pick("slats", "ladder", "panel", "arch")
+    style = sampler.pick("slats", "ladder", "panel", "arch")
     patches: list[Patch] = []
     foot = seat_height - 2.0  # inside the seat
 
@@ -297,7 +297,7 @@ def _chair_back(
     tilt = shapes.rotation(
         "y", -float(np.degrees(np.arctan2(lean, total_height - seat_height)))
     )
-    depth = draw(1.6, low=1.2, high=2.4)
+    depth = sampler(1.6, low=1.2, high=2.4)
 
     def slat(
         tag: str, z: float, width: float, height: float, center_y: float = 0.0
@@ -305,9 +305,9 @@ def _chair_back(
         """Create a board of the back, which leans with it.
 
         Args:
-            tag: of its paint.
+            tag: tag of its paint.
             z: height of its middle.
-            width, height: of the board.
+            width, height: width and height of the board.
             center_y: y of its middle.
         """
         return shapes.transform_patches(
@@ -329,7 +329,7 @@ def _chair_back(
                 inner_width,
                 0.09 * back_height,
             )
-        count = int(draw.pick(5, 3, 4, 6))
+        count = int(sampler.pick(5, 3, 4, 6))
         low = (
             seat_height + 0.22 * back_height if style == "slats" else seat_height - 1.0
         )
@@ -338,21 +338,21 @@ def _chair_back(
             patches += slat(
                 "up",
                 (low + top) / 2,
-                inner_width * draw(0.075, low=0.05, high=0.11),
+                inner_width * sampler(0.075, low=0.05, high=0.11),
                 top - low + 1.0,
                 inner_width * ((i + 1) / (count + 1) - 0.5),
             )
     elif style == "ladder":
-        count = int(draw.pick(3, 2, 4))
+        count = int(sampler.pick(3, 2, 4))
         for i in range(count):
             z = seat_height + back_height * (0.28 + 0.66 * i / max(1, count - 1))
             patches += slat(
-                "cross", z, inner_width, back_height * draw(0.15, low=0.1, high=0.2)
+                "cross", z, inner_width, back_height * sampler(0.15, low=0.1, high=0.2)
             )
     else:
-        tall = draw(0.6, low=0.35, high=0.75) * back_height
+        tall = sampler(0.6, low=0.35, high=0.75) * back_height
         patches += slat(
-            "cushion" if draw.chance(0.3) else "up",
+            "cushion" if sampler.chance(0.3) else "up",
             total_height - tall / 2 - 0.04 * back_height,
             inner_width,
             tall,
@@ -361,7 +361,7 @@ def _chair_back(
 
 
 def _shade(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     low: float,
     high: float,
     bottom_radius: float,
@@ -372,12 +372,12 @@ def _shade(
     Its profile is one closed loop: up the outside, over the rim, down the lining.
 
     Args:
-        draw: samples how much it bulges.
+        sampler: samples how much it bulges.
         low, high: heights of its edges.
-        bottom_radius, top_radius: of its edges.
+        bottom_radius, top_radius: bottom radius and top radius of its edges.
     """
     wall = 0.25
-    belly = draw(0.0, low=-0.1, high=0.12) * bottom_radius
+    belly = sampler(0.0, low=-0.1, high=0.12) * bottom_radius
     outer = shapes.spline(
         [
             (bottom_radius, low),
@@ -397,23 +397,23 @@ def _shade(
 
 
 def _lamp_base(
-    draw: ParameterSampler, style: str, low: float, radius: float, stem_radius: float
+    sampler: ParameterSampler, style: str, low: float, radius: float, stem_radius: float
 ) -> list[Patch]:
     """Create the base of a lamp, from the table to the bulb.
 
     Args:
-        draw: samples its proportions.
+        sampler: samples its proportions.
         style: "disc" (a flat foot with a thin stem), "body" or "gourd" (a body with a
             waist).
         low: height of its top.
-        radius: of the foot.
-        stem_radius: of the top.
+        radius: radius of the foot.
+        stem_radius: stem radius of the top.
     """
     # profiles of points (r, z): the lower side, and the flat top
     under = [(0.0, 0.0), (radius - 0.4, 0.0)]
     top = [(stem_radius, low), (0.0, low)]
     if style == "disc":
-        thick = draw(2.0, low=1.2, high=3.2)
+        thick = sampler(2.0, low=1.2, high=3.2)
         corners = [
             under[-1],
             (radius, 0.4),
@@ -429,8 +429,8 @@ def _lamp_base(
         return shapes.lathe(
             [("base", under), ("base", side), ("base", top)], columns=44
         )
-    belly = radius * draw(1.12, low=0.95, high=1.4)
-    belly_height = draw(0.38, low=0.28, high=0.6) * low  # height of the belly
+    belly = radius * sampler(1.12, low=0.95, high=1.4)
+    belly_height = sampler(0.38, low=0.28, high=0.6) * low  # height of the belly
     waist = [(0.45 * belly, 0.72 * low)]
     if style == "gourd":
         waist = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
@@ -460,19 +460,23 @@ def _lamp_base(
 
 
 def _shade_paint(
-    draw: ParameterSampler, linen: Color, offset: Array, low: float, total_height: float
+    sampler: ParameterSampler,
+    linen: Color,
+    offset: Array,
+    low: float,
+    total_height: float,
 ) -> Paint:
     """Sample the paint of a lamp's shade.
 
     Args:
-        draw: samples the pattern and the color of its second part.
+        sampler: samples the pattern and the color of its second part.
         linen: color of the cloth.
         offset: (3,) into the noise.
         low, total_height: heights of the shade's lower and upper edge.
     """
     weave = clouded(linen, factor=0.93, scale=1.2, offset=offset)
-    kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
-    accent = draw.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
+    kind = sampler.pick("plain", "band", "stripes", "dots", "rings", "gradient")
+    accent = sampler.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
     if kind == "band":
         for band in (
             between(0.0, low + 1.4),
@@ -483,13 +487,13 @@ def _shade_paint(
         weave = stripes(
             linen,
             accent,
-            cell=draw(5.0, low=3.0, high=9.0),
-            share=draw(0.4, low=0.2, high=0.6),
+            cell=sampler(5.0, low=3.0, high=9.0),
+            share=sampler(0.4, low=0.2, high=0.6),
         )
     elif kind == "dots":
-        weave = dots(weave, accent, cell=draw(6.0, low=4.0, high=9.0))
+        weave = dots(weave, accent, cell=sampler(6.0, low=4.0, high=9.0))
     elif kind == "rings":
-        weave = rings(linen, accent, period=draw(6.0, low=3.0, high=10.0))
+        weave = rings(linen, accent, period=sampler(6.0, low=3.0, high=10.0))
     elif kind == "gradient":
         weave = gradient(linen, shade(linen, 0.6), low=low, high=total_height)
     else:
@@ -498,29 +502,29 @@ def _shade_paint(
             between(total_height - 0.5, 2 * total_height),
         ):
             weave = over(weave, hem, solid(shade(linen, 0.75)))
-    return paint_or_random(draw, total_height, weave, wild=0.3)
+    return paint_or_random(sampler, total_height, weave, wild=0.3)
 
 
 @family(metres=0.01)
-def lamp(draw: ParameterSampler) -> Instance:
+def lamp(sampler: ParameterSampler) -> Instance:
     """Make a table lamp of random proportions, shade and base."""
-    total_height = draw(48.0, low=42.0, high=58.0)
-    shade_height = draw(20.0, low=14.0, high=24.0)
-    bottom_radius = draw(16.5, low=12.0, high=19.0)
-    top_radius = bottom_radius * draw(0.6, low=0.35, high=1.0)
+    total_height = sampler(48.0, low=42.0, high=58.0)
+    shade_height = sampler(20.0, low=14.0, high=24.0)
+    bottom_radius = sampler(16.5, low=12.0, high=19.0)
+    top_radius = bottom_radius * sampler(0.6, low=0.35, high=1.0)
     low = total_height - shade_height
-    radius = draw(7.4, low=6.0, high=9.5)
-    stem_radius = draw(0.8, low=0.6, high=1.3)
-    style = draw.pick("body", "disc", "gourd")
+    radius = sampler(7.4, low=6.0, high=9.5)
+    stem_radius = sampler(0.8, low=0.6, high=1.3)
+    style = sampler.pick("body", "disc", "gourd")
     base = _lamp_base(
-        draw,
+        sampler,
         style=style,
         low=low + 0.25 * shade_height,
         radius=radius,
         stem_radius=stem_radius,
     )
     patches = base + _shade(
-        draw,
+        sampler,
         low=low,
         high=total_height,
         bottom_radius=bottom_radius,
@@ -540,11 +544,11 @@ def lamp(draw: ParameterSampler) -> Instance:
         bottom_radius=bottom_radius,
         low=low,
     )
-    paints = _lamp_paints(draw, low, total_height, style)
+    paints = _lamp_paints(sampler, low, total_height, style)
     return Instance(
         patches,
         paints,
-        sample_material(draw, roughness=0.4, clearcoat=0.3),
+        sample_material(sampler, roughness=0.4, clearcoat=0.3),
         detail={"lining": 0.6},
     )
 
@@ -559,8 +563,9 @@ def _lamp_frame(
     """Create the rod of a lamp and the three spokes that hold its shade.
 
     Args:
-        total_height: of the lamp, which is the upper edge of the shade.
-        shade_height, top_radius, bottom_radius: of the shade.
+        total_height: total height of the lamp, which is the upper edge of the shade.
+        shade_height, top_radius, bottom_radius: shade height, top radius and bottom
+            radius of the shade.
         low: height of the shade's lower edge.
     """
     patches = list[Patch]()
@@ -589,32 +594,32 @@ def _lamp_frame(
 
 
 def _lamp_paints(
-    draw: ParameterSampler, low: float, total_height: float, style: str
+    sampler: ParameterSampler, low: float, total_height: float, style: str
 ) -> dict[str, Paint]:
     """Sample the paints of a lamp by the tags of its parts.
 
     Args:
-        draw: samples the paints.
+        sampler: samples the paints.
         low, total_height: heights of the shade's edges.
-        style: of the base, as for `_lamp_base`.
+        style: style of the base, as for `_lamp_base`.
     """
-    offset = draw.offset()
-    linen = draw.sample_color(
+    offset = sampler.offset()
+    linen = sampler.sample_color(
         "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25
     )
     cloth = _shade_paint(
-        draw, linen=linen, offset=offset, low=low, total_height=total_height
+        sampler, linen=linen, offset=offset, low=low, total_height=total_height
     )
-    clay = draw.sample_color(
+    clay = sampler.sample_color(
         "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
     )
     body = paint_or_random(
-        draw,
+        sampler,
         total_height,
         clouded(clay, factor=1.3, scale=4.0, offset=offset),
         wild=0.35,
     )
-    metal = draw.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
+    metal = sampler.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     return {
         "shade": cloth,
         "rim": solid(shade(linen, 0.8)),
@@ -622,5 +627,5 @@ def _lamp_paints(
         "bulb": solid("fbf6e6"),
         "body": body,
         "foot": solid(metal),
-        "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
+        "base": body if style == "disc" and sampler.chance(0.5) else solid(metal),
     }

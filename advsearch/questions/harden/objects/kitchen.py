@@ -26,19 +26,19 @@ from advsearch.questions.harden.objects.textures import (
 )
 
 
-def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
+def _spout(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """Create a spout along +x with an open, hollow end.
 
     One closed ring is swept along the path to the tip, then over the lip and back down
     the inside for a few points, where it shrinks to a point.
 
     Args:
-        draw: samples its proportions.
-        radius, height: of the teapot's body.
+        sampler: samples its proportions.
+        radius, height: radius and height of the teapot's body.
     """
-    path = _spout_path(draw, radius, height)
-    root_radius = draw(1.75, low=1.3, high=2.2)
-    tip_radius = draw(0.72, low=0.55, high=0.95)
+    path = _spout_path(sampler, radius, height)
+    root_radius = sampler(1.75, low=1.3, high=2.2)
+    tip_radius = sampler(0.72, low=0.55, high=0.95)
     scale = (
         tip_radius
         + (root_radius - tip_radius) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
@@ -75,23 +75,23 @@ def _spout(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
     )
 
 
-def _spout_path(draw: ParameterSampler, radius: float, height: float) -> Array:
+def _spout_path(sampler: ParameterSampler, radius: float, height: float) -> Array:
     """Sample the path (18, 3) of a spout in the x-z plane, from the body to the tip.
 
     A curved one has the shape of an S: it bulges out and downwards in its lower half,
         and is bent back a little before the tip.
 
     Args:
-        draw: samples its style and its ends.
-        radius, height: of the teapot's body.
+        sampler: samples its style and its ends.
+        radius, height: radius and height of the teapot's body.
     """
-    style = draw.pick("curved", "straight")
-    start = np.array([radius * 0.72, 0.0, height * draw(0.34, low=0.26, high=0.42)])
+    style = sampler.pick("curved", "straight")
+    start = np.array([radius * 0.72, 0.0, height * sampler(0.34, low=0.26, high=0.42)])
     tip = np.array(
         [
-            radius * draw(1.85, low=1.6, high=2.0),
+            radius * sampler(1.85, low=1.6, high=2.0),
             0.0,
-            height * draw(0.94, low=0.8, high=1.02),
+            height * sampler(0.94, low=0.8, high=1.02),
         ]
     )
     # how far it departs from a straight line, as a fraction of the radius
@@ -104,29 +104,29 @@ def _spout_path(draw: ParameterSampler, radius: float, height: float) -> Array:
 
 
 @family(metres=0.01)
-def teapot(draw: ParameterSampler) -> Instance:
+def teapot(sampler: ParameterSampler) -> Instance:
     """Make a teapot with spout, handle and lid of random proportions."""
-    radius = draw(7.2, low=6.4, high=8.0)
-    height = draw(10.2, low=8.0, high=12.5)
-    side, body = _teapot_body(draw, radius, height)
-    grip = _teapot_handle(draw, side, radius, height)
+    radius = sampler(7.2, low=6.4, high=8.0)
+    height = sampler(10.2, low=8.0, high=12.5)
+    side, body = _teapot_body(sampler, radius, height)
+    grip = _teapot_handle(sampler, side, radius, height)
     patches = [
         *body,
-        *_spout(draw, radius, height),
+        *_spout(sampler, radius, height),
         *shapes.transform_patches(grip, shapes.rotation("z", 180.0)),
     ]
     patches = shapes.transform_patches(patches, shapes.rotation("z", 118.0))
-    paints = _teapot_paints(draw, height)
+    paints = _teapot_paints(sampler, height)
     return Instance(
         patches,
         paints,
-        sample_material(draw, roughness=0.25, clearcoat=0.7),
+        sample_material(sampler, roughness=0.25, clearcoat=0.7),
         detail={"base": 0.6},
     )
 
 
 def _teapot_body(
-    draw: ParameterSampler, radius: float, height: float
+    sampler: ParameterSampler, radius: float, height: float
 ) -> tuple[Array, list[Patch]]:
     """Return the profile (26, 2) of the side, and the body with its lid and knob.
 
@@ -134,15 +134,15 @@ def _teapot_body(
     mouth.
 
     Args:
-        draw: samples its proportions.
-        radius: of the belly.
-        height: of the mouth.
+        sampler: samples its proportions.
+        radius: radius of the belly.
+        height: height of the mouth.
     """
-    foot = radius * draw(0.58, low=0.5, high=0.75)
-    mouth = radius * draw(0.48, low=0.42, high=0.6)
+    foot = radius * sampler(0.58, low=0.5, high=0.75)
+    mouth = radius * sampler(0.48, low=0.42, high=0.6)
     # a fraction of the height, and of the radius halfway up to the belly
-    belly_height = draw(0.45, low=0.35, high=0.58)
-    fullness = draw(0.9, low=0.82, high=0.97)
+    belly_height = sampler(0.45, low=0.35, high=0.58)
+    fullness = sampler(0.9, low=0.82, high=0.97)
     knots = [
         (foot, 0.5),
         (radius * fullness, 0.5 * belly_height * height),
@@ -151,8 +151,8 @@ def _teapot_body(
         (mouth, height),
     ]
     side = shapes.spline(knots, count=26)
-    dome = draw(1.5, low=0.7, high=2.4)
-    knob_radius = draw(1.0, low=0.7, high=1.4)
+    dome = sampler(1.5, low=0.7, high=2.4)
+    knob_radius = sampler(1.0, low=0.7, high=1.4)
     top = height + dome + 0.2  # of the lid
     # over the edge of the mouth, with a narrow groove where the lid begins
     rim = [
@@ -195,32 +195,32 @@ def _teapot_body(
 
 
 def _teapot_handle(
-    draw: ParameterSampler, side: Array, radius: float, height: float
+    sampler: ParameterSampler, side: Array, radius: float, height: float
 ) -> list[Patch]:
     """Create the handle in the x-z plane, on the +x side of the body.
 
     Args:
-        draw: samples its curve and its section.
+        sampler: samples its curve and its section.
         side: profile (K, 2) of the body.
-        radius, height: of the body.
+        radius, height: radius and height of the body.
     """
-    span = draw(0.9, low=0.75, high=1.0)
+    span = sampler(0.9, low=0.75, high=1.0)
     high = height * 0.84
     low = height * (0.84 - 0.62 * span)
     # both ends lie a little inside the wall
     top_root, low_root = (shapes.radius_at_height(side, z) - 0.25 for z in (high, low))
-    reach = radius * draw(0.72, low=0.5, high=0.9)
-    lift = draw(0.05, low=-0.02, high=0.2) * height
+    reach = radius * sampler(0.72, low=0.5, high=0.9)
+    lift = sampler(0.05, low=-0.02, high=0.2) * height
     knots = [
         (top_root, high),
         (radius + 0.35 * reach, high + lift),
         (radius + 0.9 * reach, high - 0.1 * (high - low)),
-        (radius + draw(0.95, low=0.7, high=1.0) * reach, 0.5 * (high + low)),
+        (radius + sampler(0.95, low=0.7, high=1.0) * reach, 0.5 * (high + low)),
         (radius + 0.4 * reach, low + 0.08 * (high - low)),
         (low_root, low),
     ]
     section = shapes.ellipse(
-        draw(0.5, low=0.4, high=0.7), draw(0.62, low=0.45, high=0.85), count=16
+        sampler(0.5, low=0.4, high=0.7), sampler(0.62, low=0.45, high=0.85), count=16
     )
     return shapes.sweep(
         "handle",
@@ -230,15 +230,15 @@ def _teapot_handle(
     )
 
 
-def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
+def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
     """Sample the paints of a teapot of a height, by the tags of its parts."""
-    offset = draw.offset()
-    clay = draw.sample_color(
+    offset = sampler.offset()
+    clay = sampler.sample_color(
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
     )
     glaze = clouded(clay, factor=1.25, scale=3.5, offset=offset, contrast=1.6)
-    second = draw.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
-    kind = draw.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
+    second = sampler.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
+    kind = sampler.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
     if kind == "bands":
         paint = over(
             glaze, between(0.7 * height, 0.74 * height, soft=0.1), solid(second)
@@ -250,41 +250,41 @@ def _teapot_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
         paint = dots(
             glaze,
             second,
-            cell=draw(2.6, low=1.6, high=4.0),
-            radius=draw(0.28, low=0.18, high=0.4),
+            cell=sampler(2.6, low=1.6, high=4.0),
+            radius=sampler(0.28, low=0.18, high=0.4),
         )
     elif kind == "stripes":
         paint = stripes(
             clay,
             second,
-            cell=draw(3.0, low=1.5, high=5.0),
-            share=draw(0.4, low=0.2, high=0.6),
+            cell=sampler(3.0, low=1.5, high=5.0),
+            share=sampler(0.4, low=0.2, high=0.6),
         )
     elif kind == "rings":
-        paint = rings(clay, second, period=draw(2.0, low=1.0, high=4.0))
+        paint = rings(clay, second, period=sampler(2.0, low=1.0, high=4.0))
     elif kind == "speckle":
         paint = speckled(glaze, second, scale=0.5, offset=offset)
     else:
         paint = glaze
-    paint = paint_or_random(draw, height + 4.0, paint)
-    trim = draw.pick(glaze, solid(second), paint)
+    paint = paint_or_random(sampler, height + 4.0, paint)
+    trim = sampler.pick(glaze, solid(second), paint)
     return {
         "base": solid("a98663"),
         "body": paint,
-        "lid": draw.pick(paint, trim),
-        "spout": draw.pick(glaze, paint),
-        "handle": draw.pick(glaze, trim),
-        "knob": solid(second) if draw.chance(0.5, canonical=True) else trim,
+        "lid": sampler.pick(paint, trim),
+        "spout": sampler.pick(glaze, paint),
+        "handle": sampler.pick(glaze, trim),
+        "knob": solid(second) if sampler.chance(0.5, canonical=True) else trim,
     }
 
 
 @family(metres=0.01)
-def frying_pan(draw: ParameterSampler) -> Instance:
+def frying_pan(sampler: ParameterSampler) -> Instance:
     """Make a frying pan with a random handle."""
-    base = draw(10.5, low=9.0, high=11.5)
-    rim = draw(13.0, low=12.2, high=14.5)
-    depth = draw(4.2, low=2.8, high=5.5)
-    wall = draw(0.38, low=0.3, high=0.55)
+    base = sampler(10.5, low=9.0, high=11.5)
+    rim = sampler(13.0, low=12.2, high=14.5)
+    depth = sampler(4.2, low=2.8, high=5.5)
+    wall = sampler(0.38, low=0.3, high=0.55)
     side = shapes.spline(
         [
             (base - 0.8, 0.0),
@@ -296,20 +296,20 @@ def frying_pan(draw: ParameterSampler) -> Instance:
     )
     body = shapes.vessel(side, wall=wall, floor=0.5, columns=64, step=1.6)
 
-    length = draw(18.0, low=14.0, high=21.0)
+    length = sampler(18.0, low=14.0, high=21.0)
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
-    rise = draw(2.6, low=0.6, high=4.5)
-    grip = _pan_handle(draw, root, length, rise)
+    rise = sampler(2.6, low=0.6, high=4.5)
+    grip = _pan_handle(sampler, root, length, rise)
     rivets = _wall_rivets(side, depth, wall)
     bracket = _pan_bracket(rim, depth, length, rise)
     patches = shapes.transform_patches(
         [*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0)
     )
-    paints = _pan_paints(draw, rim, depth)
+    paints = _pan_paints(sampler, rim, depth)
     return Instance(
         patches,
         paints,
-        sample_material(draw, roughness=0.38, clearcoat=0.3),
+        sample_material(sampler, roughness=0.38, clearcoat=0.3),
         detail={"base": 0.5},
     )
 
@@ -325,8 +325,8 @@ def _pan_bracket(rim: float, depth: float, length: float, rise: float) -> list[P
 
     Args:
         rim: radius of the pan's rim.
-        depth: of the pan.
-        length, rise: of the handle.
+        depth: depth of the pan.
+        length, rise: length and rise of the handle.
     """
     spine = [
         (rim - 1.4, 0.72 * depth),
@@ -343,7 +343,7 @@ def _pan_bracket(rim: float, depth: float, length: float, rise: float) -> list[P
 
 
 def _pan_handle(
-    draw: ParameterSampler, root: Array, length: float, rise: float
+    sampler: ParameterSampler, root: Array, length: float, rise: float
 ) -> list[Patch]:
     """Create a handle along +x, which rises and has a round end.
 
@@ -351,7 +351,7 @@ def _pan_handle(
         width after a third.
 
     Args:
-        draw: samples its curve and its section.
+        sampler: samples its curve and its section.
         root: where it begins (3,).
         length: along x.
         rise: by how much it is higher at its end, about.
@@ -360,14 +360,14 @@ def _pan_handle(
         (0.0, 0.0),
         (0.22 * length, 0.55 * rise),
         (0.6 * length, rise),
-        (length, rise * draw(1.05, low=0.8, high=1.2)),
+        (length, rise * sampler(1.05, low=0.8, high=1.2)),
     ]
     path = shapes.spline(root + shapes.to_xz_plane(np.array(knots)), count=26)
     t = np.linspace(0.0, 1.0, 26)  # from the root to the end
-    width = draw(1.15, low=0.85, high=1.5)
-    thick = draw(0.62, low=0.45, high=0.9)
+    width = sampler(1.15, low=0.85, high=1.5)
+    thick = sampler(0.62, low=0.45, high=0.9)
     shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (
-        1.0 + draw(0.12, low=0.0, high=0.25) * np.sin(np.pi * t)
+        1.0 + sampler(0.12, low=0.0, high=0.25) * np.sin(np.pi * t)
     )
     # a quarter of an ellipse over the last 6 %
     round_end = np.sqrt(
@@ -375,7 +375,7 @@ def _pan_handle(
     )
     thickness = thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0))
     scale = np.stack([thickness, width * shape], axis=1) * round_end[:, None]
-    if draw.chance(0.5, canonical=True):
+    if sampler.chance(0.5, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=20)
     else:
         section = shapes.rectangle(2.0, 2.0, bevel=0.7)
@@ -391,16 +391,20 @@ def _pan_rivets(radius: float, height: float) -> list[Patch]:
     return left + right
 
 
-def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, Paint]:
+def _pan_paints(
+    sampler: ParameterSampler, rim: float, depth: float
+) -> dict[str, Paint]:
     """Sample the paints of a pan, by the tags of its parts.
 
     Args:
-        draw: samples the paints.
+        sampler: samples the paints.
         rim: radius of its rim.
         depth: height of its rim.
     """
-    offset = draw.offset()
-    coat = draw.sample_color("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
+    offset = sampler.offset()
+    coat = sampler.sample_color(
+        "2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2
+    )
 
     def turned(t: Texels) -> Array:
         """Return the mask of faint rings, as turning leaves."""
@@ -420,9 +424,9 @@ def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, P
         offset=offset,
         amount=0.06,
     )
-    if draw.chance(0.4, canonical=True):
+    if sampler.chance(0.4, canonical=True):
         inside = over(inside, turned, solid(shade(coat, 1.6)))
-    outer = draw.sample_color(
+    outer = sampler.sample_color(
         "a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b"
     )
     # darker towards the bottom, with a dark line at the rim
@@ -431,20 +435,20 @@ def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, P
         enamel, between(-1.0, 0.25 * depth, soft=0.6 * depth), solid(shade(outer, 0.6))
     )
     enamel = over(enamel, between(depth - 0.1, 2 * depth, soft=0.15), solid("2b2c2e"))
-    outside = paint_or_random(draw, 2 * rim, enamel, wild=0.3)
-    inside = paint_or_random(draw, 2 * rim, inside, wild=0.2)
-    style = draw.pick("black", "wood", "wild")
+    outside = paint_or_random(sampler, 2 * rim, enamel, wild=0.3)
+    inside = paint_or_random(sampler, 2 * rim, inside, wild=0.2)
+    style = sampler.pick("black", "wood", "wild")
     handle_paints = {
-        "black": solid(draw.sample_color("1b1b1d", "2a2a2c", wild=0.1)),
+        "black": solid(sampler.sample_color("1b1b1d", "2a2a2c", wild=0.1)),
         "wood": wood(
-            draw.sample_color("8a5a32", "b98550", wild=0.0),
+            sampler.sample_color("8a5a32", "b98550", wild=0.0),
             scale=1.4,
             offset=offset,
             axis=0,
         ),
-        "wild": solid(draw.sample_color("a9231f")),
+        "wild": solid(sampler.sample_color("a9231f")),
     }
-    steel = solid(draw.sample_color("b9bcc0", "8c8f94", wild=0.1))
+    steel = solid(sampler.sample_color("b9bcc0", "8c8f94", wild=0.1))
     paints = {
         "outside": outside,
         "inside": inside,
@@ -452,5 +456,5 @@ def _pan_paints(draw: ParameterSampler, rim: float, depth: float) -> dict[str, P
         "rivet": steel,
         "bracket": steel,
     }
-    paints["base"] = solid(draw.sample_color("77797c", "2b2c2e"))
+    paints["base"] = solid(sampler.sample_color("77797c", "2b2c2e"))
     return paints

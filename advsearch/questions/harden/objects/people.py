@@ -57,7 +57,7 @@ def _patches(person: Any) -> list[Patch]:
     the corresponding points of the reference body.
 
     Args:
-        person: of `workbench.library.make_person`.
+        person: person of `workbench.library.make_person`.
     """
     data = person.data
     vertices = person.standing_points.numpy().astype(np.float64)
@@ -231,42 +231,44 @@ def _irises(t: Texels, color: Array) -> Array:
 
 
 @family(metres=1.0, texels=512)
-def person(draw: ParameterSampler) -> Instance:
+def person(sampler: ParameterSampler) -> Instance:
     """Make a person of random phenotype, pose and clothes."""
-    is_woman = draw.chance(0.5)
+    is_woman = sampler.chance(0.5)
     gender = 0.0 if is_woman else 1.0
     height_reduction = 0.08 if is_woman else 0.0  # metres
     phenotype = {
         "gender": gender,
-        "height": draw(1.7, low=1.52, high=1.9) - height_reduction,
-        "weight": draw(0.5, low=0.25, high=0.8),
-        "age": draw(35.0, low=16.0, high=75.0),
-        "stride": draw(0.0, low=0.0, high=1.2),
-        "walk": draw(0.0, low=0.0, high=360.0),
+        "height": sampler(1.7, low=1.52, high=1.9) - height_reduction,
+        "weight": sampler(0.5, low=0.25, high=0.8),
+        "age": sampler(35.0, low=16.0, high=75.0),
+        "stride": sampler(0.0, low=0.0, high=1.2),
+        "walk": sampler(0.0, low=0.0, high=360.0),
     }
     body = workbench.library.make_person(phenotype)
     skin = parse_hex_color(
-        draw.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4")
+        sampler.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4")
     )
-    hair = parse_hex_color(draw.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c"))
+    hair = parse_hex_color(
+        sampler.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c")
+    )
     paints = {
         "shirt": _woven(
-            draw.sample_color(
+            sampler.sample_color(
                 "5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"
             ),
             depth=0.16,
         ),
         "trousers": _jeans(
-            draw.sample_color(
+            sampler.sample_color(
                 "31374a", "4a4640", "1f2226", "6b6152", "5a6270", wild=0.15
             )
         ),
         "skin": _face(skin, hair),
         "hair": _strands(hair),
         "shoes": _leather(
-            draw.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", wild=0.15)
+            sampler.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", wild=0.15)
         ),
-        "eyes": _irises(parse_hex_color(draw.pick("4a3424", "5a7a94", "5f6f4a"))),
+        "eyes": _irises(parse_hex_color(sampler.pick("4a3424", "5a7a94", "5f6f4a"))),
     }
     detail = {"skin": 0.8, "shoes": 0.8, "shirt": 1.15}
     return Instance(

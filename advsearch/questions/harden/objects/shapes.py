@@ -175,7 +175,7 @@ def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Arra
     It is counter-clockwise.
 
     Args:
-        width, height: of the rectangle.
+        width, height: width and height of the rectangle.
         bevel: distance from a corner at which its rounding begins.
         steps: edges of a rounded corner.
     """
@@ -239,7 +239,7 @@ def transform_patches(
     """Rotate patches, then translate them, together with what is painted on them.
 
     Args:
-        patches: to move; they are not changed.
+        patches: patches to move; they are not changed.
         rotation: matrix (3, 3); None for no rotation.
         offset: (3,).
     """
@@ -281,7 +281,7 @@ def grid(
     """Create the patch of a grid of points (R, C, 3) with unit normals.
 
     Args:
-        tag: of the paint.
+        tag: tag of the paint.
         points: u grows from column to column, and v from row to row; the cross
             product of these directions points outwards.
         normals: (R, C, 3).
@@ -399,7 +399,7 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     length along the profile, as a fraction of the whole.
 
     Args:
-        tag: of the paint.
+        tag: tag of the paint.
         profile: (K, 2) points (r, z).
         normals: (K, 2), as (r, z), at these points.
         columns: faces around.
@@ -490,7 +490,7 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     A band that is much wider than high is cut into 2 or 4 charts.
 
     Args:
-        tag: of the paint.
+        tag: tag of the paint.
         profile: (K, 2) points (r, z).
         normals: (K, 2), as (r, z), at these points.
         columns: faces around.
@@ -647,9 +647,9 @@ def sphere(
     """Create a sphere of three charts: two polar caps and a band.
 
     Args:
-        tag: of the paint.
-        radius: of the sphere.
-        centre: of the sphere.
+        tag: tag of the paint.
+        radius: radius of the sphere.
+        centre: centre of the sphere.
         rows: faces from pole to pole.
         columns: faces around the z axis.
     """
@@ -701,7 +701,7 @@ def sweep(
     """Create the surface that a closed section sweeps along a path (N, 3).
 
     Args:
-        tag: of the paint.
+        tag: tag of the paint.
         path: the centres of the section.
         section: (M, 2) counter-clockwise, coordinates along the first and second
             normal.
@@ -850,8 +850,8 @@ def box(
     """Create a box with rounded edges and smooth normals, with a chart for each face.
 
     Args:
-        tag: of the paint.
-        centre: of the box.
+        tag: tag of the paint.
+        centre: centre of the box.
         size: along x, y and z.
         bevel: radius of the edges.
         steps: cells across half of an edge's rounding.
@@ -913,7 +913,7 @@ def _rounded_face(
     which is the box made smaller by the bevel on each side, until it is `bevel` away.
 
     Args:
-        axis: that the face is perpendicular to: 0, 1 or 2.
+        axis: axis that the face is perpendicular to: 0, 1 or 2.
         side: 1 of the upper face, -1 of the lower one.
         u, v: coordinates (U,) and (V,) along the next two axes, `axis` + 1 and + 2.
         half: half the size of the box (3,).
@@ -965,7 +965,7 @@ def carve_patches(
     Args:
         patches: smooth ones that are not transformed yet.
         inside: the field, positive inside.
-        tag: of the inside; None removes it.
+        tag: tag of the inside; None removes it.
     """
     carved_patches = []
     for patch in patches:

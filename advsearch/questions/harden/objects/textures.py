@@ -382,19 +382,19 @@ def facing(
     return weight
 
 
-def sample_paint(draw: ParameterSampler, size: float) -> Paint:
+def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
     """Sample a paint of any kind and colors, for textures that do not indicate the
     class.
 
     Args:
-        draw: with a generator.
-        size: of the instance, about.
+        sampler: sampler with a generator.
+        size: size of the instance, about.
     """
-    first_color = draw.sample_color("808080", wild=1.0)
-    second_color = draw.sample_color("808080", wild=1.0)
-    cell = size * draw(0.1, low=0.05, high=0.2)
-    noise_offset = draw.offset()
-    kind = draw.pick(
+    first_color = sampler.sample_color("808080", wild=1.0)
+    second_color = sampler.sample_color("808080", wild=1.0)
+    cell = size * sampler(0.1, low=0.05, high=0.2)
+    noise_offset = sampler.offset()
+    kind = sampler.pick(
         "solid",
         "rings",
         "stripes",
@@ -411,16 +411,16 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
             first_color,
             second_color,
             period=cell,
-            share=draw(0.5, low=0.2, high=0.8),
-            axis=int(draw.pick(0, 1, 2)),
+            share=sampler(0.5, low=0.2, high=0.8),
+            axis=int(sampler.pick(0, 1, 2)),
         )
     if kind == "stripes":
         return stripes(
             first_color,
             second_color,
             cell=cell,
-            share=draw(0.5, low=0.2, high=0.8),
-            slant=int(draw.pick(0, 1, 3)),
+            share=sampler(0.5, low=0.2, high=0.8),
+            slant=int(sampler.pick(0, 1, 3)),
         )
     if kind == "checks":
         return checks(first_color, second_color, cell=cell)
@@ -429,7 +429,7 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
             solid(first_color),
             second_color,
             cell=cell,
-            radius=draw(0.3, low=0.18, high=0.42),
+            radius=sampler(0.3, low=0.18, high=0.42),
         )
     if kind == "zigzag":
         return zigzag(first_color, second_color, cell=cell)
@@ -439,7 +439,7 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
             second_color,
             scale=1.5 * cell,
             offset=noise_offset,
-            contrast=draw(2.0, low=1.0, high=4.0),
+            contrast=sampler(2.0, low=1.0, high=4.0),
         )
     if kind == "speckled":
         return speckled(
@@ -447,27 +447,31 @@ def sample_paint(draw: ParameterSampler, size: float) -> Paint:
             second_color,
             scale=0.4 * cell,
             offset=noise_offset,
-            amount=draw(0.2, low=0.1, high=0.4),
+            amount=sampler(0.2, low=0.1, high=0.4),
         )
     if kind == "gradient":
         return gradient(
-            first_color, second_color, low=0.0, high=size, axis=int(draw.pick(0, 1, 2))
+            first_color,
+            second_color,
+            low=0.0,
+            high=size,
+            axis=int(sampler.pick(0, 1, 2)),
         )
     if kind == "wood":
         return wood(
-            draw.sample_color("9a6a3c", "c89b62", "5b3a22"),
+            sampler.sample_color("9a6a3c", "c89b62", "5b3a22"),
             scale=0.5 * cell,
             offset=noise_offset,
-            axis=int(draw.pick(0, 1, 2)),
+            axis=int(sampler.pick(0, 1, 2)),
         )
     return solid(first_color)
 
 
 def paint_or_random(
-    draw: ParameterSampler, size: float, paint: Paint, wild: float = 0.35
+    sampler: ParameterSampler, size: float, paint: Paint, wild: float = 0.35
 ) -> Paint:
     """Return the paint, or with probability `wild` a sample of `sample_paint`.
 
     The canonical instance has the paint.
     """
-    return sample_paint(draw, size) if draw.chance(wild) else paint
+    return sample_paint(sampler, size) if sampler.chance(wild) else paint

@@ -105,10 +105,10 @@ def _press_seams(
         edge.
 
     Args:
-        patches: of the sphere, around the origin.
-        radius: of the sphere.
-        depth: of the groove, as a fraction of the radius; it falls with the distance
-            from the seam as a Gaussian.
+        patches: patches of the sphere, around the origin.
+        radius: radius of the sphere.
+        depth: depth of the groove, as a fraction of the radius; it falls with the
+            distance from the seam as a Gaussian.
         seam: returns the distance (N,) of directions (N, 3) of about length 1 to the
             seam.
     """
@@ -162,22 +162,22 @@ def _star(t: Texels, radius: float) -> Array:
 
 
 @family(metres=0.01)
-def ball(draw: ParameterSampler) -> Instance:
+def ball(sampler: ParameterSampler) -> Instance:
     """Make a football, or a ball of another pattern."""
     radius = 11.0
-    style = draw.pick(
+    style = sampler.pick(
         "football", "beach", "basket", "tennis", "star", "plain", "wild", "wild"
     )
-    squash = draw(1.0, low=0.95, high=1.03)
+    squash = sampler(1.0, low=0.95, high=1.03)
     patches = shapes.sphere("ball", radius, rows=28, columns=48)
-    turn = shapes.rotation("z", draw(12.0, low=0.0, high=360.0)) @ shapes.rotation(
-        "x", draw(24.0, low=0.0, high=180.0)
+    turn = shapes.rotation("z", sampler(12.0, low=0.0, high=360.0)) @ shapes.rotation(
+        "x", sampler(24.0, low=0.0, high=180.0)
     )
-    offset = draw.offset()
-    light = draw.sample_color("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
-    dark = draw.sample_color("1d1f22", "23395d", "b5442e", wild=0.3)
+    offset = sampler.offset()
+    light = sampler.sample_color("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
+    dark = sampler.sample_color("1d1f22", "23395d", "b5442e", wild=0.3)
     paint, patches = _ball_surface(
-        draw,
+        sampler,
         style=style,
         light=light,
         radius=radius,
@@ -190,12 +190,12 @@ def ball(draw: ParameterSampler) -> Instance:
         for p in shapes.transform_patches(patches, turn)
     ]
     return Instance(
-        shaped, {"ball": paint}, sample_material(draw, roughness=0.4, clearcoat=0.3)
+        shaped, {"ball": paint}, sample_material(sampler, roughness=0.4, clearcoat=0.3)
     )
 
 
 def _ball_surface(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     style: str,
     light: Array,
     radius: float,
@@ -208,23 +208,23 @@ def _ball_surface(
     A football and a basketball have grooves pressed into their patches.
 
     Args:
-        draw: samples colors.
+        sampler: samples colors.
         style: "football", "beach", "basket", "tennis", "star", "plain" or "wild".
         light, dark: colors of some styles.
-        radius: of the ball.
+        radius: radius of the ball.
         offset: (3,) into the noise.
-        patches: of a sphere.
+        patches: patches of a sphere.
     """
     if style == "beach":
         bright = [
-            draw.sample_color(code, wild=0.5)
+            sampler.sample_color(code, wild=0.5)
             for code in "d8342c f4f4f2 2f6fb5 f4f4f2 eeb52d f4f4f2".split()
         ]
         paint = _beach(
-            [color if draw.chance(0.7) else light for color in bright], light, radius
+            [color if sampler.chance(0.7) else light for color in bright], light, radius
         )
     elif style == "basket":
-        skin = draw.sample_color("c8642b", "b5532a", "7a3b22", wild=0.2)
+        skin = sampler.sample_color("c8642b", "b5532a", "7a3b22", wild=0.2)
         paint = over(
             clouded(skin, factor=0.85, scale=0.7, offset=offset),
             _near_to(basketball_seams, reach=0.03),
@@ -232,7 +232,7 @@ def _ball_surface(
         )
         patches = _press_seams(patches, radius, 0.015, basketball_seams)
     elif style == "tennis":
-        felt = draw.sample_color("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
+        felt = sampler.sample_color("c9d63c", "d5dc4a", "e08a2e", wild=0.25)
         paint = over(
             clouded(felt, factor=0.85, scale=0.6, offset=offset),
             _near_to(tennis_seam, reach=0.045),
@@ -243,7 +243,7 @@ def _ball_surface(
     elif style == "plain":
         paint = clouded(dark, factor=1.2, scale=3.0, offset=offset)
     elif style == "wild":
-        paint = sample_paint(draw, 2 * radius)
+        paint = sample_paint(sampler, 2 * radius)
     else:
         paint = _football(light, dark, offset)
         patches = _press_seams(
@@ -257,44 +257,46 @@ def _ball_surface(
 
 
 @family(metres=0.01)
-def banana(draw: ParameterSampler) -> Instance:
+def banana(sampler: ParameterSampler) -> Instance:
     """Make a banana of random bend and ripeness."""
-    length = draw(19.0, low=15.0, high=22.0)
-    bend = draw(105.0, low=65.0, high=130.0)
-    thick = draw(1.65, low=1.45, high=2.1)
-    stem = draw(2.4, low=1.6, high=3.6)
-    path, radius = _banana_shape(draw, bend=bend, length=length, stem=stem, thick=thick)
-    section = _banana_section(draw)
+    length = sampler(19.0, low=15.0, high=22.0)
+    bend = sampler(105.0, low=65.0, high=130.0)
+    thick = sampler(1.65, low=1.45, high=2.1)
+    stem = sampler(2.4, low=1.6, high=3.6)
+    path, radius = _banana_shape(
+        sampler, bend=bend, length=length, stem=stem, thick=thick
+    )
+    section = _banana_section(sampler)
     patches = shapes.sweep(
         "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
     )
     patches = shapes.transform_patches(
-        patches, shapes.rotation("y", draw(9.0, low=0.0, high=14.0))
+        patches, shapes.rotation("y", sampler(9.0, low=0.0, high=14.0))
     )
     patches = shapes.transform_patches(
-        patches, shapes.rotation("z", draw(78.0, low=45.0, high=120.0))
+        patches, shapes.rotation("z", sampler(78.0, low=45.0, high=120.0))
     )
 
-    paint = _banana_paint(draw, path, stem)
+    paint = _banana_paint(sampler, path, stem)
 
     return Instance(
         patches,
-        {"banana": paint_or_random(draw, length, paint, wild=0.4)},
-        sample_material(draw, roughness=0.45, clearcoat=0.1),
+        {"banana": paint_or_random(sampler, length, paint, wild=0.4)},
+        sample_material(sampler, roughness=0.45, clearcoat=0.1),
     )
 
 
 def _banana_shape(
-    draw: ParameterSampler, bend: float, length: float, stem: float, thick: float
+    sampler: ParameterSampler, bend: float, length: float, stem: float, thick: float
 ) -> tuple[Array, Array]:
     """Return the path (N, 3) of a banana from its stem, and its radius (N,) along it.
 
     The path is in the x-y plane.
 
     Args:
-        draw: samples the thickness of the stem.
+        sampler: samples the thickness of the stem.
         bend: by how many degrees the path turns from end to end.
-        length: of the path.
+        length: length of the path.
         stem: length of the stem.
         thick: the largest radius.
     """
@@ -312,7 +314,7 @@ def _banana_shape(
     fall = np.clip((length - position) / (0.24 * length), 0.0, 1.0) ** 0.62
     body = np.sin(0.5 * np.pi * rise) * np.maximum(np.sin(0.5 * np.pi * fall), 0.26)
     # the stem is thicker where it was cut
-    neck = draw(0.3, low=0.24, high=0.4)
+    neck = sampler(0.3, low=0.24, high=0.4)
     stem_radius = neck * (1.0 + 0.25 * np.exp(-position / 0.5))
     radius = thick * np.maximum(stem_radius, body)
     # smoothed by a mean of five
@@ -320,27 +322,27 @@ def _banana_shape(
     return path, radius
 
 
-def _banana_section(draw: ParameterSampler) -> Array:
+def _banana_section(sampler: ParameterSampler) -> Array:
     """Sample the section (30, 2) of a banana, about a unit circle, with five ridges."""
-    ridge = draw(0.06, low=0.02, high=0.1)
+    ridge = sampler(0.06, low=0.02, high=0.1)
     phi = 2 * np.pi * np.arange(30) / 30
     # |cos(2.5 phi)| has five maxima around the circle
     lumps = 1.0 + ridge * (np.abs(np.cos(2.5 * phi)) - 0.6)
     return np.stack([np.cos(phi), np.sin(phi)], axis=1) * lumps[:, None]
 
 
-def _banana_paint(draw: ParameterSampler, path: Array, stem: float) -> Paint:
+def _banana_paint(sampler: ParameterSampler, path: Array, stem: float) -> Paint:
     """Sample the paint of a banana: green and brown towards its ends, with flecks.
 
     Args:
-        draw: samples its color and how many flecks it has.
+        sampler: samples its color and how many flecks it has.
         path: (N, 3) of the banana, whose ends are those of the stem and of the tip.
         stem: length of the stem.
     """
-    offset = draw.offset()
-    skin = draw.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
+    offset = sampler.offset()
+    skin = sampler.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
     tip, brown, green = map(parse_hex_color, ("3a2a18", "6b4520", "a9b13c"))
-    amount = draw(0.1, low=0.0, high=0.22)
+    amount = sampler(0.1, low=0.0, high=0.22)
 
     def paint(t: Texels) -> Array:
         """Paint the skin, then green, flecks, the brown stem and both dark ends."""
@@ -366,17 +368,17 @@ def _banana_paint(draw: ParameterSampler, path: Array, stem: float) -> Paint:
 
 
 @family(metres=0.01)
-def book(draw: ParameterSampler) -> Instance:
+def book(sampler: ParameterSampler) -> Instance:
     """Make a closed hardback that lies on its back cover.
 
     The spine runs along y at -x; the pages show at the other three sides.
     """
-    width = draw(15.5, low=12.0, high=18.0)
+    width = sampler(15.5, low=12.0, high=18.0)
     height = 22.5
-    thick = draw(4.2, low=2.2, high=6.0)
-    board = draw(0.34, low=0.2, high=0.45)
-    lip = draw(0.4, low=0.2, high=0.6)
-    bulge = draw(0.35, low=0.0, high=0.7)
+    thick = sampler(4.2, low=2.2, high=6.0)
+    board = sampler(0.34, low=0.2, high=0.45)
+    lip = sampler(0.4, low=0.2, high=0.6)
+    bulge = sampler(0.35, low=0.0, high=0.7)
     patches: list[Patch] = []
     for z in (board / 2, thick - board / 2):
         patches += shapes.box(
@@ -390,15 +392,15 @@ def book(draw: ParameterSampler) -> Instance:
         thick=thick, width=width, bulge=bulge, board=board, height=height
     )
     turned = shapes.transform_patches(
-        patches, shapes.rotation("z", draw(-122.0, low=-150.0, high=-100.0))
+        patches, shapes.rotation("z", sampler(-122.0, low=-150.0, high=-100.0))
     )
 
-    front, pages_paint, spine = _book_paints(draw, height, width, thick)
+    front, pages_paint, spine = _book_paints(sampler, height, width, thick)
 
     return Instance(
         turned,
         {"cover": front, "pages": pages_paint, "spine": spine},
-        sample_material(draw, roughness=0.55, clearcoat=0.0),
+        sample_material(sampler, roughness=0.55, clearcoat=0.0),
     )
 
 
@@ -410,7 +412,7 @@ def _round_spine(
     Its section in the x-z plane lies between two half ellipses that bulge towards -x.
 
     Args:
-        thick, width, height: of the book.
+        thick, width, height: thick, width and height of the book.
         bulge: by how much it bulges.
         board: its thickness, which is that of the covers.
     """
@@ -431,31 +433,37 @@ def _round_spine(
 
 
 def _book_paints(
-    draw: ParameterSampler, height: float, width: float, thick: float
+    sampler: ParameterSampler, height: float, width: float, thick: float
 ) -> tuple[Paint, Paint, Paint]:
     """Sample the paints of the cover, the pages and the spine of a book, in this order.
 
     Args:
-        draw: samples the paints.
-        height, width, thick: of the book.
+        sampler: samples the paints.
+        height, width, thick: height, width and thick of the book.
     """
-    offset = draw.offset()
-    cloth = draw.sample_color(
+    offset = sampler.offset()
+    cloth = sampler.sample_color(
         "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
     )
-    gold = draw.sample_color("d8b45a", "efe6cf", "1d1f22", wild=0.25)
+    gold = sampler.sample_color("d8b45a", "efe6cf", "1d1f22", wild=0.25)
     base = paint_or_random(
-        draw,
+        sampler,
         height,
         clouded(cloth, factor=0.85, scale=0.6, offset=offset, contrast=1.2),
         wild=0.3,
     )
-    title = draw.pick("frame", "blocks", "picture", "plain")
+    title = sampler.pick("frame", "blocks", "picture", "plain")
     front = _front(
-        draw, base=base, gold=gold, title=title, width=width, height=height, thick=thick
+        sampler,
+        base=base,
+        gold=gold,
+        title=title,
+        width=width,
+        height=height,
+        thick=thick,
     )
     paper = parse_hex_color("f4f2ea")
-    if draw.chance(0.7, canonical=True):
+    if sampler.chance(0.7, canonical=True):
         paper = parse_hex_color("ece2c8")
 
     def pages_paint(t: Texels) -> Array:
@@ -498,7 +506,7 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
     Args:
         outer: (K, 2) points (x, z) of its outer side, upwards.
         inner: (K, 2) points (x, z) of its inner side, downwards.
-        height: of the book; the extent along y.
+        height: height of the book; the extent along y.
     """
     loop = np.concatenate([outer, inner])[::-1]
     # the path leads along -y, and the section's axes are x and z
@@ -536,7 +544,7 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
 
 
 def _front(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     base: Paint,
     gold: Array,
     title: str,
@@ -551,13 +559,13 @@ def _front(
     but "plain" have lines of words.
 
     Args:
-        draw: samples the color of a picture.
+        sampler: samples the color of a picture.
         base: paint of both covers.
         gold: color of the decoration and the words.
         title: "plain", "picture", "frame" or "blocks".
-        width, height, thick: of the book.
+        width, height, thick: width, height and thick of the book.
     """
-    accent = draw.sample_color("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
+    accent = sampler.sample_color("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
     def inside(x: Array, y: Array, half_width: float, half_height: float) -> Array:
         """Return the mask of a rectangle around the origin, for points (x, y)."""
@@ -671,7 +679,7 @@ def _word_strokes(letters: str, height: float) -> list[Array]:
 
     Args:
         letters: keys of `_STROKES`.
-        height: of a letter.
+        height: height of a letter.
     """
     strokes = []
     for k, letter in enumerate(letters):
@@ -691,7 +699,7 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
     Args:
         t: points of the plate.
         red: color.
-        radius: from the middle of the octagon to its corners.
+        radius: radius from the middle of the octagon to its corners.
     """
     apothem = radius * np.cos(np.pi / 8)  # from the middle to the sides
     side_angles = np.pi * (np.arange(8) + 0.5) / 4 + np.pi / 8
@@ -709,11 +717,11 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
 
 
 @family(metres=1.0, texels=192)
-def stop_sign(draw: ParameterSampler) -> Instance:
+def stop_sign(sampler: ParameterSampler) -> Instance:
     """Make a stop sign on a post."""
-    radius = draw(0.45, low=0.4, high=0.5)
-    height = draw(0.74, low=0.66, high=0.84)
-    red = draw.sample_color("b3121d", "a8161f", "c0202a", wild=0.0)
+    radius = sampler(0.45, low=0.4, high=0.5)
+    height = sampler(0.74, low=0.66, high=0.84)
+    red = sampler.sample_color("b3121d", "a8161f", "c0202a", wild=0.0)
     plate = _sign_plate(radius, height)
     post = _sign_post(height, radius)
     foot = shapes.box(
@@ -728,7 +736,7 @@ def stop_sign(draw: ParameterSampler) -> Instance:
             "post", (0.008, 0.0, z), (0.05, 0.09, 0.03), bevel=0.006, steps=1
         )
     ]
-    grey = draw.sample_color("9a9da0", "7d8083", wild=0.0)
+    grey = sampler.sample_color("9a9da0", "7d8083", wild=0.0)
     paints = {
         "face": _face(red, radius),
         "metal": solid("a4a7aa"),
@@ -737,7 +745,7 @@ def stop_sign(draw: ParameterSampler) -> Instance:
     }
     turned = shapes.transform_patches(
         [*plate, *post, *foot, *clamps],
-        shapes.rotation("z", draw(0.0, low=-25.0, high=25.0)),
+        shapes.rotation("z", sampler(0.0, low=-25.0, high=25.0)),
     )
     return Instance(
         turned,
@@ -753,8 +761,8 @@ def _sign_plate(radius: float, height: float) -> list[Patch]:
     post.
 
     Args:
-        radius: from its middle to its corners.
-        height: of its middle.
+        radius: radius from its middle to its corners.
+        height: height of its middle.
     """
     ring = shapes.polygon(8, bevel=0.02, steps=2) * radius
     ahead = np.array([1.0, 0.0, 0.0])
@@ -775,8 +783,8 @@ def _sign_post(height: float, radius: float) -> list[Patch]:
     """Create the post of a stop sign: a closed tube that ends behind the plate.
 
     Args:
-        height: of the middle of the plate.
-        radius: of the plate.
+        height: height of the middle of the plate.
+        radius: radius of the plate.
     """
     tube = shapes.round_corners(
         [

@@ -26,18 +26,18 @@ from advsearch.questions.harden.objects.textures import (
 
 
 def _claw(
-    draw: ParameterSampler, half: float, start: float, length: float, drop: float
+    sampler: ParameterSampler, half: float, start: float, length: float, drop: float
 ) -> list[Patch]:
     """Create two tapering prongs that curve downwards (towards -x) from the head.
 
     Args:
-        draw: samples how far they spread.
+        sampler: samples how far they spread.
         half: half the width of the head.
         start: y of their roots.
         length: along +y.
         drop: by how much their tips are lower than their roots.
     """
-    spread = draw(0.34, low=0.2, high=0.5)
+    spread = sampler(0.34, low=0.2, high=0.5)
     t = np.linspace(0.0, 1.0, 14)  # from the root to the tip
     half_thickness = half * (0.72 * (1 - t) + 0.1)
     half_width = half * 0.47 * (1.0 - 0.25 * t)
@@ -61,17 +61,17 @@ def _points_on_y(*positions: float) -> Array:
 
 
 def _peen(
-    draw: ParameterSampler, half: float, start: float, length: float
+    sampler: ParameterSampler, half: float, start: float, length: float
 ) -> list[Patch]:
     """Create a wedge (cross peen) or a ball at the back of the head, along +y.
 
     Args:
-        draw: chooses between both.
+        sampler: chooses between both.
         half: half the width of the head.
         start: y of its root.
         length: along +y.
     """
-    if draw.chance(0.5):
+    if sampler.chance(0.5):
         neck = _points_on_y(start - 0.3, start + 0.5 * length)
         center = (0.0, start + 0.75 * length, 0.0)
         stem = shapes.sweep(
@@ -95,22 +95,24 @@ def _peen(
 
 
 @family(metres=0.01)
-def hammer(draw: ParameterSampler) -> Instance:
+def hammer(sampler: ParameterSampler) -> Instance:
     """Make a hammer whose handle runs along -x, and whose head lies along y.
 
     The head is at the origin, and its striking face at -y.
     """
-    half = draw(1.35, low=1.15, high=1.7)
-    length = draw(27.0, low=20.0, high=31.0)
-    front = draw(5.0, low=3.8, high=6.0)
-    face = half * draw(1.1, low=1.0, high=1.35)
-    style = draw.pick("claw", "claw", "peen", "sledge")
-    eye = half * draw(1.25, low=1.1, high=1.5)
+    half = sampler(1.35, low=1.15, high=1.7)
+    length = sampler(27.0, low=20.0, high=31.0)
+    front = sampler(5.0, low=3.8, high=6.0)
+    face = half * sampler(1.1, low=1.0, high=1.35)
+    style = sampler.pick("claw", "claw", "peen", "sledge")
+    eye = half * sampler(1.25, low=1.1, high=1.5)
     front = max(front, 2.2 * eye)
 
-    head = _hammer_head(draw, half=half, eye=eye, style=style, front=front, face=face)
+    head = _hammer_head(
+        sampler, half=half, eye=eye, style=style, front=front, face=face
+    )
 
-    swelling, half_thickness, handle = _hammer_handle(draw, half, length)
+    swelling, half_thickness, handle = _hammer_handle(sampler, half, length)
 
     # It lies on the head and on the swelling of the handle.
     head_height = max(half * 1.05, face * 1.2 if style == "sledge" else face)
@@ -119,17 +121,17 @@ def hammer(draw: ParameterSampler) -> Instance:
     )
     patches = shapes.transform_patches(
         shapes.transform_patches([*head, *handle], shapes.rotation("y", -float(tilt))),
-        shapes.rotation("z", draw(58.0, low=20.0, high=90.0)),
+        shapes.rotation("z", sampler(58.0, low=20.0, high=90.0)),
     )
 
-    paints = _hammer_paints(draw, front, length)
+    paints = _hammer_paints(sampler, front, length)
     return Instance(
-        patches, paints, sample_material(draw, roughness=0.38, clearcoat=0.2)
+        patches, paints, sample_material(sampler, roughness=0.38, clearcoat=0.2)
     )
 
 
 def _hammer_head(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     half: float,
     eye: float,
     style: str,
@@ -143,7 +145,7 @@ def _hammer_head(
     behind.
 
     Args:
-        draw: samples the shape of the block, the claw or the peen.
+        sampler: samples the shape of the block, the claw or the peen.
         half: half the width of the block around the eye.
         eye: half its length, about.
         style: "claw", "peen" or "sledge".
@@ -164,7 +166,7 @@ def _hammer_head(
         path = _points_on_y(-front, -front + 0.3, front - 0.3, front)
         section = (
             shapes.polygon(8, bevel=0.1)
-            if draw.chance(0.5)
+            if sampler.chance(0.5)
             else shapes.rectangle(1.8, 1.8, bevel=0.4)
         )
         scale = np.array([0.85, 1.0, 1.0, 0.85]) * face * 1.25
@@ -194,19 +196,19 @@ def _hammer_head(
         )
         if style == "claw":
             head += _claw(
-                draw,
+                sampler,
                 half=half,
                 start=eye * 0.95,
-                length=draw(6.4, low=5.0, high=7.5),
-                drop=draw(2.6, low=1.2, high=3.6),
+                length=sampler(6.4, low=5.0, high=7.5),
+                drop=sampler(2.6, low=1.2, high=3.6),
             )
         else:
-            head += _peen(draw, half, eye, draw(4.0, low=3.0, high=5.0))
+            head += _peen(sampler, half, eye, sampler(4.0, low=3.0, high=5.0))
     return head
 
 
 def _hammer_handle(
-    draw: ParameterSampler, half: float, length: float
+    sampler: ParameterSampler, half: float, length: float
 ) -> tuple[float, float, list[Patch]]:
     """Create the handle of a hammer, from the head along -x.
 
@@ -214,15 +216,15 @@ def _hammer_handle(
     rounded.
 
     Args:
-        draw: samples its thickness and its section, an ellipse or a rounded square.
+        sampler: samples its thickness and its section, an ellipse or a rounded square.
         half: half the width of the head.
-        length: from the head to the end.
+        length: length from the head to the end.
 
     Returns:
         By what fraction it swells, half its thickness, and its patches.
     """
     t = np.linspace(0.0, 1.0, 30)  # from the head to the end
-    swelling = draw(0.16, low=0.0, high=0.3)
+    swelling = sampler(0.16, low=0.0, high=0.3)
     swell = (
         1.0
         + swelling * np.exp(-(((t - 0.78) / 0.14) ** 2))
@@ -233,15 +235,15 @@ def _hammer_handle(
     end_fraction = ((t - 0.95) / 0.05).clip(0.0, 1.0)
     round_end = np.sqrt(np.clip(1.0 - end_fraction**2 * 0.999, 0.0, 1.0))
     round_end[-1] = 0.0
-    half_thickness = half * draw(0.72, low=0.6, high=0.9)
-    half_width = half * draw(0.92, low=0.75, high=1.1)
+    half_thickness = half * sampler(0.72, low=0.6, high=0.9)
+    half_width = half * sampler(0.92, low=0.75, high=1.1)
     top = half * 1.18  # x of the end that sticks out of the head
     path = np.stack([top - (length + top) * t, 0 * t, 0 * t], axis=1)
     scale = np.stack(
         [half_width * swell * round_end, half_thickness * swell * round_end], axis=1
     )
     scale[0] *= 0.9  # a bevel at the head
-    if draw.chance(0.6, canonical=True):
+    if sampler.chance(0.6, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=24)
     else:
         section = shapes.rectangle(2.0, 2.0, bevel=0.7)
@@ -250,7 +252,7 @@ def _hammer_handle(
 
 
 def _hammer_paints(
-    draw: ParameterSampler, front: float, length: float
+    sampler: ParameterSampler, front: float, length: float
 ) -> dict[str, Paint]:
     """Sample the paints of the head and the handle of a hammer.
 
@@ -258,31 +260,34 @@ def _hammer_paints(
     or has a ribbed rubber grip.
 
     Args:
-        draw: samples the paints.
+        sampler: samples the paints.
         front: distance of the striking face from the middle of the head, at -y.
-        length: of the handle, along -x.
+        length: length of the handle, along -x.
     """
-    offset = draw.offset()
-    steel = draw.sample_color("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
+    offset = sampler.offset()
+    steel = sampler.sample_color("4b4f55", "8d9298", "2b2d30", "6b7078", wild=0.15)
     metal = over(
         clouded(steel, factor=0.8, scale=1.6, offset=offset, contrast=2.4),
         lambda t: step(-t.xyz[:, 1], 0.86 * front, soft=0.3),
         solid(shade(steel, 1.7)),
     )
     timber = wood(
-        draw.sample_color("c48f55", "a8743f", "d9b27c", "7a4f2a", wild=0.05),
+        sampler.sample_color("c48f55", "a8743f", "d9b27c", "7a4f2a", wild=0.05),
         scale=0.9,
         offset=offset,
         axis=0,
     )
-    stain = draw.sample_color("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
-    kind = draw.pick("wood", "dipped", "rubber")
+    stain = sampler.sample_color("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
+    kind = sampler.pick("wood", "dipped", "rubber")
     hold = timber
     if kind == "dipped":
         hold = over(
             timber,
             between(
-                -2 * length, -draw(0.5, low=0.4, high=0.7) * length, axis=0, soft=0.05
+                -2 * length,
+                -sampler(0.5, low=0.4, high=0.7) * length,
+                axis=0,
+                soft=0.05,
             ),
             solid(stain),
         )
@@ -294,22 +299,22 @@ def _hammer_paints(
             ribs,
         )
     return {
-        "head": paint_or_random(draw, length, metal, wild=0.3),
-        "handle": paint_or_random(draw, length, hold, wild=0.3),
+        "head": paint_or_random(sampler, length, metal, wild=0.3),
+        "handle": paint_or_random(sampler, length, hold, wild=0.3),
     }
 
 
 def _weights(
-    draw: ParameterSampler, style: str, at: float, length: float, radius: float
+    sampler: ParameterSampler, style: str, at: float, length: float, radius: float
 ) -> list[Patch]:
     """Create the weight at the upper end of a dumbbell whose bar is along z.
 
     Args:
-        draw: chooses the nut of "plates".
+        sampler: chooses the nut of "plates".
         style: "hex", "globe", "plates" (three, each smaller, and a nut) or "round".
         at: z of its inner side.
         length: along z, but for a globe, which is as long as it is thick.
-        radius: of the weight.
+        radius: radius of the weight.
     """
     if style == "hex":
         path = [
@@ -362,7 +367,7 @@ def _weights(
         z += length / n_plates
     if style == "plates":
         nut = shapes.ellipse(1.0, 1.0, count=24)
-        if draw.chance(0.5):
+        if sampler.chance(0.5):
             nut = shapes.polygon(6, bevel=0.1)
         path = [(0, 0, z - 0.1), (0, 0, z + 0.6), (0, 0, z + 0.75)]
         scale = np.array([1.0, 1.0, 0.85]) * 0.42 * radius
@@ -373,19 +378,19 @@ def _weights(
 
 
 @family(metres=0.01)
-def dumbbell(draw: ParameterSampler) -> Instance:
+def dumbbell(sampler: ParameterSampler) -> Instance:
     """Make a dumbbell with weights of random shape."""
-    style = draw.pick("hex", "plates", "hex", "round", "globe")
-    radius = draw(4.6, low=3.6, high=6.2)
-    grip = draw(5.6, low=5.0, high=7.0)
-    length = draw(5.6, low=3.8, high=7.0)
-    bar = draw(1.45, low=1.2, high=1.9)
-    swell = draw(0.16, low=0.0, high=0.3)
+    style = sampler.pick("hex", "plates", "hex", "round", "globe")
+    radius = sampler(4.6, low=3.6, high=6.2)
+    grip = sampler(5.6, low=5.0, high=7.0)
+    length = sampler(5.6, low=3.8, high=7.0)
+    bar = sampler(1.45, low=1.2, high=1.9)
+    swell = sampler(0.16, low=0.0, high=0.3)
     z = np.linspace(-grip - 0.6, grip + 0.6, 25)
     profile = np.stack(
         [bar * (1.0 + swell * np.cos(np.pi * z / (2 * grip + 1.2)) ** 2), z], axis=1
     )
-    weights = _weights(draw, style=style, at=grip, length=length, radius=radius)
+    weights = _weights(sampler, style=style, at=grip, length=length, radius=radius)
     patches = (
         shapes.lathe([("bar", profile)], columns=28)
         + weights
@@ -393,29 +398,31 @@ def dumbbell(draw: ParameterSampler) -> Instance:
     )
     laid = shapes.transform_patches(
         shapes.transform_patches(patches, shapes.rotation("y", 90.0)),
-        shapes.rotation("z", draw(118.0, low=90.0, high=150.0)),
+        shapes.rotation("z", sampler(118.0, low=90.0, high=150.0)),
     )
     paints = _dumbbell_paints(
-        draw, grip=grip, style=style, length=length, radius=radius
+        sampler, grip=grip, style=style, length=length, radius=radius
     )
-    return Instance(laid, paints, sample_material(draw, roughness=0.42, clearcoat=0.2))
+    return Instance(
+        laid, paints, sample_material(sampler, roughness=0.42, clearcoat=0.2)
+    )
 
 
 def _dumbbell_paints(
-    draw: ParameterSampler, grip: float, style: str, length: float, radius: float
+    sampler: ParameterSampler, grip: float, style: str, length: float, radius: float
 ) -> dict[str, Paint]:
     """Sample the paints of a dumbbell: of its weights, and of its knurled bar.
 
     The dumbbell is painted before it is laid down, so that its bar is along z.
 
     Args:
-        draw: samples the paints.
+        sampler: samples the paints.
         grip: half the length of the bar between the weights.
-        style: of the weights, as for `_weights`.
-        length, radius: of the weights.
+        style: style of the weights, as for `_weights`.
+        length, radius: length and radius of the weights.
     """
-    offset = draw.offset()
-    iron = draw.sample_color(
+    offset = sampler.offset()
+    iron = sampler.sample_color(
         "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", wild=0.25
     )
     weight = speckled(
@@ -423,12 +430,12 @@ def _dumbbell_paints(
         shade(iron, 1.9),
         scale=0.35,
         offset=offset,
-        amount=draw(0.08, low=0.0, high=0.2),
+        amount=sampler(0.08, low=0.0, high=0.2),
     )
     # z of the outer side of a weight
     tip = grip + (length if style != "globe" else 1.75 * radius)
-    accent = draw.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
-    if draw.chance(0.5, canonical=True):
+    accent = sampler.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
+    if sampler.chance(0.5, canonical=True):
 
         def on_both_ends(t: Texels) -> Array:
             """Return the mask of a ring on the outer side of each weight."""
@@ -441,7 +448,7 @@ def _dumbbell_paints(
             return step(np.abs(t.xyz[:, 2]), tip - 0.6, soft=0.05) * ring
 
         weight = over(weight, on_both_ends, solid(accent))
-    steel = draw.sample_color("b4b8bd", "8d9298", "2b2d30", wild=0.2)
+    steel = sampler.sample_color("b4b8bd", "8d9298", "2b2d30", wild=0.2)
     # fine slanted lines on the part that is held
     knurl = over(
         solid(steel),
@@ -454,4 +461,7 @@ def _dumbbell_paints(
         ),
         solid(shade(steel, 0.55)),
     )
-    return {"weight": paint_or_random(draw, 2 * tip, weight, wild=0.35), "bar": knurl}
+    return {
+        "weight": paint_or_random(sampler, 2 * tip, weight, wild=0.35),
+        "bar": knurl,
+    }

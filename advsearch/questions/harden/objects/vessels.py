@@ -42,7 +42,7 @@ HANDLE_POINTS = 26  # points of the curve of a handle
 
 
 def make_handle(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     style: str,
     low: float,
     high: float,
@@ -55,19 +55,19 @@ def make_handle(
     It is thicker at both roots. Its section is an ellipse or a rounded rectangle.
 
     Args:
-        draw: samples its thickness.
+        sampler: samples its thickness.
         style: "round", "ear" (widest at the top), "square" or "loop" (small).
         low, high: heights of its roots.
         reach: its extent from the wall.
-        profile: of the wall (K, 2).
+        profile: profile of the wall (K, 2).
         inset: depth of the roots inside the wall.
     """
     low_root = shapes.radius_at_height(profile, low) - inset
     high_root = shapes.radius_at_height(profile, high) - inset
     curve = _handle_curve(style, (low_root, low), (high_root, high), reach)
-    half_thickness = draw(0.42, low=0.32, high=0.6)
-    half_width = draw(0.62, low=0.4, high=0.95)
-    if draw.chance(0.7, canonical=True):
+    half_thickness = sampler(0.42, low=0.32, high=0.6)
+    half_width = sampler(0.62, low=0.4, high=0.95)
+    if sampler.chance(0.7, canonical=True):
         section = shapes.ellipse(half_thickness, half_width, count=16)
     else:
         section = shapes.rectangle(
@@ -122,20 +122,20 @@ def _handle_curve(
 
 
 def _ceramic(
-    draw: ParameterSampler, height: float, glaze: Paint, accent: Paint
+    sampler: ParameterSampler, height: float, glaze: Paint, accent: Paint
 ) -> Paint:
     """Sample a decoration as a potter or a printer puts it around a vessel.
 
     Args:
-        draw: samples its kind, its proportions and its second color.
-        height: of the vessel.
+        sampler: samples its kind, its proportions and its second color.
+        height: height of the vessel.
         glaze: the ground of most decorations; alone on a plain vessel.
         accent: the paint of a single band, and of the upper part of a dipped vessel.
     """
-    kind = draw.pick(
+    kind = sampler.pick(
         "band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings"
     )
-    second = draw.sample_color(
+    second = sampler.sample_color(
         "2f5d7c", "b5442e", "356b4f", "e0b040", "22262b", "f2efe6"
     )
     pale = "f4efe4"
@@ -143,8 +143,8 @@ def _ceramic(
         return over(
             glaze,
             between(
-                draw(0.36, low=0.1, high=0.5) * height,
-                draw(0.72, low=0.55, high=0.9) * height,
+                sampler(0.36, low=0.1, high=0.5) * height,
+                sampler(0.72, low=0.55, high=0.9) * height,
                 soft=0.12,
             ),
             accent,
@@ -159,68 +159,68 @@ def _ceramic(
         return dots(
             glaze,
             second,
-            cell=draw(2.0, low=1.2, high=3.2),
-            radius=draw(0.3, low=0.2, high=0.4),
+            cell=sampler(2.0, low=1.2, high=3.2),
+            radius=sampler(0.3, low=0.2, high=0.4),
         )
     if kind == "stripes":
-        ground = draw.sample_color(pale, "f4f4f2")
+        ground = sampler.sample_color(pale, "f4f4f2")
         return stripes(
             ground,
             second,
-            cell=draw(1.8, low=1.0, high=4.0),
-            share=draw(0.5, low=0.25, high=0.6),
-            slant=int(draw.pick(0, 2)),
+            cell=sampler(1.8, low=1.0, high=4.0),
+            share=sampler(0.5, low=0.25, high=0.6),
+            slant=int(sampler.pick(0, 2)),
         )
     if kind == "checks":
         board = checks(
-            draw.sample_color(pale), second, cell=draw(1.4, low=0.9, high=2.2)
+            sampler.sample_color(pale), second, cell=sampler(1.4, low=0.9, high=2.2)
         )
         return over(glaze, between(0.25 * height, 0.75 * height), board)
     if kind == "zigzag":
         return over(
             glaze,
             between(0.3 * height, 0.7 * height),
-            zigzag(draw.sample_color(pale), second, cell=2.5),
+            zigzag(sampler.sample_color(pale), second, cell=2.5),
         )
     if kind == "dip":
         return over(
             glaze,
-            between(draw(0.5, low=0.3, high=0.7) * height, 2 * height, soft=0.1),
+            between(sampler(0.5, low=0.3, high=0.7) * height, 2 * height, soft=0.1),
             accent,
         )
     if kind == "rings":
         return rings(
-            draw.sample_color(pale),
+            sampler.sample_color(pale),
             second,
-            period=height * draw(0.12, low=0.06, high=0.25),
-            share=draw(0.5, low=0.2, high=0.7),
+            period=height * sampler(0.12, low=0.06, high=0.25),
+            share=sampler(0.5, low=0.2, high=0.7),
         )
     return glaze
 
 
 @family(metres=0.01)
-def mug(draw: ParameterSampler) -> Instance:
+def mug(sampler: ParameterSampler) -> Instance:
     """Make a mug with a handle."""
-    height = draw(9.4, low=7.6, high=12.0)
-    wall, side, body = _mug_body(draw, height)
+    height = sampler(9.4, low=7.6, high=12.0)
+    wall, side, body = _mug_body(sampler, height)
 
-    style = draw.pick("ear", "round", "square", "loop")
-    grip_high = height * draw(0.85, low=0.76, high=0.88)
+    style = sampler.pick("ear", "round", "square", "loop")
+    grip_high = height * sampler(0.85, low=0.76, high=0.88)
     if style == "loop":
-        grip_low = height * draw(0.3, low=0.34, high=0.42)
+        grip_low = height * sampler(0.3, low=0.34, high=0.42)
     else:
-        grip_low = height * draw(0.2, low=0.16, high=0.3)
+        grip_low = height * sampler(0.2, low=0.16, high=0.3)
     grip = make_handle(
-        draw,
+        sampler,
         style,
         low=grip_low,
         high=grip_high,
-        reach=draw(2.9, low=2.3, high=3.4),
+        reach=sampler(2.9, low=2.3, high=3.4),
         profile=side,
         inset=0.55 * wall,
     )
 
-    paints = _mug_paints(draw, height)
+    paints = _mug_paints(sampler, height)
     patches = shapes.transform_patches(
         [*body, *shapes.transform_patches(grip, shapes.rotation("z", -108.0))],
         SEAM_ROTATION,
@@ -228,29 +228,29 @@ def mug(draw: ParameterSampler) -> Instance:
     return Instance(
         patches,
         paints,
-        sample_material(draw, roughness=0.3, clearcoat=0.5),
+        sample_material(sampler, roughness=0.3, clearcoat=0.5),
         detail={"inside": 0.8, "base": 0.6},
     )
 
 
 def _mug_body(
-    draw: ParameterSampler, height: float
+    sampler: ParameterSampler, height: float
 ) -> tuple[float, Array, list[Patch]]:
     """Create a mug without its handle.
 
     Args:
-        draw: samples its proportions.
-        height: of the mug.
+        sampler: samples its proportions.
+        height: height of the mug.
 
     Returns:
         The thickness of its wall; the profile (14, 2) of its side, points (r, z) from
         the foot's edge upwards; and its patches.
     """
-    top = draw(4.15, low=3.6, high=5.0)
-    foot = top * draw(0.93, low=0.72, high=1.02)
-    belly = draw(0.0, low=-0.06, high=0.13) * top
-    wall = draw(0.36, low=0.28, high=0.5)
-    low = draw(0.7, low=0.3, high=1.2)  # size of the round edge at the foot
+    top = sampler(4.15, low=3.6, high=5.0)
+    foot = top * sampler(0.93, low=0.72, high=1.02)
+    belly = sampler(0.0, low=-0.06, high=0.13) * top
+    wall = sampler(0.36, low=0.28, high=0.5)
+    low = sampler(0.7, low=0.3, high=1.2)  # size of the round edge at the foot
     corners = [
         (foot - low, 0.0),
         (foot, low),
@@ -259,93 +259,97 @@ def _mug_body(
     ]
     side = shapes.spline(np.array(corners[1:]), count=14)
     outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
-    body = shapes.vessel(outside, wall=wall, floor=draw(0.6, low=0.5, high=0.9))
+    body = shapes.vessel(outside, wall=wall, floor=sampler(0.6, low=0.5, high=0.9))
     return wall, side, body
 
 
-def _mug_paints(draw: ParameterSampler, height: float) -> dict[str, Paint]:
+def _mug_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
     """Sample the paints of a mug of a height, by the tags of its parts."""
-    offset = draw.offset()
-    clay = draw.sample_color(
+    offset = sampler.offset()
+    clay = sampler.sample_color(
         "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
     )
-    specks = draw.sample_color("7d6247", wild=0.2)
+    specks = sampler.sample_color("7d6247", wild=0.2)
     glaze = speckled(
         clouded(clay, factor=0.93, scale=3.0, offset=offset),
         specks,
         scale=0.28,
         offset=offset,
-        amount=draw(0.06, low=0.0, high=0.14),
+        amount=sampler(0.06, low=0.0, high=0.14),
     )
-    deep = draw.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
+    deep = sampler.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
     accent = clouded(deep, factor=1.35, scale=2.2, offset=offset)
-    outer = paint_or_random(draw, height, _ceramic(draw, height, glaze, accent))
+    outer = paint_or_random(sampler, height, _ceramic(sampler, height, glaze, accent))
     # the inside is seldom decorated; else it is glazed or of one color
     inner = outer
-    if not draw.chance(0.15):
+    if not sampler.chance(0.15):
         inner = glaze
-        if draw.chance(0.5, canonical=True):
-            inner = solid(draw.sample_color("efe6d4", "f3f1ec", wild=0.3))
+        if sampler.chance(0.5, canonical=True):
+            inner = solid(sampler.sample_color("efe6d4", "f3f1ec", wild=0.3))
     raw_clay = solid("a98663")
     # the foot may be left without a glaze
     outside = outer
-    if draw.chance(0.4, canonical=True):
+    if sampler.chance(0.4, canonical=True):
         outside = over(outer, between(-1.0, 0.35, soft=0.1), raw_clay)
     return {
         "outside": outside,
         "inside": inner,
         "base": raw_clay,
-        "handle": draw.pick(glaze, outer, accent),
+        "handle": sampler.pick(glaze, outer, accent),
     }
 
 
 @family(metres=0.01)
-def bowl(draw: ParameterSampler) -> Instance:
+def bowl(sampler: ParameterSampler) -> Instance:
     """Make a bowl."""
     radius = 8.0
-    height = radius * draw(0.86, low=0.6, high=1.0)
-    body = _bowl_body(draw, radius, height)
-    offset = draw.offset()
-    clay = draw.sample_color("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
+    height = radius * sampler(0.86, low=0.6, high=1.0)
+    body = _bowl_body(sampler, radius, height)
+    offset = sampler.offset()
+    clay = sampler.sample_color(
+        "3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f"
+    )
     glaze = clouded(clay, factor=0.72, scale=2.6, offset=offset)
     accent = mottled(
         parse_hex_color("e8dcc0"), parse_hex_color("d6c39a"), scale=2.0, offset=offset
     )
     raw = solid("9b7352")
-    if draw.rng is None:
+    if sampler.rng is None:
         rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
         outer = over(rim, between(-1.0, 0.55, soft=0.1), raw)
     else:
-        outer = paint_or_random(draw, 2 * radius, _ceramic(draw, height, glaze, accent))
-    inner = draw.pick(
+        outer = paint_or_random(
+            sampler, 2 * radius, _ceramic(sampler, height, glaze, accent)
+        )
+    inner = sampler.pick(
         accent,
         glaze,
         outer,
-        solid(draw.sample_color("f3f1ec")),
+        solid(sampler.sample_color("f3f1ec")),
         rings(clay, shade(clay, 1.3), period=height * 0.2),
     )
     paints = {"outside": outer, "inside": inner, "base": raw}
     return Instance(
         shapes.transform_patches(body, SEAM_ROTATION),
         paints,
-        sample_material(draw, roughness=0.28, clearcoat=0.5),
+        sample_material(sampler, roughness=0.28, clearcoat=0.5),
         detail={"base": 0.6},
     )
 
 
-def _bowl_body(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
+def _bowl_body(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """Create the surface of a bowl on a foot ring.
 
     Args:
-        draw: samples its proportions.
-        radius: of the rim before it flares.
-        height: of the rim.
+        sampler: samples its proportions.
+        radius: radius of the rim before it flares.
+        height: height of the rim.
     """
-    foot = radius * draw(0.42, low=0.34, high=0.55)
-    ring = draw(0.7, low=0.15, high=1.1)  # height of the foot ring
+    foot = radius * sampler(0.42, low=0.34, high=0.55)
+    ring = sampler(0.7, low=0.15, high=1.1)  # height of the foot ring
     # how far out the wall is at half height, in units of the radius
-    full = draw(0.86, low=0.72, high=0.97)
-    flare = draw(0.0, low=-0.03, high=0.1) * radius
+    full = sampler(0.86, low=0.72, high=0.97)
+    flare = sampler(0.0, low=-0.03, high=0.1) * radius
     knots = [
         (foot * 1.04, ring),
         (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
@@ -355,42 +359,42 @@ def _bowl_body(draw: ParameterSampler, radius: float, height: float) -> list[Pat
     ]
     return shapes.vessel(
         np.array([(foot, 0.0), *shapes.spline(knots, count=22)]),
-        wall=draw(0.45, low=0.32, high=0.65),
+        wall=sampler(0.45, low=0.32, high=0.65),
         floor=ring + 0.55,
         step=0.9,
     )
 
 
 @family(metres=0.01)
-def bottle(draw: ParameterSampler) -> Instance:
+def bottle(sampler: ParameterSampler) -> Instance:
     """Make a bottle with a cap and perhaps a label."""
-    height = draw(30.0, low=24.0, high=32.0)
-    shoulder, patches = _bottle_body(draw, height)
-    paints = _bottle_paints(draw, height, shoulder)
+    height = sampler(30.0, low=24.0, high=32.0)
+    shoulder, patches = _bottle_body(sampler, height)
+    paints = _bottle_paints(sampler, height, shoulder)
     return Instance(
         shapes.transform_patches(patches, SEAM_ROTATION),
         paints,
-        sample_material(draw, roughness=0.2, clearcoat=0.6),
+        sample_material(sampler, roughness=0.2, clearcoat=0.6),
         detail={"inside": 0.25, "base": 0.5},
     )
 
 
-def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Patch]]:
+def _bottle_body(sampler: ParameterSampler, height: float) -> tuple[float, list[Patch]]:
     """Create the surface of a bottle, perhaps with a cap.
 
     Args:
-        draw: samples its proportions.
-        height: of the neck's end.
+        sampler: samples its proportions.
+        height: height of the neck's end.
 
     Returns:
         The height of its shoulder, where the body begins to narrow; and its patches.
     """
-    radius = draw(3.75, low=3.0, high=4.8)
-    neck_radius = draw(1.35, low=1.0, high=1.7)
-    shoulder = height * draw(0.62, low=0.45, high=0.68)
-    rise = height * draw(0.15, low=0.08, high=0.22)
-    slope = draw(0.35, low=0.1, high=0.8)  # 0: square shoulder, 1: sloping
-    taper = draw(1.0, low=0.93, high=1.03)
+    radius = sampler(3.75, low=3.0, high=4.8)
+    neck_radius = sampler(1.35, low=1.0, high=1.7)
+    shoulder = height * sampler(0.62, low=0.45, high=0.68)
+    rise = height * sampler(0.15, low=0.08, high=0.22)
+    slope = sampler(0.35, low=0.1, high=0.8)  # 0: square shoulder, 1: sloping
+    taper = sampler(1.0, low=0.93, high=1.03)
     corners = [
         (radius * 0.82, 0.0),
         (radius * taper, 0.02 * height),
@@ -406,51 +410,56 @@ def _bottle_body(draw: ParameterSampler, height: float) -> tuple[float, list[Pat
         corners, radius=[0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], steps=7
     )
     # the thicker ring around the mouth
-    ring_radius = neck_radius * 0.95 + draw(0.28, low=0.1, high=0.4)
+    ring_radius = neck_radius * 0.95 + sampler(0.28, low=0.1, high=0.4)
     ring = [
         (ring_radius, height - 1.5),
         (ring_radius, height - 0.6),
         (neck_radius * 0.97, height - 0.5),
         (neck_radius * 0.93, height),
     ]
-    capped = draw.chance(0.4)
+    capped = sampler.chance(0.4)
     outside = np.concatenate([shapes.subdivide(curve, longest=1.6), ring])
     patches = shapes.vessel(
-        outside, wall=draw(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
+        outside, wall=sampler(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
     )
     if capped:
-        patches += _cap(draw, ring_radius + 0.12, height)
+        patches += _cap(sampler, ring_radius + 0.12, height)
     return shoulder, patches
 
 
 def _bottle_paints(
-    draw: ParameterSampler, height: float, shoulder: float
+    sampler: ParameterSampler, height: float, shoulder: float
 ) -> dict[str, Paint]:
     """Sample the paints of a bottle: glass, a label, and often foil around its neck.
 
     Args:
-        draw: samples the paints.
-        height: of the bottle.
+        sampler: samples the paints.
+        height: height of the bottle.
         shoulder: height at which the body begins to narrow; the label ends below.
     """
-    offset = draw.offset()
-    glass = draw.sample_color(
+    offset = sampler.offset()
+    glass = sampler.sample_color(
         "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
     )
     surface = paint_or_random(
-        draw, height, clouded(glass, factor=1.25, scale=9.0, offset=offset), wild=0.25
+        sampler,
+        height,
+        clouded(glass, factor=1.25, scale=9.0, offset=offset),
+        wild=0.25,
     )
-    paper = draw.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
-    ink = draw.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
+    paper = sampler.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", wild=0.3)
+    ink = sampler.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", wild=0.3)
     low = 0.14 * height
-    high = min(draw(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
+    high = min(sampler(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
     outer = (
         surface
-        if draw.chance(0.2)
-        else _labelled(draw, surface=surface, paper=paper, ink=ink, low=low, high=high)
+        if sampler.chance(0.2)
+        else _labelled(
+            sampler, surface=surface, paper=paper, ink=ink, low=low, high=high
+        )
     )
-    foil = draw.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
-    if draw.chance(0.5, canonical=True):
+    foil = sampler.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
+    if sampler.chance(0.5, canonical=True):
         outer = over(
             outer,
             between(height * 0.8, 2 * height),
@@ -460,19 +469,19 @@ def _bottle_paints(
         "outside": outer,
         "inside": solid(shade(glass, 0.6)),
         "base": solid(glass),
-        "cap": solid(draw.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")),
+        "cap": solid(sampler.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")),
     }
 
 
-def _cap(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
+def _cap(sampler: ParameterSampler, radius: float, height: float) -> list[Patch]:
     """Create the cap of a bottle: a cylinder around the end of its neck.
 
     Args:
-        draw: samples how far down it reaches.
-        radius: of the cap.
-        height: of the bottle without it.
+        sampler: samples how far down it reaches.
+        radius: radius of the cap.
+        height: height of the bottle without it.
     """
-    low = height - draw(1.5, low=0.9, high=2.2)
+    low = height - sampler(1.5, low=0.9, high=2.2)
     top = height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
     side = shapes.round_corners(
@@ -489,7 +498,7 @@ def _cap(draw: ParameterSampler, radius: float, height: float) -> list[Patch]:
 
 
 def _labelled(
-    draw: ParameterSampler,
+    sampler: ParameterSampler,
     surface: Paint,
     paper: Array,
     ink: Array,
@@ -503,14 +512,14 @@ def _labelled(
     round seal.
 
     Args:
-        draw: samples its width.
+        sampler: samples its width.
         surface: paint of the bottle.
         paper, ink: colors.
         low, high: heights of its edges.
     """
     azimuth = 180.0
     # degrees from the middle of the label to its sides
-    half_angle = draw(95.0, low=60.0, high=180.0)
+    half_angle = sampler(95.0, low=60.0, high=180.0)
     span = high - low
     label = over(
         surface,
@@ -577,15 +586,19 @@ def _labelled(
 
 
 @family(metres=0.01)
-def vase(draw: ParameterSampler) -> Instance:
+def vase(sampler: ParameterSampler) -> Instance:
     """Make a vase, perhaps with handles."""
     height = 24.0
-    belly_at, neck_at, profile, patches = _vase_body(draw, height)
-    patches += _vase_handles(draw, belly_at, neck_at, profile)
-    offset = draw.offset()
-    clay = draw.sample_color("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
+    belly_at, neck_at, profile, patches = _vase_body(sampler, height)
+    patches += _vase_handles(sampler, belly_at, neck_at, profile)
+    offset = sampler.offset()
+    clay = sampler.sample_color(
+        "f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a"
+    )
     glaze = clouded(clay, factor=0.95, scale=4.0, offset=offset)
-    outer = paint_or_random(draw, height, _vase_paint(draw, glaze, height, offset))
+    outer = paint_or_random(
+        sampler, height, _vase_paint(sampler, glaze, height, offset)
+    )
     paints = {
         "outside": outer,
         "inside": solid(shade(clay, 0.8)),
@@ -595,30 +608,30 @@ def vase(draw: ParameterSampler) -> Instance:
     return Instance(
         shapes.transform_patches(patches, SEAM_ROTATION),
         paints,
-        sample_material(draw, roughness=0.25, clearcoat=0.6),
+        sample_material(sampler, roughness=0.25, clearcoat=0.6),
         detail={"inside": 0.35, "base": 0.5},
     )
 
 
 def _vase_body(
-    draw: ParameterSampler, height: float
+    sampler: ParameterSampler, height: float
 ) -> tuple[float, float, Array, list[Patch]]:
     """Create a vase without handles.
 
     Args:
-        draw: samples its proportions.
-        height: of the lip.
+        sampler: samples its proportions.
+        height: height of the lip.
 
     Returns:
         The heights of the belly (its widest place) and of the neck (the narrowest
         above); its outer profile (34, 2) of points (r, z); and its patches.
     """
-    foot = draw(3.6, low=2.6, high=4.4)
-    belly = draw(7.2, low=5.2, high=8.6)
-    belly_at = height * draw(0.52, low=0.3, high=0.68)
-    neck = draw(2.6, low=2.2, high=3.8)
-    neck_at = height * draw(0.84, low=0.78, high=0.88)
-    lip = neck + draw(1.5, low=0.5, high=2.6)
+    foot = sampler(3.6, low=2.6, high=4.4)
+    belly = sampler(7.2, low=5.2, high=8.6)
+    belly_at = height * sampler(0.52, low=0.3, high=0.68)
+    neck = sampler(2.6, low=2.2, high=3.8)
+    neck_at = height * sampler(0.84, low=0.78, high=0.88)
+    lip = neck + sampler(1.5, low=0.5, high=2.6)
     knots = [
         (foot, 0.0),
         (foot * 0.97, 0.5),
@@ -630,31 +643,31 @@ def _vase_body(
     ]
     profile = shapes.spline(knots, count=34)
     patches = shapes.vessel(
-        profile, wall=draw(0.4, low=0.35, high=0.6), floor=0.8, step=1.2
+        profile, wall=sampler(0.4, low=0.35, high=0.6), floor=0.8, step=1.2
     )
     return belly_at, neck_at, profile, patches
 
 
 def _vase_handles(
-    draw: ParameterSampler, belly_at: float, neck_at: float, profile: Array
+    sampler: ParameterSampler, belly_at: float, neck_at: float, profile: Array
 ) -> list[Patch]:
     """Create two handles on opposite sides of a vase, or none.
 
     Args:
-        draw: chooses, and samples their shape.
+        sampler: chooses, and samples their shape.
         belly_at, neck_at: heights between which they are.
-        profile: of the vase (K, 2).
+        profile: profile of the vase (K, 2).
     """
     patches = list[Patch]()
-    if draw.chance(0.25):
+    if sampler.chance(0.25):
         low = belly_at + 0.15 * (neck_at - belly_at)
         high = neck_at - 0.2
         ear = make_handle(
-            draw,
+            sampler,
             "ear",
             low=low,
             high=high,
-            reach=draw(1.6, low=1.2, high=2.4),
+            reach=sampler(1.6, low=1.2, high=2.4),
             profile=profile,
             inset=0.2,
         )
@@ -666,21 +679,21 @@ def _vase_handles(
 
 
 def _vase_paint(
-    draw: ParameterSampler, glaze: Paint, height: float, offset: Array
+    sampler: ParameterSampler, glaze: Paint, height: float, offset: Array
 ) -> Paint:
     """Paint a vase: blue brushwork on the canonical one; on others that or a
         decoration.
 
     Args:
-        draw: chooses, and samples the ink.
+        sampler: chooses, and samples the ink.
         glaze: the ground.
-        height: of the vase.
+        height: height of the vase.
         offset: (3,) into the noise.
     """
-    ink = draw.sample_color("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
-    if draw.rng is not None and draw.chance(0.6):
+    ink = sampler.sample_color("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
+    if sampler.rng is not None and sampler.chance(0.6):
         return _ceramic(
-            draw, height, glaze, clouded(ink, factor=1.3, scale=3.0, offset=offset)
+            sampler, height, glaze, clouded(ink, factor=1.3, scale=3.0, offset=offset)
         )
 
     def scroll(texels: Texels) -> Array:
@@ -715,12 +728,12 @@ def _vase_paint(
 
 
 @family(metres=0.01)
-def wine_glass(draw: ParameterSampler) -> Instance:
+def wine_glass(sampler: ParameterSampler) -> Instance:
     """Make a wine glass, perhaps with wine."""
-    foot = draw(3.5, low=2.9, high=4.2)
-    stem = draw(0.42, low=0.32, high=0.6)
-    stem_top = draw(9.5, low=6.0, high=12.0)
-    depth, wall, outer = _glass_bowl(draw, stem, stem_top)
+    foot = sampler(3.5, low=2.9, high=4.2)
+    stem = sampler(0.42, low=0.32, high=0.6)
+    stem_top = sampler(9.5, low=6.0, high=12.0)
+    depth, wall, outer = _glass_bowl(sampler, stem, stem_top)
     inner, lip = _glass_lip(outer, wall, stem_top, depth)
     profile = _glass_profile(
         stem_top=stem_top,
@@ -732,21 +745,21 @@ def wine_glass(draw: ParameterSampler) -> Instance:
         lip=lip,
     )
     body = shapes.lathe(profile, columns=52)
-    paints = _glass_paints(draw, stem_top, depth)
+    paints = _glass_paints(sampler, stem_top, depth)
     return Instance(
         shapes.transform_patches(body, SEAM_ROTATION),
         paints,
-        sample_material(draw, roughness=0.18, clearcoat=0.8, spread=0.12),
+        sample_material(sampler, roughness=0.18, clearcoat=0.8, spread=0.12),
     )
 
 
 def _glass_bowl(
-    draw: ParameterSampler, stem: float, stem_top: float
+    sampler: ParameterSampler, stem: float, stem_top: float
 ) -> tuple[float, float, Array]:
     """Sample the bowl of a wine glass, with the upper part of its stem.
 
     Args:
-        draw: samples its proportions.
+        sampler: samples its proportions.
         stem: radius of the stem.
         stem_top: height at which the bowl begins.
 
@@ -754,12 +767,12 @@ def _glass_bowl(
         The depth of the bowl; the thickness of its wall; and its outer profile (36, 2),
         points (r, z) from the stem up to the mouth.
     """
-    bowl = draw(4.1, low=3.2, high=5.0)
-    depth = draw(9.8, low=6.5, high=11.5)
-    mouth = bowl * draw(0.8, low=0.7, high=1.12)
-    wide_at = draw(0.42, low=0.3, high=0.55)
-    wall = draw(0.24, low=0.2, high=0.3)
-    knob = draw.chance(0.25)
+    bowl = sampler(4.1, low=3.2, high=5.0)
+    depth = sampler(9.8, low=6.5, high=11.5)
+    mouth = bowl * sampler(0.8, low=0.7, high=1.12)
+    wide_at = sampler(0.42, low=0.3, high=0.55)
+    wall = sampler(0.24, low=0.2, high=0.3)
+    knob = sampler.chance(0.25)
     neck = [
         (stem * (2.2 if knob else 1.0), 0.78 * stem_top),
         (stem * 1.1, 0.92 * stem_top),
@@ -784,7 +797,7 @@ def _glass_lip(
         outer: (K, 2) points (r, z) from the stem up to the mouth.
         wall: thickness of the wall.
         stem_top: height at which the bowl begins.
-        depth: of the bowl.
+        depth: depth of the bowl.
 
     Returns:
         The inside (n, 2) from the mouth downwards, without its floor; and three points
@@ -823,7 +836,7 @@ def _glass_profile(
 
     Args:
         stem_top: height of the top of the stem.
-        depth: of the bowl.
+        depth: depth of the bowl.
         inner, outer, lip: profiles of the bowl (K, 2); `inner` leads downwards.
         foot, stem: radii.
     """
@@ -847,36 +860,36 @@ def _glass_profile(
 
 
 def _glass_paints(
-    draw: ParameterSampler, stem_top: float, depth: float
+    sampler: ParameterSampler, stem_top: float, depth: float
 ) -> dict[str, Paint]:
     """Sample the paints of a wine glass, which often has wine in it.
 
     The glass is opaque: wine is a color of its outside and its inside up to a level.
 
     Args:
-        draw: samples the paints.
+        sampler: samples the paints.
         stem_top: height at which the bowl begins.
-        depth: of the bowl.
+        depth: depth of the bowl.
     """
     height = stem_top + depth
-    tint = draw.sample_color(
+    tint = sampler.sample_color(
         "c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3
     )
-    drink = draw.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
-    level = stem_top + depth * draw(0.48, low=0.3, high=0.62)
+    drink = sampler.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
+    level = stem_top + depth * sampler(0.48, low=0.3, high=0.62)
     plain = gradient(shade(tint, 0.86), shade(tint, 1.08), low=0.0, high=height)
     outside = inside = plain
-    if draw.chance(0.5, canonical=True):
-        wine = clouded(drink, factor=0.8, scale=3.0, offset=draw.offset())
+    if sampler.chance(0.5, canonical=True):
+        wine = clouded(drink, factor=0.8, scale=3.0, offset=sampler.offset())
         outside = over(plain, between(stem_top + 0.06 * depth, level, soft=0.1), wine)
         inside = over(plain, between(0.0, level, soft=0.1), solid(drink))
-    outside = paint_or_random(draw, height, outside, wild=0.3)
-    if draw.chance(0.2, canonical=True):
+    outside = paint_or_random(sampler, height, outside, wild=0.3)
+    if sampler.chance(0.2, canonical=True):
         outside = over(
             outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b")
         )
-    if draw.chance(0.7, canonical=True):
-        foot_paint = draw.pick(plain, outside, plain)
+    if sampler.chance(0.7, canonical=True):
+        foot_paint = sampler.pick(plain, outside, plain)
     else:
-        foot_paint = sample_paint(draw, height)
+        foot_paint = sample_paint(sampler, height)
     return {"foot": foot_paint, "bowl": outside, "inside": inside}

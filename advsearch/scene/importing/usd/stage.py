@@ -71,7 +71,7 @@ class Conversion:
     Attributes beside the fields:
         header: the JSON part of the file.
         lights: entries of its lights.
-        unit: of the stage in metres, once `convert` has begun.
+        unit: unit of the stage in metres, once `convert` has begun.
     """
 
     stage: Any
@@ -423,7 +423,7 @@ class Conversion:
         """Return one primitive for each material and tint of a mesh.
 
         Args:
-            prim: of the mesh.
+            prim: prim of the mesh.
             mesh: the mesh.
             points: (N, 3).
             counts: the number of corners of each face.

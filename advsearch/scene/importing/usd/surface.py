@@ -194,10 +194,10 @@ class UsdTextureUse:
     path: str  # as the file has it
     data: bytes  # the image file
     is_srgb: bool  # whether its colors are decoded from sRGB
-    channels: Sequence[int]  # of the image, that the input takes
+    channels: Sequence[int]  # channels of the image, that the input takes
     scale: tuple[float, ...]  # (4,) factors of the channels
     bias: tuple[float, ...]  # (4,) what is added after scaling
-    layout: TextureLayout  # of its texture coordinates
+    layout: TextureLayout  # layout of its texture coordinates
     wraps: tuple[int, int]  # wrap modes along s and t, as in glTF
 
     @property
@@ -430,7 +430,7 @@ class PreviewSurface:
     Attributes:
         surfaces: writes the material, and counts notes.
         shader: the preview surface.
-        name: of the material.
+        name: name of the material.
         layouts: its texture coordinates so far, by their index in glTF.
         nodes: shaders that are read, by path.
     """
@@ -759,7 +759,7 @@ class PreviewSurface:
 
         Args:
             color_use: the texture of the color, or None.
-            opacity_use: that of the opacity, or None.
+            opacity_use: opacity use that of the opacity, or None.
             color: (3,) linear color where there is no texture of it.
 
         Returns:
