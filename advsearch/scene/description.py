@@ -563,7 +563,7 @@ def load_description(
     is_scene_file = node is not None or is_mitsuba
     _check_axes(up, facing, is_scene_file=is_scene_file, is_mitsuba=is_mitsuba)
     if plugins is not None:
-        # a circle: it takes descriptions
+        # Mitsuba is imported only for what it reads
         from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
 
         imported = import_mitsuba_scene(plugins, node or str(object_spec))
@@ -636,7 +636,7 @@ def _import_scene_file(path: Path, node: str, *, is_mitsuba: bool) -> ImportedSc
     with track_opened_files(path):
         if not is_mitsuba:
             return import_scene(path, node)
-        # a circle: it takes descriptions
+        # Mitsuba is imported only for what it reads
         from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
 
         return import_mitsuba_scene(path, node)

@@ -40,7 +40,7 @@ from advsearch.scene.geometry import (
 from advsearch.scene.grounds import is_paved
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import look_up_texture, rasterize_triangles
-from advsearch.scene.scene_data import SceneData
+from advsearch.scene.scene_data import SceneData, cache_per_scene
 from advsearch.scene.settings import ORBIT_CAMERA, resolve_settings
 
 DENOISERS = ("oidn", "none")
@@ -237,7 +237,7 @@ METERED_DEFAULTS = ("camera.", "pose.", "environment.")
 """Beginnings of names of settings whose defaults are metered: controls move these."""
 
 
-@lru_cache(maxsize=8)
+@cache_per_scene
 def compute_metered_gain(scene: SceneData) -> float:
     """Return the factor on radiance by which a white card is `CARD_DISPLAY_VALUE`.
 

@@ -9,10 +9,11 @@ at azimuth 0 and elevation 0 looks from +x towards the object.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TypeVar
+from functools import cached_property, wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -221,6 +222,33 @@ class SceneData:
 
 
 AnyScene = TypeVar("AnyScene", bound=SceneData)
+P = ParamSpec("P")
+R = TypeVar("R")
+
+MAX_CACHED_RESULTS = 64  # of one function and one scene
+
+
+def cache_per_scene(
+    compute: Callable[Concatenate[AnyScene, P], R],
+) -> Callable[Concatenate[AnyScene, P], R]:
+    """Cache what a function returns for a scene and hashable arguments.
+
+    The scene may go, and what was computed for it goes with it: a scene holds all of
+    its meshes and maps. What the function returns must not hold the scene.
+    """
+    results_by_scene: WeakKeyDictionary[Any, dict[Any, R]] = WeakKeyDictionary()
+
+    @wraps(compute)
+    def compute_cached(scene: AnyScene, *args: P.args, **kwargs: P.kwargs) -> R:
+        results = results_by_scene.setdefault(scene, {})
+        key = (args, tuple(kwargs.items()))
+        if key not in results:
+            if len(results) >= MAX_CACHED_RESULTS:
+                del results[next(iter(results))]
+            results[key] = compute(scene, *args, **kwargs)
+        return results[key]
+
+    return compute_cached
 
 
 def object_to_world(description: SceneData) -> Float64Array:

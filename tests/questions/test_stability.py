@@ -17,7 +17,7 @@ from advsearch.questions.stability.result import (
     FELL_SHORT,
     OK,
     Case,
-    Outcome,
+    CaseOutcome,
     StabilityResult,
     check_range,
 )
@@ -52,8 +52,8 @@ def test_a_case_holds(case: Case) -> None:
 # ---- rows -----------------------------------------------------------------------------------------------------------
 
 
-def made(outcome: Outcome | Exception, name: str = "made") -> Case:
-    def find() -> Outcome:
+def made(outcome: CaseOutcome | Exception, name: str = "made") -> Case:
+    def find() -> CaseOutcome:
         if isinstance(outcome, Exception):
             raise outcome
         return outcome
@@ -63,7 +63,7 @@ def made(outcome: Outcome | Exception, name: str = "made") -> Case:
 
 def test_a_row_has_what_the_design_lists() -> None:
     numbers = [check_range("a", 1.0, most=2.0), check_range("b", 5.0, most=2.0)]
-    outcome = Outcome(numbers, relative_error=0.25, ending="stalled", measured={"c": 3.0})
+    outcome = CaseOutcome(numbers, relative_error=0.25, ending="stalled", measured={"c": 3.0})
     row: Any = made(outcome).run().to_dict()
     wanted = {"case": "made", "group": "noise", "finite": True, "relative_error": 0.25, "ending": "stalled"}
     assert {**row, **wanted} == row
@@ -82,8 +82,8 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    good = made(Outcome([check_range("a", 1.0, most=2.0)], relative_error=0.02, ending="found"), "good")
-    bad = replace(made(Outcome([check_range("a", 3.0, most=2.0)]), "bad"), group="stiff")
+    good = made(CaseOutcome([check_range("a", 1.0, most=2.0)], relative_error=0.02, ending="found"), "good")
+    bad = replace(made(CaseOutcome([check_range("a", 3.0, most=2.0)]), "bad"), group="stiff")
     monkeypatch.setattr(suite, "ALL_CASES", (good, bad))
     yield
 
@@ -96,7 +96,7 @@ def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert [(row["case"], row["status"]) for row in said["rows"]] == [("good", OK), ("bad", FELL_SHORT)]
 
 
-def uncalled() -> Outcome:
+def uncalled() -> CaseOutcome:
     pytest.fail("tried again")
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from advsearch.options import Value
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.tables import make_sweep_frame
-from advsearch.viewer.columns import pack_columns, read_columns
+from advsearch.viewer.columns import Boxes, pack_columns, read_columns
 from advsearch.viewer.thumbnails import find_thumbnails, thumbnail_path
 from stored_sweeps import make_sweep
 
@@ -70,3 +71,11 @@ def test_rows_are_read_in_parts(tmp_path: Path) -> None:
     assert (first["step"].tolist(), first["id"].iloc[-1]) == ([0, 1, 2, 3], 4)
     assert read_columns(tmp_path, after=4)["step"].tolist() == [4, 5, 6, 7, 8, 9]
     assert read_columns(tmp_path, after=10)["step"].tolist() == []
+
+
+def test_names_of_boxes_beyond_the_limit_are_shown_as_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advsearch.viewer.columns.MAX_LEVELS", 3)
+    boxes = Boxes()
+    boxes.add({"found": [{"box": (0, 0, 1, 1), "label": name, "score": 1.0} for name in "abcda"]})
+    assert list(boxes.names) == ["a", "b", "others"]
+    assert list(boxes.values[4::6]) == [0, 1, 2, 2, 0]
