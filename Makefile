@@ -72,7 +72,7 @@ docs: $(STAMP) ## run what the pages say and build them into build/site; fails o
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # what compares results and not times, and takes long
-STUDIES := searches closed_form policies precision kill harden kill_cluster sequential verdict_flow verdicts drives
+STUDIES := searches closed_form policies precision kill harden sequential verdict_flow verdicts drives
 
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
 	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py) benchmarks/golden.py,$(wildcard benchmarks/[!_]*.py)); do \

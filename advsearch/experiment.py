@@ -213,7 +213,8 @@ def run_experiment(
     """
     from advsearch.api.names import check_names  # imports scipy
 
-    check_names(config)
+    if not config.python_only_parts:  # objects of a session may have any name
+        check_names(dict(config))
     writes_run = resumed is None and getattr(config, "out", None) is None
     # The folder is made before heavy imports, so that a run that is stopped early can
     # be listed.

@@ -18,8 +18,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.extend import workbench
-
 if TYPE_CHECKING:
     from advsearch.extend import workbench
     from advsearch.questions.test.result import ClaimResult, SuiteResult

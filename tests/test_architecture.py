@@ -462,6 +462,6 @@ def test_imports_inside_functions_are_few_and_say_why() -> None:
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
-    """Late imports counted; what is for the type checker only is not imported."""
+    """Late imports and those for the type checker counted."""
     concepts = runpy.run_path(str(ROOT / "tools" / "concepts.py"))
     assert concepts["circles"](concepts["modules_of"](ROOT)) == []

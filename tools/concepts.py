@@ -53,23 +53,13 @@ def modules_of(root: Path) -> Modules:
 
 
 def imports_of(name: str, path: Path, modules: Modules) -> Iterator[str]:
-    """Yield the modules of the package that one imports, late imports included."""
-    for node in but_for_types(ast.parse(path.read_text("utf-8"))):
+    """Yield the modules of the package that one imports, late and for types too."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in modules)
         elif isinstance(node, ast.ImportFrom) and node.module in modules:
             inner = [f"{node.module}.{alias.name}" for alias in node.names]
             yield from (one if one in modules else str(node.module) for one in inner)
-
-
-def but_for_types(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield everything in a module but what is for the type checker only."""
-    for child in ast.iter_child_nodes(node):
-        if not (
-            isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
-        ):
-            yield child
-            yield from but_for_types(child)
 
 
 def inner_imports(text: str) -> dict[int, str]:

@@ -22,7 +22,7 @@ from advsearch.scene.library import (
     list_environments,
     list_objects,
 )
-from advsearch.settings import Config, split_names
+from advsearch.settings import split_names
 
 # What can only be the name of something bundled: no path, no file, no code.
 WORD = re.compile(r"[^\W\d][\w-]{0,59}")
@@ -37,19 +37,16 @@ they are complete.
 """
 
 
-def check_names(config: Config) -> None:
+def check_names(values: Mapping[str, Any]) -> None:
     """Check that names in settings are those of something that exists, so that a slip
     is found before anything is loaded.
+
+    `values` are those of the settings, by name.
 
     Raises:
         UnknownNameError: nothing has such a name.
         InputError: a run or a file is not there.
     """
-    if config.python_only_parts:
-        return  # objects of a Python session may have any name
-    values: dict[str, Any] = {
-        name: getattr(config, name) for name in type(config).model_fields
-    }
     _check_scene(values)
     _check_controls(values)
     for setting, group in (("policy", "policies"), ("task", "tasks")):

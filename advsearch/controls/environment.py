@@ -37,6 +37,7 @@ from advsearch.scene.description import (
 from advsearch.scene.formation import compute_metered_gain
 from advsearch.scene.geometry import compute_real_harmonics
 from advsearch.scene.library import import_environment
+from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.settings import CHANNELS, Parameter
 
 N_COEFFICIENTS = 27  # degrees 0 to 2 of three colour channels
@@ -229,7 +230,7 @@ class EnvironmentControl(Control):
             name, self.scene
         )
         base = _load_map(
-            None if is_scene_map else _load_environment(name), self.scene
+            self.scene, None if is_scene_map else _load_environment(name)
         ).to(device)
         rotated = rotate_map(
             base, values["rotation"] - self.scene.get_number("environment.rotation")
@@ -286,8 +287,8 @@ def _read_environment(real_path: str, name: str, *version: int) -> EnvironmentAs
     return import_environment(name)
 
 
-@lru_cache(maxsize=64)
-def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
+@cache_per_scene
+def _load_map(scene: SceneDescription, asset: EnvironmentAsset | None) -> Tensor:
     """Return the map (H, W, 3) of an environment, linear radiance.
 
     None as the asset stands for the scene's own environment. If the scene is metered,

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 import torch
@@ -300,7 +300,7 @@ def _is_outside_cone(center: assets.Float64Array, radius: float, angle: float) -
     return center_angle - math.asin(radius / distance) >= angle
 
 
-@lru_cache(maxsize=8)
+@geometry.cache_per_scene
 def find_strongest_light(scene: SceneDescription) -> tuple[assets.Float64Array, float]:
     """Find what puts most light on a surface that faces it.
 

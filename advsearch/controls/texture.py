@@ -36,7 +36,11 @@ from advsearch.controls.base import (
     describe_color_change,
 )
 from advsearch.controls.support.images import resize_to_square
-from advsearch.controls.support.norms import DEFAULT_EPSILON, NORMS, compute_radius
+from advsearch.controls.support.norms import (
+    DEFAULT_EPSILON,
+    NORMS,
+    compute_default_radius,
+)
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import BoolArray, Float32Array, Float64Array
 from advsearch.scene.color import srgb_to_linear
@@ -266,24 +270,30 @@ class TextureControl(Control):
         """
         texels = self._original[mask]
         norm = self.chosen["norm"]
-        epsilon = self._settings.get("epsilon")
         if self.form == "palette":
             weight = _texel_areas(part, mask)
             centers = compute_palette(
                 self._original, weight, int(self.chosen["colors"])
             )
-            budget = Budget(norm, compute_radius(norm, epsilon, centers.numel()))
+            budget = Budget(norm, self._compute_radius(norm, centers.numel()))
             return make_palette_painter(texels, centers, budget)
         if self.form == "waves":
-            max_change = compute_radius(norm, epsilon, texels.numel())
+            max_change = self._compute_radius(norm, texels.numel())
             if norm == "l2":
                 # so that all values at the maximum are on the edge of the ball
                 max_change = max_change / math.sqrt(texels.numel())
             n_waves = int(self.chosen["waves"])
             return make_wave_painter(texels, mask, n_waves, max_change)
-        budget = Budget(norm, compute_radius(norm, epsilon, texels.numel()))
+        budget = Budget(norm, self._compute_radius(norm, texels.numel()))
         group = Group("texels", texels.numel(), ("adjoint",), budget)
         return Painter(texels.reshape(-1), group, to_texels)
+
+    def _compute_radius(self, norm: str, count: int) -> float:
+        """Return the radius of the ball that `count` values stay in."""
+        epsilon = self._settings.get("epsilon")
+        if epsilon is None:
+            return compute_default_radius(norm, count)
+        return float(epsilon)
 
     def _texels_of(
         self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]

@@ -30,14 +30,15 @@ from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
 from advsearch.scene.backdrop import (
-    BackdropPhotograph,
     find_photographed_light,
     fit_to_photograph,
 )
+from advsearch.scene.backdrop_photograph import BackdropPhotograph
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_ENVIRONMENT,
+    PhotographFolder,
     SceneDescription,
     check_ground,
     check_mesh_names,
@@ -60,7 +61,6 @@ from advsearch.scene.importing.pictures import read_image
 from advsearch.scene.library import import_environment
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.photograph_files import (
-    PhotographFolder,
     is_photograph_folder,
     put_into_photograph,
     read_photograph_folder,
@@ -496,7 +496,9 @@ def fit_camera(
             fitted = {name: fit_camera(s, size) for name, s in folder.scenes.items()}
             folder = replace(folder, scenes=fitted)
         return replace(
-            fit_to_photograph(description, description.backdrop_photograph, size),
+            fit_to_photograph(
+                description, description.backdrop_photograph, size, description.gain
+            ),
             photographs=folder,
         )
     camera_model = description.camera_model

@@ -314,19 +314,37 @@ without such a setting counts as one that does not state it.
 """
 
 
+SETTINGS_OF_SEARCHES = frozenset({"epsilon"})
+"""Those that only searched controls take; one that varies by chance has none."""
+
+
+def collect_run_settings(
+    config: SceneConfig, *, are_searched: bool = True
+) -> dict[str, Any]:
+    """Return the settings that a configuration states for its controls, by name.
+
+    Where the controls vary by chance (not `are_searched`), without those of searches.
+    """
+    values = {name: getattr(config, name, None) for name in RUN_SETTINGS}
+    return {
+        name: value
+        for name, value in values.items()
+        if value is not None and (are_searched or name not in SETTINGS_OF_SEARCHES)
+    }
+
+
 def make_configured_controls(
     config: SceneConfig, controls: Controls, *, are_searched: bool = True
 ) -> tuple[Control, ...]:
     """Return control instances; settings of the run complete what they do not state.
 
-    Controls that vary by chance (not `are_searched`) get no epsilon.
+    Controls that vary by chance are not `are_searched`.
 
     Raises:
         InputError: a control that was passed as an instance would take a setting of the
             run, or a control is unknown.
     """
-    if not are_searched:
-        config = config.model_copy(update={"epsilon": None})
+    run_settings = collect_run_settings(config, are_searched=are_searched)
     control_by_name: dict[str, Any] = {}
     for name, control in normalize_controls(controls).items():
         if not isinstance(control, Control):
@@ -337,17 +355,20 @@ def make_configured_controls(
     completed: dict[str, Control | Mapping[str, object]] = {}
     for name, control in control_by_name.items():
         if isinstance(control, Control):
-            _check_takes_no_run_setting(config, control)
+            _check_takes_no_run_setting(run_settings, control)
             completed[name] = control
         else:
-            completed[name] = {**_run_settings_of(config, name, control), **control}
+            settings_of_control = _select_settings(run_settings, name, control)
+            completed[name] = {**settings_of_control, **control}
     return make_controls(completed)
 
 
-def _check_takes_no_run_setting(config: SceneConfig, control: Control) -> None:
+def _check_takes_no_run_setting(
+    run_settings: Mapping[str, Any], control: Control
+) -> None:
     """Raise InputError if an instance would take a setting that the run states."""
     for choice in _list_active_choices(type(control), control.to_settings()):
-        if getattr(config, choice.run_setting, None) is not None:
+        if choice.run_setting in run_settings:
             raise InputError(
                 f"{choice.run_setting}: control {control.name} was given as an "
                 "instance; set it there, as in "
@@ -355,23 +376,25 @@ def _check_takes_no_run_setting(config: SceneConfig, control: Control) -> None:
             )
 
 
-def _run_settings_of(
-    config: SceneConfig, qualified_name: str, control_settings: Mapping[str, object]
+def _select_settings(
+    run_settings: Mapping[str, Any],
+    qualified_name: str,
+    control_settings: Mapping[str, object],
 ) -> dict[str, object]:
     """Return those settings of the run that a control takes, by its own names for them.
 
     A setting of the run may be a mapping by the names of controls.
     """
-    run_settings: dict[str, object] = {}
+    selected: dict[str, object] = {}
     for choice in _list_choices(qualified_name, control_settings) or ():
-        value = getattr(config, choice.run_setting, None)
+        value = run_settings.get(choice.run_setting)
         if isinstance(value, Mapping):
             _, instance_name = parse_control_name(qualified_name, control_settings)
             value = value.get(instance_name)
         # A tuple is a curve of epsilons: each of its runs has a single one.
         if value is not None and not isinstance(value, tuple):
-            run_settings[choice.name] = value
-    return run_settings
+            selected[choice.name] = value
+    return selected
 
 
 def select_run_settings(
@@ -404,19 +427,15 @@ def select_run_settings(
 def check_run_settings(config: SceneConfig) -> None:
     """Check that every setting of a run is taken by one of its controls.
 
-    An epsilon is looked for among the searched controls only: those that vary by chance
-    have none.
+    Settings of searches are looked for among the searched controls only.
 
     Raises:
         InputError: no control takes a setting, or the one that it names does not.
         UnknownNameError: a setting names a control that is not there.
     """
-    for setting in RUN_SETTINGS:
-        value = getattr(config, setting, None)
-        if value is None:
-            continue
+    for setting, value in collect_run_settings(config).items():
         random_controls: Mapping[str, Any] = {}
-        if setting != "epsilon":
+        if setting not in SETTINGS_OF_SEARCHES:
             random_controls = getattr(config, "over", {})
         controls = merge_control_settings({**config.controls, **random_controls})
         # kind of each control that does not take the setting

@@ -27,9 +27,8 @@ import math
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +38,8 @@ from torch import Tensor
 
 from advsearch.errors import FileFormatError, InputError
 from advsearch.pictures import check_decodable, open_image, to_8bit_levels
-from advsearch.scene.assets import Float32Array, Float64Array, ObjectAsset
+from advsearch.scene.assets import Float64Array, ObjectAsset
+from advsearch.scene.backdrop_photograph import BackdropPhotograph, decode_all_levels
 from advsearch.scene.camera_model import (
     BROWN_CONRADY,
     EQUIRECTANGULAR,
@@ -51,18 +51,15 @@ from advsearch.scene.camera_model import (
 )
 from advsearch.scene.color import CHANNELS, linear_to_srgb, srgb_to_linear
 from advsearch.scene.depth_pictures import check_no_depth, is_depth, read_depth
+from advsearch.scene.formation import Surfaces
 from advsearch.scene.geometry import camera_to_world, object_to_world, project_points
-from advsearch.scene.image_quality import make_noise, measure_blur, measure_noise
-from advsearch.scene.importing.pictures import average_area
+from advsearch.scene.image_quality import measure_blur
+from advsearch.scene.scene_data import AnyScene, SceneData
 from advsearch.trust.stored_files import (
     LARGEST_FILE,
     record_opened,
     track_opened_files,
 )
-
-if TYPE_CHECKING:
-    from advsearch.scene.description import SceneDescription
-    from advsearch.scene.formation import Surfaces
 
 MAX_ELEVATION = 89.0  # degrees, of a camera that orbits the object
 MIN_SIDE = 8  # pixels of a photograph, or of what is cut out of it
@@ -75,9 +72,6 @@ PHOTOGRAPH_CAMERA = "photograph"  # name of the pinhole of a part of a photograp
 PLANE_SETTINGS = frozenset(
     ("ground.size", "ground.level", *(f"ground.{channel}" for channel in CHANNELS))
 )
-# points at which depth is looked up in a pixel, along each side
-MIN_DEPTH_POINTS = 2
-MAX_DEPTH_POINTS = 4
 # fraction of a depth: what is nearer by less does not hide, as where things touch
 DEPTH_TOLERANCE = 0.01
 MIN_BLUR = 0.15  # pixels; less is not seen
@@ -93,125 +87,6 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue (BT.709
 GROUND = "ground"  # name of the plane that takes the shadow, among surfaces
 LIGHT_SUFFIXES = (".hdr", ".exr")
 CROP = re.compile(r"(?P<path>.+)#(?P<numbers>\d+,\d+,\d+,\d+)")
-
-
-@dataclass(frozen=True, eq=False)
-class BackdropPhotograph:
-    """A photograph, or a part of one, that a scene is rendered into."""
-
-    spec: str  # how it was asked for: a path, and perhaps the part
-    levels: npt.NDArray[np.uint8]  # (H, W, 3) sRGB of the full photograph
-    digest: str  # SHA-256 of the levels, in hexadecimal
-    crop: tuple[int, int, int, int]  # left, top, width and height in pixels
-    # (H, W) levels: 255 where the photograph shows what is before the object; None if
-    # nothing is
-    front: npt.NDArray[np.uint8] | None = None
-    # (H, W) metres along the camera's axis, infinite where unknown; None if no depth is
-    depth: Float32Array | None = None
-    front_spec: str = ""  # how one of them was asked for
-
-    @property
-    def full_size(self) -> tuple[int, int]:
-        """Height and width of the full photograph, pixels."""
-        return self.levels.shape[0], self.levels.shape[1]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of the part that is used, pixels."""
-        return self.crop[3], self.crop[2]
-
-    @property
-    def is_cropped(self) -> bool:
-        """Whether only a part of the photograph is used."""
-        return self.size != self.full_size
-
-    def resample(self, resolution: tuple[int, int]) -> Tensor:
-        """Return the part in display-linear values at (height, width) pixels.
-
-        Each pixel is the mean over the area that it covers, in linear light. Where the
-        photograph has fewer pixels than that, it is interpolated.
-
-        Returns:
-            (H, W, 3) float32 in [0, 1].
-        """
-        return self._resample_part(_decode_all_levels()[self.levels], resolution)
-
-    def resample_front(self, resolution: tuple[int, int]) -> Tensor | None:
-        """Return what is before the object, (H, W, 1) float32 in [0, 1], or None."""
-        if self.front is None:
-            return None
-        fractions = self.front[..., None].astype(np.float32) / np.float32(255.0)
-        return self._resample_part(fractions, resolution)
-
-    def resample_depth(self, resolution: tuple[int, int]) -> Tensor | None:
-        """Return the depth (H S, W S) float32 in metres at S x S points of each pixel.
-
-        They are so many that the edges in the depth are followed, at most
-        `MAX_DEPTH_POINTS` along each side. None if there is no depth.
-        """
-        if self.depth is None:
-            return None
-        left, top, width, height = self.crop
-        part = self.depth[top : top + height, left : left + width]
-        needed = math.ceil(max(height / resolution[0], width / resolution[1]))
-        n_points = min(max(needed, MIN_DEPTH_POINTS), MAX_DEPTH_POINTS)
-        picks = [
-            ((np.arange(n_points * n_pixels) + 0.5) * side / (n_points * n_pixels))
-            for n_pixels, side in zip(resolution, part.shape, strict=True)
-        ]
-        rows, columns = (pick.astype(np.intp) for pick in picks)
-        return torch.from_numpy(part[np.ix_(rows, columns)])
-
-    def make_noise(self, resolution: tuple[int, int], sigma: float | None) -> Tensor:
-        """Return noise (H, W, 3) float32, display-referred, as the photograph has.
-
-        It is made in the pixels of the photograph and resampled as that is, so that it
-        is as coarse. The same photograph gives the same noise.
-
-        Args:
-            resolution: height and width in pixels.
-            sigma: standard deviation in levels at that resolution; None: that of the
-                photograph.
-        """
-        part = self.levels[
-            self.crop[1] : self.crop[1] + self.crop[3],
-            self.crop[0] : self.crop[0] + self.crop[2],
-        ]
-        seed = int(self.digest[:8], 16)
-        if sigma is not None:
-            return make_noise(np.full(3, sigma / 255.0), resolution, seed)
-        noise = make_noise(measure_noise(part) / 255.0, self.size, seed)
-        return _resample_image(noise.numpy(), resolution)
-
-    def _resample_part(
-        self, image: Float32Array, resolution: tuple[int, int]
-    ) -> Tensor:
-        """Return the used part of an image (H, W, C) at (height, width) pixels."""
-        left, top, width, height = self.crop
-        part = image[top : top + height, left : left + width]
-        return _resample_image(part, resolution)
-
-
-def _resample_image(image: Float32Array, resolution: tuple[int, int]) -> Tensor:
-    """Resample an image (H, W, C) to (height, width) pixels.
-
-    Along an axis with more pixels it is averaged down, along one with fewer it is then
-    interpolated.
-    """
-    height, width = image.shape[:2]
-    averaged = average_area(
-        image, min(height, resolution[0]), min(width, resolution[1])
-    )
-    resampled = torch.from_numpy(averaged)
-    if tuple(averaged.shape[:2]) == resolution:
-        return resampled
-    enlarged = torch.nn.functional.interpolate(
-        resampled.permute(2, 0, 1)[None],
-        size=resolution,
-        mode="bilinear",
-        align_corners=False,
-    )
-    return enlarged[0].permute(1, 2, 0).contiguous()
 
 
 def read_backdrop(spec: str | Path) -> BackdropPhotograph:
@@ -315,7 +190,7 @@ def _check_front_size(
 
 
 def make_image_inputs(
-    description: SceneDescription, resolution: tuple[int, int]
+    description: SceneData, resolution: tuple[int, int]
 ) -> dict[str, Tensor]:
     """Return the inputs by which a rendered image becomes a part of its photograph.
 
@@ -466,16 +341,11 @@ def make_backdrop(
     return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
 
 
-def _decode_all_levels() -> Float32Array:
-    """Return the display-linear values (256,) of all levels of 8-bit sRGB."""
-    return srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))
-
-
 # ---- The light of a photograph
 
 
 def compute_photograph_gain(
-    description: SceneDescription, photograph: BackdropPhotograph
+    description: SceneData, photograph: BackdropPhotograph
 ) -> float:
     """Return the factor from radiance to display-linear values of a photograph.
 
@@ -489,14 +359,14 @@ def compute_photograph_gain(
         np.bincount(photograph.levels[..., channel].reshape(-1), minlength=256)
         for channel in range(len(CHANNELS))
     ]
-    decoded = _decode_all_levels()
+    decoded = decode_all_levels()
     means = np.array([np.average(decoded, weights=count) for count in counts])
     mean = max(float(means @ LUMINANCE), 1e-3)
     # a matt surface has the radiance reflectance * irradiance / pi
     return mean * math.pi / (GREY_CARD * irradiance)
 
 
-def compute_level_irradiance(description: SceneDescription) -> Float64Array:
+def compute_level_irradiance(description: SceneData) -> Float64Array:
     """Return the irradiance (3,) of a level surface under the environment alone.
 
     It is that of the map, before `environment.exposure`.
@@ -516,7 +386,7 @@ def compute_level_irradiance(description: SceneDescription) -> Float64Array:
     return np.asarray((weights[:, None] * row_means).sum(axis=0))
 
 
-def has_plane(description: SceneDescription) -> bool:
+def has_plane(description: SceneData) -> bool:
     """Return whether a scene has a plane that takes the shadow in a photograph.
 
     It needs an environment, whose light the shadow is in, and a camera above it.
@@ -529,7 +399,7 @@ def has_plane(description: SceneDescription) -> bool:
     )
 
 
-def compute_plane_radiance(description: SceneDescription) -> Tensor | None:
+def compute_plane_radiance(description: SceneData) -> Tensor | None:
     """Return the radiance (3,) float32 of the plane without the object.
 
     None if a scene has no plane.
@@ -544,7 +414,7 @@ def compute_plane_radiance(description: SceneDescription) -> Tensor | None:
 
 
 def measure_plane_color(
-    description: SceneDescription, photograph: BackdropPhotograph
+    description: SceneData, photograph: BackdropPhotograph, gain: float
 ) -> dict[str, float]:
     """Return the settings of the plane's color, sRGB, measured around the object.
 
@@ -555,6 +425,7 @@ def measure_plane_color(
     Args:
         description: the scene, with the camera of the full photograph.
         photograph: photograph that it is rendered into.
+        gain: factor from radiance to display-linear values.
     """
     names = [f"ground.{channel}" for channel in CHANNELS]
     if not has_plane(description) or description.requested & set(names):
@@ -564,13 +435,13 @@ def measure_plane_color(
         return {}
     display = levels.astype(np.float32) / np.float32(255.0)
     # (3,) display-linear values of a plane with an albedo of 1
-    light = description.gain * compute_level_irradiance(description) / math.pi
+    light = gain * compute_level_irradiance(description) / math.pi
     albedo = np.median(srgb_to_linear(display), axis=0) / light
     color = linear_to_srgb(np.clip(albedo, *ALBEDO_RANGE).astype(np.float32))
     return dict(zip(names, map(float, color), strict=True))
 
 
-def _sample_ring(description: SceneDescription) -> Float64Array:
+def _sample_ring(description: SceneData) -> Float64Array:
     """Return random points (N, 3) of the ground plane in a ring around the object.
 
     Its radii are `CONTACT_RING`. The seed is fixed: every call returns the same points.
@@ -586,7 +457,7 @@ def _sample_ring(description: SceneDescription) -> Float64Array:
 
 
 def _look_up_levels(
-    description: SceneDescription, photograph: BackdropPhotograph, points: Float64Array
+    description: SceneData, photograph: BackdropPhotograph, points: Float64Array
 ) -> npt.NDArray[np.uint8]:
     """Return the levels (M, 3) of the pixels of a photograph that show points (N, 3).
 
@@ -655,16 +526,18 @@ def make_matrix_camera(
 
 
 def fit_to_photograph(
-    description: SceneDescription,
+    description: AnyScene,
     photograph: BackdropPhotograph,
     resolution: tuple[int, int],
-) -> SceneDescription:
+    gain: float,
+) -> AnyScene:
     """Return a scene with the camera of the part of a photograph that is used.
 
     Args:
         description: the scene, whose camera took the full photograph.
         photograph: photograph that it is rendered into.
         resolution: height and width of the film, pixels.
+        gain: factor from radiance to display-linear values.
 
     Raises:
         InputError: the film, or the camera's picture, has another shape than the
@@ -678,7 +551,7 @@ def fit_to_photograph(
         model = make_bundled_models(full_aspect).get(model.name, model)
         _check_camera_shape(photograph, model)
     uncropped = replace(description, camera_model=model)
-    plane_color = measure_plane_color(uncropped, photograph)
+    plane_color = measure_plane_color(uncropped, photograph, gain)
     if photograph.is_cropped:
         if model is None:
             fov = description.get_number("camera.fov")

@@ -1,20 +1,14 @@
-"""A scene as data: meshes, of which one is the object, lamps, an environment and the
-settings; nothing of Mitsuba.
-
-Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is
-1 before `pose.scale`), angles in degrees. Lengths of the camera and of a photograph's
-floor and paths of files are in metres where the object has a size in metres. The camera
-at azimuth 0 and elevation 0 looks from +x towards the object.
+"""A scene as its users have it: `SceneData` with its light, its exposure, its cameras and
+what there is to say of it. And `load_description`, which reads one.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy.typing as npt
 import torch
@@ -22,10 +16,8 @@ import torch
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene import geometry, library, settings
 from advsearch.scene.assets import (
-    TRIPOD_HEIGHT,
     EnvironmentAsset,
     Float64Array,
-    Material,
     ObjectAsset,
     describe_size_doubts,
     with_size,
@@ -33,13 +25,13 @@ from advsearch.scene.assets import (
 from advsearch.scene.backdrop import (
     PLANE_SETTINGS,
     PLANE_SIZE,
-    BackdropPhotograph,
     compute_photograph_gain,
     compute_view_settings,
     make_matrix_camera,
     read_backdrop,
     with_front,
 )
+from advsearch.scene.backdrop_photograph import BackdropPhotograph
 from advsearch.scene.camera_entries import (
     MAX_TABLETOP_SIZE,
     PRESETS,
@@ -47,7 +39,7 @@ from advsearch.scene.camera_entries import (
     TABLE_SIDE,
 )
 from advsearch.scene.camera_files import read_camera
-from advsearch.scene.camera_model import CameraModel, make_bundled_models
+from advsearch.scene.camera_model import make_bundled_models
 from advsearch.scene.formation import (
     CARD_DISPLAY_VALUE,
     CARD_REFLECTANCE,
@@ -55,9 +47,7 @@ from advsearch.scene.formation import (
     compute_metered_gain,
 )
 from advsearch.scene.grounds import (
-    Photograph,
     find_place,
-    get_photograph,
     has_lanes,
     is_against_traffic,
     is_paved,
@@ -73,21 +63,18 @@ from advsearch.scene.importing.scenes import (
     split_node,
 )
 from advsearch.scene.parts import (
-    CAMERA,
-    BeamLamp,
     Lamp,
-    LampGlass,
-    MeshPart,
     PluginPart,
     PosedCamera,
     ScenePart,
     iterate_plugins,
-    make_mesh_part,
 )
-from advsearch.scene.photograph_files import PhotographFolder
 from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
-from advsearch.scene.rig import AXES, Mount, read_photograph_camera, read_rig
+from advsearch.scene.rig import AXES, read_photograph_camera, read_rig
+from advsearch.scene.scene_data import NO_ENVIRONMENT as NO_ENVIRONMENT
+from advsearch.scene.scene_data import OBJECT as OBJECT
+from advsearch.scene.scene_data import SceneData
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import (
     ThingPart,
@@ -98,70 +85,36 @@ from advsearch.scene.things import (
 from advsearch.trust.stored_files import track_opened_files
 
 DEFAULT_ENVIRONMENT = "studio"
-OBJECT = "object"  # the name of the mesh under test
 # what stands for the environment among the settings that were asked for
 ENVIRONMENT = "environment"
 ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 """Mitsuba's lights from everywhere, of which a scene can have one."""
-NO_ENVIRONMENT = "none"  # what the environment of a scene without a map is called
 # what the scene's own environment is called where another may be chosen
 SCENE_ENVIRONMENT = "own"
 
 
 @dataclass(frozen=True, eq=False)
-class SceneDescription:
+class PhotographFolder:
+    """A folder of photographs, and the scene as it is rendered into each of them.
+
+    Attributes:
+        path: path of the folder, as it was stated.
+        camera: camera that the user stated for all of them; None if each has its own.
+        scenes: scenes by the name of the photograph's file, in alphabetical order.
+    """
+
+    path: str
+    camera: str | None
+    scenes: Mapping[str, SceneDescription]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneDescription(SceneData):
     """Everything that fixes a scene except what a control varies."""
 
-    object: ObjectAsset  # the thing to recognise
-    # the map that lights it; None where only lamps do
-    environment: EnvironmentAsset | None
-    # every setting of `advsearch.scene.settings` by name; None where the scene works
-    # the value out. Those of meshes around the object, `pose:chair.yaw`, only where
-    # they were given
-    values: Mapping[str, float | None] = field(default_factory=dict)
-    # how the object was asked for: a bundled name, a path, or an asset's own name
-    object_spec: str = ""
-    environment_spec: str = ""  # how the environment was asked for, likewise
-    up: str | None = None  # the up axis that was given for a mesh file
-    facing: str | None = None  # the axis of a mesh file that was given for its front
-    size: float | None = None  # the object's longest side in metres that was given
-    # Unit of the object's file, that was given
-    # (`advsearch.scene.assets.METRES_PER_UNIT`).
-    unit: str | None = None
-    # what was asked for: names of settings, and "environment"
-    requested: frozenset[str] = frozenset()
-    # beside object, environment and ground: further meshes, lamps, haze
-    parts: tuple[ScenePart, ...] = ()
-    thin_lens: bool = False  # the camera has an aperture and a focus distance
-    # the environment may be hidden behind a plain colour or a photograph
-    # (`backdrop.color`)
-    backdrop: bool = False
-    # Backdrop photograph that it is rendered into; None for none.
-    backdrop_photograph: BackdropPhotograph | None = None
-    # the folder of photographs among which the control `backdrop` chooses; the scene
-    # itself is in the first of them
+    # The folder of photographs among which the control `backdrop` chooses. The scene
+    # itself is in the first of them.
     photographs: PhotographFolder | None = None
-    aspect: float = 1.0  # width over height of the picture
-    # those with poses of their own, by name
-    cameras: Mapping[str, PosedCamera] = field(default_factory=dict)
-    # name of the one in use; `ORBIT_CAMERA` for that of the settings
-    camera: str = ORBIT_CAMERA
-    # name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for
-    # none
-    preset: str = ""
-    # Camera model of the camera around the object; None for a pinhole.
-    camera_model: CameraModel | None = None
-    # cameras that take pictures at the same time, this one first; empty where it is
-    # alone
-    rig: tuple[Mount, ...] = ()
-    rig_spec: str = ""  # how they were asked for
-    # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba
-    # shows it
-    metered: bool = True
-    # Remarks for users: of further files that controls have read, of things in each
-    # other.
-    remarks: tuple[str, ...] = ()
-    things_spec: str = ""  # how the things beside the object were asked for
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part. Raises InputError: its name is taken."""
@@ -444,44 +397,6 @@ class SceneDescription:
         return scene.with_values(camera__distance=distance)
 
     @property
-    def azimuth_zero(self) -> float:
-        """Direction from the object to the camera of azimuth 0, degrees from +x."""
-        return 180.0 if self.is_in_lane and self.object.drives else 0.0
-
-    @property
-    def is_in_lane(self) -> bool:
-        """Whether the camera is mounted in a car that drives in the object's lane."""
-        return self.preset != "" and PRESETS[self.preset].in_lane
-
-    @cached_property
-    def meshes(self) -> Mapping[str, MeshPart]:
-        """Every mesh by name, as the settings have it.
-
-        The one under test is `OBJECT`. The glass of lamps has the pose of what carries
-        it.
-        """
-        around = {
-            name: geometry.apply_settings(part, self.values)
-            for name, part in self.surrounding_meshes.items()
-        }
-        object_part = make_mesh_part(
-            OBJECT, self.object, geometry.object_to_world(self), self.material
-        )
-        meshes = {OBJECT: object_part, **around}
-        glasses = {
-            name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)
-        }
-        return meshes | {
-            name: replace(glass, to_world=meshes[glass.carrier].to_world)
-            for name, glass in glasses.items()
-        }
-
-    @cached_property
-    def surrounding_meshes(self) -> Mapping[str, MeshPart]:
-        """The meshes around the object by name, as they came."""
-        return {part.name: part for part in self.parts if isinstance(part, MeshPart)}
-
-    @property
     def things(self) -> Mapping[str, ThingPart]:
         """The things beside the object by name, as they came."""
         return {part.name: part for part in self.parts if isinstance(part, ThingPart)}
@@ -520,32 +435,7 @@ class SceneDescription:
     @property
     def lamps(self) -> Mapping[str, Lamp]:
         """Every light beside the environment, by name."""
-        return {
-            part.name: self.get_positioned_part(part)
-            for part in self.parts
-            if isinstance(part, Lamp)
-        }
-
-    def get_positioned_part(self, part: ScenePart) -> Any:
-        """Return one of the parts as the settings and the camera have it.
-
-        A mesh has the pose and the material of its settings. A beam stands where its
-        carrier, a mesh or the camera's car, takes it. Other parts are as they are.
-        """
-        if not isinstance(part, BeamLamp):
-            return self.meshes.get(part.name, part)
-        if part.carrier == CAMERA:
-            carrier = geometry.compute_car_pose(
-                torch.from_numpy(geometry.camera_to_world(self))
-            )
-        else:
-            carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
-        return replace(
-            part,
-            to_world=geometry.compute_carried_pose(
-                carrier, torch.from_numpy(part.pose_on_carrier)
-            ).numpy(),
-        )
+        return geometry.list_lamps(self)
 
     @property
     def is_lit(self) -> bool:
@@ -558,26 +448,6 @@ class SceneDescription:
             or bool(self.lamps)
             or shining
             or self.has_emission
-        )
-
-    @property
-    def size_in_metres(self) -> float:
-        """Metres of one object size, or 1 where they are not known."""
-        return self.object.size_in_metres or 1.0
-
-    @property
-    def object_name(self) -> str:
-        """How the object was asked for, or else its own name."""
-        return self.object_spec or self.object.name
-
-    @property
-    def environment_name(self) -> str:
-        """How the environment was asked for, or else its own name.
-
-        `NO_ENVIRONMENT` where there is none.
-        """
-        return self.environment_spec or (
-            NO_ENVIRONMENT if self.environment is None else self.environment.name
         )
 
     @property
@@ -662,23 +532,6 @@ class SceneDescription:
         return find_ground_height(self, position)
 
     @property
-    def base_vertices(self) -> Float64Array:
-        """(V, 3) the object's vertices in world space, in its base pose."""
-        return geometry.compute_base_vertices(self.meshes[OBJECT])
-
-    def get_number(self, name: str) -> float:
-        """Return a setting that always has a value.
-
-        Of the field of view, that of the camera in use.
-        """
-        if name == "camera.fov" and self.camera != ORBIT_CAMERA:
-            return self.cameras[self.camera].compute_larger_fov(self.aspect)
-        value = self.values[name]
-        if value is None:
-            raise KeyError(name)
-        return value
-
-    @property
     def requested_values(self) -> dict[str, float | str]:
         """The settings that were requested and have a value, by name.
 
@@ -696,51 +549,6 @@ class SceneDescription:
                     else value
                 )
         return requested
-
-    @property
-    def photograph(self) -> Photograph | None:
-        """The ground that shows the environment's photograph; None where it is a table.
-
-        Where `ground.kind` is not set, a photographed environment has such a ground,
-        unless a table is described or the environment may be hidden behind a color,
-        which would hide everything above the horizon alone.
-        """
-        environment = self.environment
-        kind = self.values.get("ground.kind")
-        if environment is None or self.get_number("ground.size") == 0.0:
-            return None
-        if kind is not None:
-            shows_photograph = settings.GROUND_KINDS[int(kind)] == settings.PHOTOGRAPH
-        else:
-            shows_photograph = (
-                environment.photographed
-                and not self.backdrop
-                and self.requested.isdisjoint(settings.TABLE_SETTINGS)
-            )
-        if not shows_photograph:
-            return None
-        rotation = self.get_number("environment.rotation")
-        return get_photograph(environment, self.capture_height, rotation)
-
-    @property
-    def capture_height(self) -> float:
-        """Height above the floor of the photograph's camera, object sizes."""
-        height = self.values.get("ground.height")
-        if height is None and self.object.size_in_metres is None:
-            return settings.DEFAULT_PHOTOGRAPH_HEIGHT
-        return (TRIPOD_HEIGHT if height is None else height) / self.size_in_metres
-
-    @property
-    def ground_color(self) -> tuple[float, ...]:
-        """(3,) colour of the ground plane, display-referred sRGB."""
-        return tuple(
-            self.get_number(f"ground.{channel}") for channel in settings.CHANNELS
-        )
-
-    @property
-    def material(self) -> Material:
-        """The object's material with the `material.*` settings over it."""
-        return self.object.material.with_values(self.values, "material.")
 
     @property
     def gain(self) -> float:
@@ -807,7 +615,7 @@ def load_description(
     is_scene_file = node is not None or is_mitsuba
     _check_axes(up, facing, is_scene_file=is_scene_file, is_mitsuba=is_mitsuba)
     if plugins is not None:
-        # a circle: it takes descriptions
+        # Mitsuba is imported only for what it reads
         from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
 
         imported = import_mitsuba_scene(plugins, node or str(object_spec))
@@ -880,7 +688,7 @@ def _import_scene_file(path: Path, node: str, *, is_mitsuba: bool) -> ImportedSc
     with track_opened_files(path):
         if not is_mitsuba:
             return import_scene(path, node)
-        # a circle: it takes descriptions
+        # Mitsuba is imported only for what it reads
         from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
 
         return import_mitsuba_scene(path, node)

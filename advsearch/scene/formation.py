@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -33,16 +33,15 @@ from advsearch.scene.geometry import (
     Frame,
     camera_to_world,
     compute_base_vertices,
+    list_lamps,
     make_rotation,
     object_to_world,
 )
 from advsearch.scene.grounds import is_paved
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import look_up_texture, rasterize_triangles
+from advsearch.scene.scene_data import SceneData, cache_per_scene
 from advsearch.scene.settings import ORBIT_CAMERA, resolve_settings
-
-if TYPE_CHECKING:
-    from advsearch.scene.description import SceneDescription
 
 DENOISERS = ("oidn", "none")
 # samplers of a run's image formation; `advsearch precision` compares more
@@ -238,8 +237,8 @@ METERED_DEFAULTS = ("camera.", "pose.", "environment.")
 """Beginnings of names of settings whose defaults are metered: controls move these."""
 
 
-@lru_cache(maxsize=8)
-def compute_metered_gain(scene: SceneDescription) -> float:
+@cache_per_scene
+def compute_metered_gain(scene: SceneData) -> float:
     """Return the factor on radiance by which a white card is `CARD_DISPLAY_VALUE`.
 
     The card, of `CARD_REFLECTANCE`, is laid against all of the object that the camera
@@ -270,7 +269,7 @@ def compute_metered_gain(scene: SceneDescription) -> float:
     )
 
 
-def compute_irradiance(scene: SceneDescription, normals: Float64Array) -> Float64Array:
+def compute_irradiance(scene: SceneData, normals: Float64Array) -> Float64Array:
     """Return the irradiance (N, 3) on unshadowed surfaces at the object's center.
 
     The surfaces have unit normals (N, 3).
@@ -282,7 +281,7 @@ def compute_irradiance(scene: SceneDescription, normals: Float64Array) -> Float6
     cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
     # no BLAS, whose last bits depend on its threads
     irradiances = np.asarray(np.einsum("nw,wc->nc", cosines, power))
-    for lamp in scene.lamps.values():
+    for lamp in list_lamps(scene).values():
         direction, lamp_irradiance = lamp.compute_lighting(center)
         if lamp_irradiance.any():  # the lamps of controls are dark by default
             distance = max(float(np.linalg.norm(direction)), 1e-12)
@@ -299,7 +298,7 @@ def compute_irradiance(scene: SceneDescription, normals: Float64Array) -> Float6
 
 
 def _compute_distant_light(
-    scene: SceneDescription, center: Float64Array
+    scene: SceneData, center: Float64Array
 ) -> tuple[Float64Array, Float64Array]:
     """Return the light that arrives at a point from environment and ground.
 
@@ -332,7 +331,7 @@ def _compute_distant_light(
 
 
 def compute_environment_light(
-    scene: SceneDescription,
+    scene: SceneData,
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return the environment's light in a coarse map.
 
@@ -403,7 +402,7 @@ def _find_nearest(
     return np.asarray(front[front >= 0])
 
 
-def compute_visible_normals(scene: SceneDescription) -> Float64Array:
+def compute_visible_normals(scene: SceneData) -> Float64Array:
     """Return the object's unit normals (N, 3) in the pixels of a small image.
 
     N is the number of pixels that show the object, each by its nearest face; other
@@ -432,7 +431,7 @@ def compute_visible_normals(scene: SceneDescription) -> Float64Array:
 
 
 def _interpolate_normals(
-    scene: SceneDescription, corners: IntArray, weights: Float64Array
+    scene: SceneData, corners: IntArray, weights: Float64Array
 ) -> Float64Array:
     """Return unit normals (N, 3) in world space of points on the object's faces.
 

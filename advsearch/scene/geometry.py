@@ -23,7 +23,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,17 +32,20 @@ from torch import Tensor
 
 from advsearch.scene.assets import Float64Array, make_pose
 from advsearch.scene.camera_model import CameraModel as CameraModel
-from advsearch.scene.parts import Footprint, MeshPart
+from advsearch.scene.parts import CAMERA, BeamLamp, Footprint, Lamp, ScenePart
+from advsearch.scene.poses import apply_settings as apply_settings
+from advsearch.scene.poses import compute_base_vertices as compute_base_vertices
+from advsearch.scene.poses import make_rotation as make_rotation
 from advsearch.scene.rigged import PERSON_PARAMETERS as PERSON_PARAMETERS
 from advsearch.scene.rigged import TIME as TIME
 from advsearch.scene.rigged import find_rig_parameter as find_rig_parameter
-from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
+from advsearch.scene.scene_data import SceneData
+from advsearch.scene.scene_data import cache_per_scene as cache_per_scene
+from advsearch.scene.scene_data import object_to_world as object_to_world
+from advsearch.scene.settings import ORBIT_CAMERA, SETTINGS
 from advsearch.scene.skeleton import (
     compute_rotation_entries as compute_rotation_entries,
 )
-
-if TYPE_CHECKING:
-    from advsearch.scene.description import SceneDescription
 
 # share of the picture's half-width that the object may reach when the distance is
 # worked out
@@ -104,7 +107,7 @@ class Frame:
 
 
 def _compute_edge_tangents(
-    description: SceneDescription, fov: Tensor, aspect: float
+    description: SceneData, fov: Tensor, aspect: float
 ) -> Tensor:
     """Return the tangents (2,) of the angles from the middle of an image to its edges.
 
@@ -130,7 +133,7 @@ def _compute_edge_tangents(
 
 
 def compute_framing_distance(
-    description: SceneDescription, fov: Tensor, aspect: float
+    description: SceneData, fov: Tensor, aspect: float
 ) -> Tensor:
     """Return the distance () of the camera to the middle of a scene's object.
 
@@ -194,7 +197,7 @@ def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float6
     return np.stack([*rolled_axes, outwards])
 
 
-def compute_center(description: SceneDescription) -> Float64Array:
+def compute_center(description: SceneData) -> Float64Array:
     """Return what the camera looks at.
 
     The middle (3,) of the object's bounding box in its default pose.
@@ -237,22 +240,6 @@ def _compute_framing_distance_all_around(
     return torch.stack([for_sides.max(), for_top.max(), for_bottom.max()]).max()
 
 
-def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
-    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix.
-
-    That is first a turn about x by the roll, then about y, then about z.
-    """
-    # cosine and sine of each
-    (cz, sz), (cy, sy), (cx, sx) = (
-        (math.cos(math.radians(a)), math.sin(math.radians(a)))
-        for a in (yaw, pitch, roll)
-    )
-    rz = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
-    ry = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-    rx = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-    return np.asarray(rz @ ry @ rx)
-
-
 def make_affine(linear: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
     """Return the pose (4, 4) of `v -> linear @ v + translation`.
 
@@ -262,88 +249,8 @@ def make_affine(linear: torch.Tensor, translation: torch.Tensor) -> torch.Tensor
     return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])
 
 
-def object_to_world(description: SceneDescription) -> Float64Array:
-    """Return the object's pose (4, 4).
-
-    Scale and rotate about the middle of its bounding box, keep it on the ground, shift.
-    "On the ground" means that the lowest vertex is at z = 0 before `pose.z` is added,
-    whatever the rotation.
-    """
-    vertices = description.object.mesh.vertices.astype(np.float64)
-    parameters = {
-        parameter.name: description.get_number(f"pose.{parameter.name}")
-        for parameter in POSE
-    }
-    return _compute_pose(vertices, 0.0, parameters)
-
-
-def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
-    """Return a mesh around the object as the settings have it.
-
-    It is posed about its own middle, where it stands, by the settings `pose:NAME.yaw`
-    and so on, and stays on the height that it stands on; without any it stays as it is.
-    Its material is set by `material:NAME.roughness` and so on.
-    """
-    parameters = {}
-    for parameter in POSE:
-        value = values.get(f"pose:{part.name}.{parameter.name}")
-        if value is not None:
-            parameters[parameter.name] = value
-    if parameters:
-        positions = compute_base_vertices(part)
-        parameters = {
-            **{parameter.name: float(parameter.default) for parameter in POSE},
-            **parameters,
-        }
-        part = replace(
-            part,
-            to_world=_compute_pose(positions, float(positions[:, 2].min()), parameters)
-            @ part.to_world,
-        )
-    return replace(
-        part, material=part.material.with_values(values, f"material:{part.name}.")
-    )
-
-
-def compute_base_vertices(part: MeshPart) -> Float64Array:
-    """Return where the vertices (V, 3) of a mesh are in its base pose."""
-    return np.asarray(
-        part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T
-        + part.to_world[:3, 3]
-    )
-
-
-def _compute_pose(
-    positions: Float64Array, floor: float, parameters: Mapping[str, float]
-) -> Float64Array:
-    """Return the pose (4, 4) that parameters of `settings.POSE` give to vertices.
-
-    It scales and rotates about the middle of their bounding box, puts the lowest at the
-    height `floor`, and then shifts by x, y and z. Without the shift the middle stays
-    above the same point of the ground.
-
-    Args:
-        positions: (V, 3) of the vertices.
-        floor: height of what they stand on.
-        parameters: parameters by name; angles in degrees.
-    """
-    center = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
-    linear = parameters["scale"] * make_rotation(
-        parameters["yaw"], parameters["pitch"], parameters["roll"]
-    )
-    lowest = float(((positions - center) @ linear.T)[:, 2].min())
-    # `- linear @ center` moves the middle to the origin
-    translation = (
-        np.array([parameters["x"], parameters["y"], floor + parameters["z"] - lowest])
-        - linear @ center
-    )
-    # back above the same point; the height follows from the floor instead
-    translation[:2] += center[:2]
-    return make_pose(linear, translation)
-
-
 def camera_to_world(
-    description: SceneDescription, aspect: float | None = None
+    description: SceneData, aspect: float | None = None
 ) -> Float64Array:
     """Return the pose (4, 4) of the camera in use.
 
@@ -390,7 +297,7 @@ def camera_to_world(
 
 
 def project_points(
-    description: SceneDescription,
+    description: SceneData,
     inputs: Mapping[str, Tensor],
     points: Tensor,
     size: tuple[int, int],
@@ -465,6 +372,35 @@ def compute_car_pose(camera: Tensor) -> Tensor:
         [forward[0], -forward[1], zero, forward[1], forward[0], zero, zero, zero, unit]
     ).reshape(3, 3)
     return make_affine(axes, torch.cat([camera[:2, 3], zero[None]]))
+
+
+def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
+    """Return one of a scene's parts as the settings and the camera have it.
+
+    A mesh has the pose and the material of its settings. A beam stands where its
+    carrier, a mesh or the camera's car, takes it. Other parts are as they are.
+    """
+    if not isinstance(part, BeamLamp):
+        return scene.meshes.get(part.name, part)
+    if part.carrier == CAMERA:
+        carrier = compute_car_pose(torch.from_numpy(camera_to_world(scene)))
+    else:
+        carrier = torch.from_numpy(scene.meshes[part.carrier].to_world)
+    return replace(
+        part,
+        to_world=compute_carried_pose(
+            carrier, torch.from_numpy(part.pose_on_carrier)
+        ).numpy(),
+    )
+
+
+def list_lamps(scene: SceneData) -> dict[str, Lamp]:
+    """Return every light of a scene beside its environment, by name."""
+    return {
+        part.name: get_positioned_part(scene, part)
+        for part in scene.parts
+        if isinstance(part, Lamp)
+    }
 
 
 @lru_cache(maxsize=4)
@@ -554,9 +490,7 @@ OCCLUDER_INPUTS = (
 """Inputs of other controls that an occluder goes by."""
 
 
-def get_camera_pose(
-    scene: SceneDescription, earlier_inputs: Mapping[str, Tensor]
-) -> Tensor:
+def get_camera_pose(scene: SceneData, earlier_inputs: Mapping[str, Tensor]) -> Tensor:
     """Return the pose (4, 4) of the camera where the controls before have it."""
     return earlier_inputs.get(
         "camera.to_world", torch.from_numpy(camera_to_world(scene))

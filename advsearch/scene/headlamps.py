@@ -25,7 +25,6 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,11 +41,9 @@ from advsearch.scene.assets import (
 )
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart, ScenePart
+from advsearch.scene.scene_data import AnyScene, SceneData
 from advsearch.scene.settings import LAMPS
 from advsearch.scene.things import ThingPart, find_triangle_heights
-
-if TYPE_CHECKING:
-    from advsearch.scene.description import SceneDescription
 
 # degrees above the horizon at which the low beam has half of what it has below
 CUT_OFF = -0.57
@@ -142,7 +139,7 @@ def make_candela_table(kind: str) -> Float32Array:
     return np.asarray(candela * fade.clip(0.0, 1.0), np.float32)
 
 
-def add_lamps(scene: SceneDescription) -> SceneDescription:
+def add_lamps(scene: AnyScene) -> AnyScene:
     """Return the scene with the lamps that are on, and no others.
 
     Those of its object, its things and the car of its camera; lamps that the scene has
@@ -185,7 +182,7 @@ def add_lamps(scene: SceneDescription) -> SceneDescription:
     return replace(scene, parts=(*other_parts, *lamps))
 
 
-def _check_units(scene: SceneDescription, carrier: str) -> float:
+def _check_units(scene: SceneData, carrier: str) -> float:
     """Return the luminance of a radiance of 1, cd/m2, in the scene's environment.
 
     `carrier` is what has lamps, for the message. Raises InputError: the environment has
@@ -209,13 +206,13 @@ def _check_units(scene: SceneDescription, carrier: str) -> float:
     return radiance_unit
 
 
-def get_lamp_kind(scene: SceneDescription, setting: str) -> str:
+def get_lamp_kind(scene: SceneData, setting: str) -> str:
     """Return the word that a setting of lamps has."""
     return LAMPS[int(scene.values.get(setting) or 0.0)]
 
 
 def _make_lamps(
-    scene: SceneDescription,
+    scene: SceneData,
     carrier: str,
     kind: str,
     radiance_unit: float,

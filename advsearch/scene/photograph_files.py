@@ -11,7 +11,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from advsearch.pictures import open_image
 from advsearch.scene.assets import Float64Array
 from advsearch.scene.backdrop import CROP, compute_view_settings, find_photograph_file
 from advsearch.scene.camera_files import VIEW_KEYS, read_camera_entries
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.rig import has_photographs
 from advsearch.scene.settings import resolve_settings
 from advsearch.trust.named_files import is_inside
@@ -29,9 +30,6 @@ from advsearch.trust.stored_files import (
     record_opened,
     track_opened_files,
 )
-
-if TYPE_CHECKING:
-    from advsearch.scene.description import SceneDescription
 
 CAMERA_SUFFIXES = (".yaml", ".yml", ".json")
 PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
@@ -82,21 +80,6 @@ class PhotographView:
         if self.object_to_camera is not None:
             groups |= {"camera", "pose", "ground"}
         return tuple(sorted(f"{group}." for group in groups))
-
-
-@dataclass(frozen=True, eq=False)
-class PhotographFolder:
-    """A folder of photographs, and the scene as it is rendered into each of them.
-
-    Attributes:
-        path: path of the folder, as it was stated.
-        camera: camera that the user stated for all of them; None if each has its own.
-        scenes: scenes by the name of the photograph's file, in alphabetical order.
-    """
-
-    path: str
-    camera: str | None
-    scenes: Mapping[str, SceneDescription]
 
 
 def is_photograph_folder(spec: object) -> bool:

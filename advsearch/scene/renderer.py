@@ -18,7 +18,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -48,6 +47,7 @@ from advsearch.scene.image_quality import blur_image
 from advsearch.scene.mitsuba_backend.denoise import denoise_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
+from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.window import Window
 
 MAX_SPP = 65536
@@ -789,7 +789,7 @@ class Renderer:
         return {name: frozenset(reached) for name, reached in routes.items()}
 
 
-@lru_cache(maxsize=4)
+@cache_per_scene
 def _base_pose_and_center(description: SceneDescription) -> tuple[Tensor, Tensor]:
     """Return the camera's pose (4, 4) and the object's center (3,) in a scene.
 

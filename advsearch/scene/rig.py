@@ -22,7 +22,7 @@ from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Float64Array, make_pose
 from advsearch.scene.camera_files import LENS_KEYS, MAX_JSON_SIZE, read_camera
 from advsearch.scene.camera_model import CameraModel
-from advsearch.scene.geometry import make_rotation
+from advsearch.scene.poses import make_rotation
 from advsearch.scene.skeleton import compute_rotation_entries
 from advsearch.trust.stored_files import (
     parse_json,

@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -40,10 +39,8 @@ from advsearch.scene.geometry import (
 from advsearch.scene.grounds import has_lanes
 from advsearch.scene.importing.files import make_safe_name
 from advsearch.scene.parts import Footprint, MeshPart, make_mesh_part
+from advsearch.scene.scene_data import AnyScene, SceneData
 from advsearch.scene.settings import LAMPS
-
-if TYPE_CHECKING:
-    from advsearch.scene.description import SceneDescription
 
 MAX_DISTANCE = 1000.0  # how far from the object a thing may stand, metres
 MAX_THINGS = 64  # things beside an object
@@ -184,10 +181,10 @@ def _parse_number(part: str, name: str, text: str, low: float, high: float) -> f
 
 
 def add_things(
-    scene: SceneDescription,
+    scene: AnyScene,
     things_spec: str | None,
     load: Callable[[str, str | None], ObjectAsset],
-) -> SceneDescription:
+) -> AnyScene:
     """Return the scene with the things beside its object that a setting names.
 
     Args:
@@ -222,7 +219,7 @@ def add_things(
 
 
 def _make_thing(
-    scene: SceneDescription,
+    scene: SceneData,
     thing: RequestedThing,
     load: Callable[[str, str | None], ObjectAsset],
 ) -> tuple[ThingPart, list[str]]:
@@ -262,7 +259,7 @@ def _make_thing(
     ), remarks
 
 
-def _list_overlap_remarks(scene: SceneDescription) -> list[str]:
+def _list_overlap_remarks(scene: SceneData) -> list[str]:
     """Return a remark on each pair that overlaps, of the object and the things.
 
     That is by their convex outlines from above, at heights that both have.
@@ -281,7 +278,7 @@ def _list_overlap_remarks(scene: SceneDescription) -> list[str]:
 
 
 def _compute_pose(
-    scene: SceneDescription,
+    scene: SceneData,
     asset: ObjectAsset,
     requested: RequestedThing,
     metres: float,
@@ -314,7 +311,7 @@ def _compute_pose(
     )
 
 
-def find_ground_height(scene: SceneDescription, position: Float64Array) -> float:
+def find_ground_height(scene: SceneData, position: Float64Array) -> float:
     """Return how high the ground lies at a position (2,), object sizes.
 
     That is the height of the road, the pavement, the table or the floor; or 0.
@@ -358,7 +355,7 @@ def find_triangle_heights(corners: Float64Array, position: Float64Array) -> list
     return heights
 
 
-def find_overlapping_solid(scene: SceneDescription, footprint: Footprint) -> str | None:
+def find_overlapping_solid(scene: SceneData, footprint: Footprint) -> str | None:
     """Return the solid of the scene that a footprint overlaps, such as "a house".
 
     None where it stands free.
@@ -370,7 +367,7 @@ def find_overlapping_solid(scene: SceneDescription, footprint: Footprint) -> str
     return None
 
 
-def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
+def add_solid_remarks(scene: AnyScene) -> AnyScene:
     """Return the scene with a remark on its object and each thing inside a solid.
 
     Solids are those of the place around it; without any the scene is returned as it is.
@@ -379,8 +376,9 @@ def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
         return scene
     footprints = {"the object": compute_footprint(scene.base_vertices)}
     footprints |= {
-        name: compute_footprint(compute_base_vertices(scene.meshes[name]))
-        for name in scene.things
+        part.name: compute_footprint(compute_base_vertices(scene.meshes[part.name]))
+        for part in scene.parts
+        if isinstance(part, ThingPart)
     }
     remarks = list[str]()
     for name, outline in footprints.items():
@@ -394,7 +392,7 @@ def add_solid_remarks(scene: SceneDescription) -> SceneDescription:
 
 
 def list_camera_remarks(
-    scene: SceneDescription, eyes: Sequence[Float64Array]
+    scene: SceneData, eyes: Sequence[Float64Array]
 ) -> tuple[str, ...]:
     """Return a remark where cameras are inside a solid of the place; empty if none is.
 

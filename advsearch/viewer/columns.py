@@ -73,9 +73,11 @@ class Boxes:
         x0, y0, x1, y1 = (
             min(max(round(BOX_STEPS * float(corner)), 0), NO_BOX - 1) for corner in box
         )
-        # names beyond the limit share its index
-        next_index = min(len(self.names), MAX_LEVELS)
-        name_index = self.names.setdefault(str(name), next_index)
+        name = str(name)
+        # a name beyond the limit is shown as the last one, "others"
+        if name not in self.names and len(self.names) >= MAX_LEVELS - 1:
+            name = "others"
+        name_index = self.names.setdefault(name, len(self.names))
         self.values.extend((x0, y0, x1, y1, name_index, score))
 
     def __deepcopy__(self, memo: object) -> Boxes:

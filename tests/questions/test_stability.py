@@ -12,7 +12,7 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.questions.stability import scenes as suite
-from advsearch.questions.stability.result import ALL_CASES, OK, Case, Outcome, StabilityResult, check_range
+from advsearch.questions.stability.result import ALL_CASES, OK, Case, CaseOutcome, StabilityResult, check_range
 from advsearch.questions.stability.scenes import select_cases
 from advsearch.runs.directory import find_run
 from advsearch.runs.summary import read_result
@@ -44,8 +44,8 @@ def test_a_case_holds(case: Case) -> None:
 # ---- rows -----------------------------------------------------------------------------------------------------------
 
 
-def made(outcome: Outcome | Exception, name: str = "made") -> Case:
-    def find() -> Outcome:
+def made(outcome: CaseOutcome | Exception, name: str = "made") -> Case:
+    def find() -> CaseOutcome:
         if isinstance(outcome, Exception):
             raise outcome
         return outcome
@@ -64,13 +64,13 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    good = made(Outcome([check_range("a", 1.0, most=2.0)], relative_error=0.02, ending="found"), "good")
-    bad = replace(made(Outcome([check_range("a", 3.0, most=2.0)]), "bad"), group="stiff")
+    good = made(CaseOutcome([check_range("a", 1.0, most=2.0)], relative_error=0.02, ending="found"), "good")
+    bad = replace(made(CaseOutcome([check_range("a", 3.0, most=2.0)]), "bad"), group="stiff")
     monkeypatch.setattr(suite, "ALL_CASES", (good, bad))
     yield
 
 
-def uncalled() -> Outcome:
+def uncalled() -> CaseOutcome:
     pytest.fail("tried again")
 
 

@@ -10,7 +10,7 @@ import torch
 
 from advsearch.engine.acceptance import compute_level_errors
 from advsearch.engine.gradients import make_smooth_loss
-from advsearch.questions.stability.result import Outcome, check_condition, check_range
+from advsearch.questions.stability.result import CaseOutcome, check_condition, check_range
 from advsearch.questions.stability.scene import (
     REFERENCE_SPP,
     ControlSettings,
@@ -29,7 +29,7 @@ TRACED = 256
 NIGHT = make_gray_environment(0.0)
 
 
-def right(outcome: Outcome) -> None:
+def right(outcome: CaseOutcome) -> None:
     """Everything is finite, and every check holds."""
     assert outcome.finite and [str(number) for number in outcome.checks if not number.ok] == []
 
@@ -50,7 +50,7 @@ def lit(
     levels: float = LEVELS,
     slope: float | None = 0.15,
     **scene: object,
-) -> Outcome:
+) -> CaseOutcome:
     """Compare a picture by light on surfaces with a traced one, and its derivative by the texture with differences.
 
     Args:
@@ -87,7 +87,7 @@ def lit(
     ]
     finite = bool(torch.isfinite(picture).all() and torch.isfinite(gradient).all()) and light.non_finite == 0
     measured = {"entries": float(light.n_entries), "derivative": wanted, "hidden numbers": float(hidden.sum())}
-    return Outcome(checks, finite, error, measured=measured)
+    return CaseOutcome(checks, finite, error, measured=measured)
 
 
 HALF = np.repeat(np.repeat(np.array([1.0, 0.0], np.float32), 16)[None, :, None], 3, axis=2).repeat(16, axis=0)

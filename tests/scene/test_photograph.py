@@ -13,8 +13,8 @@ from torch import Tensor
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import load_description
-from advsearch.scene.grounds import Photograph, compute_irradiance
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.photographed_ground import Photograph, compute_irradiance
 
 SIZE = 32
 AWAY = {"pose.x": 900.0, "pose.scale": 0.01}

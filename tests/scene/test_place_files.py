@@ -19,8 +19,9 @@ from advsearch.scene.assets import Material, Mesh, Shape
 from advsearch.scene.description import load_description
 from advsearch.scene.geometry import compute_base_vertices
 from advsearch.scene.glb import encode_glb
-from advsearch.scene.grounds import LUMINANCE, compute_irradiance, has_lanes, is_enclosed, is_paved
+from advsearch.scene.grounds import LUMINANCE, has_lanes, is_enclosed, is_paved
 from advsearch.scene.library import import_environment, load_environment
+from advsearch.scene.photographed_ground import compute_irradiance
 from advsearch.scene.places import place_meshes
 from advsearch.scene.places.place_file import load_bundled_place, read_place_file
 from glb_files import change_header

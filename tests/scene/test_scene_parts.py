@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -10,6 +12,7 @@ import torch
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import load_description
+from advsearch.scene.formation import compute_metered_gain
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.parts import BallLamp, PointLamp, PosedCamera
@@ -61,3 +64,13 @@ def test_a_scene_is_seen_by_any_of_its_cameras() -> None:
         scene.with_camera("sied")
     with pytest.raises(InputError, match="camera 'side'"):
         picture(Scene(scene.with_camera("side")), "camera")
+
+
+def test_what_is_cached_of_a_scene_goes_with_it() -> None:
+    scene = load_description("mug")
+    gain = compute_metered_gain(scene)
+    assert compute_metered_gain(scene) == gain
+    reference = weakref.ref(scene)
+    del scene
+    gc.collect()
+    assert reference() is None

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from advsearch.options import Value
 from advsearch.runs.store import Row
 from advsearch.runs.tables import make_sweep_frame
-from advsearch.viewer.columns import pack_columns, read_columns
+from advsearch.viewer.columns import Boxes, pack_columns, read_columns
 from advsearch.viewer.thumbnails import find_thumbnails, thumbnail_path
 from stored_sweeps import make_sweep
 
@@ -60,3 +61,11 @@ def test_what_is_packed_is_what_the_rows_are() -> None:
     assert (yaw["name"], yaw["unit"], yaw["levels"]) == ("yaw", "degrees", None)
     assert list(columns["parameter 0"]) == [0, 10, 20, 30, 40]
     assert [environment["levels"][k] for k in columns["parameter 1"]] == ["a", "b", "a", "b", "a"]
+
+
+def test_names_of_boxes_beyond_the_limit_are_shown_as_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advsearch.viewer.columns.MAX_LEVELS", 3)
+    boxes = Boxes()
+    boxes.add({"found": [{"box": (0, 0, 1, 1), "label": name, "score": 1.0} for name in "abcda"]})
+    assert list(boxes.names) == ["a", "b", "others"]
+    assert list(boxes.values[4::6]) == [0, 1, 2, 2, 0]

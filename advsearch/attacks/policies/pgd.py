@@ -134,7 +134,7 @@ class Peak(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Window:
+class StepWindow:
     """The evaluations between two checkpoints, at which the step size may be halved.
 
     Attributes:
@@ -154,7 +154,7 @@ class Window:
     reference_best: float = -math.inf
     was_halved: bool = True
 
-    def add(self, value: float) -> Window:
+    def add(self, value: float) -> StepWindow:
         last = self.values[-1] if self.values else self.previous
         n_improved = self.n_improved + 1 if value > last else self.n_improved
         return replace(self, values=(*self.values, value), n_improved=n_improved)
@@ -184,7 +184,7 @@ class Window:
         std = math.sqrt(squared_deviations / max(1, len(self.values) - 1))
         return best > mean + 2.0 * std
 
-    def next(self, steps: int, best: float, halved: bool) -> Window:
+    def next(self, steps: int, best: float, halved: bool) -> StepWindow:
         """Return the window after this one, which is a little shorter.
 
         Args:
@@ -198,7 +198,7 @@ class Window:
             round(MIN_WINDOW_FRACTION * steps),
             self.length - max(1, round(WINDOW_DECREASE * steps)),
         )
-        return Window(
+        return StepWindow(
             length,
             previous=self.values[-1],
             reference_best=best,
@@ -247,7 +247,7 @@ class Ascent:
     n_flat: int = 0
     lengths: tuple[float, ...] = ()
     counts: Counts = NO_COUNTS
-    window: Window = field(default_factory=lambda: Window(MIN_WINDOW))
+    window: StepWindow = field(default_factory=lambda: StepWindow(MIN_WINDOW))
     start_objective: float = math.nan
     n_idle_windows: int = 0
 
@@ -358,7 +358,7 @@ class PGD(AscentPolicy):
     is a coin toss wherever the noise exceeds it.
 
     The step size is halved at checkpoints when the objective stalls, by the two
-    conditions of Auto-PGD (Croce and Hein 2020, section 3.1; see `Window.stalled`).
+    conditions of Auto-PGD (Croce and Hein 2020, section 3.1; see `StepWindow.stalled`).
     There we depart from Auto-PGD: it always goes on from the best configuration after
     halving; a noisy best is often only a lucky one, so we go back only if the last
     window lags behind it by two of the window's standard deviations.
@@ -419,7 +419,7 @@ class PGD(AscentPolicy):
             u,
             direction=torch.zeros_like(u),
             step_size=self.step_size,
-            window=Window(window_length),
+            window=StepWindow(window_length),
         )
 
     def pace(self, state: Ascent) -> float:
@@ -465,7 +465,7 @@ class PGD(AscentPolicy):
             return self._move_uphill(self._end_exact_window(state, window), u)
         return self._end_noisy_window(state, window, u)
 
-    def _end_exact_window(self, state: Ascent, window: Window) -> Ascent:
+    def _end_exact_window(self, state: Ascent, window: StepWindow) -> Ascent:
         """Halve the step size if the best objective of a window, without noise, is not
         clearly above that of the window before; start the next one, as long.
 
@@ -486,10 +486,10 @@ class PGD(AscentPolicy):
             state,
             step_size=step_size,
             n_idle_windows=n_idle_windows,
-            window=Window(window.length, reference_best=best),
+            window=StepWindow(window.length, reference_best=best),
         )
 
-    def _end_noisy_window(self, state: Ascent, window: Window, u: Tensor) -> Ascent:
+    def _end_noisy_window(self, state: Ascent, window: StepWindow, u: Tensor) -> Ascent:
         """Halve the step size if the objective stalled in a window, and take a step
         from u, the latest configuration.
 

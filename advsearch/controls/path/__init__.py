@@ -15,7 +15,6 @@ import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -785,7 +784,7 @@ class PathControl(Control):
         return _level_direction(-camera[:3, 0]) * from_middle[..., None], no_turn
 
 
-@lru_cache(maxsize=4)
+@geometry.cache_per_scene
 def get_start_poses(scene: SceneDescription, device: torch.device) -> Start:
     """Return the poses of a scene; cached, as it looks at every vertex."""
     poses = (

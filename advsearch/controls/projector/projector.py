@@ -18,7 +18,7 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -485,7 +485,7 @@ def blur_light(light: Tensor, blur: Tensor) -> Tensor:
     return images.to_image(blurred)
 
 
-@lru_cache(maxsize=64)
+@geometry.cache_per_scene
 def make_projector_pose(
     scene: SceneDescription, azimuth: float, elevation: float, distance: float
 ) -> Tensor:

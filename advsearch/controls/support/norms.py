@@ -11,14 +11,12 @@ root-mean-square change at its edge.
 NORMS = ("linf", "l2")
 
 
-def compute_radius(
-    norm: str, epsilon: float | None, count: int, default: float = DEFAULT_EPSILON
+def compute_default_radius(
+    norm: str, count: int, radius: float = DEFAULT_EPSILON
 ) -> float:
-    """Return the radius of a ball over `count` colors.
+    """Return the radius of a ball over `count` colors where none is stated.
 
-    The default L2 ball is so large that its edge has the same root mean square as that
-    of the default L-infinity ball.
+    `radius` is that of the L-infinity ball; the L2 ball is so large that its edge has
+    the same root mean square.
     """
-    if epsilon is not None:
-        return float(epsilon)
-    return default * (math.sqrt(count) if norm == "l2" else 1.0)
+    return radius * (math.sqrt(count) if norm == "l2" else 1.0)

@@ -21,7 +21,7 @@ from advsearch.controls.base import (
     describe_color_change,
 )
 from advsearch.controls.ranges import Fixed, Range, Spec
-from advsearch.controls.support.norms import DEFAULT_EPSILON, compute_radius
+from advsearch.controls.support.norms import DEFAULT_EPSILON, compute_default_radius
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing.pictures import read_image
 from advsearch.scene.settings import Parameter
@@ -86,9 +86,9 @@ class PictureControl(Control):
         spec = self.get_spec(parameter)
         assert isinstance(spec, Range)
         n_colors = 3 * math.prod(self.sides)
-        radius = compute_radius(
-            norm, self.chosen["epsilon"], n_colors, self.default_epsilon
-        )
+        radius = self.chosen["epsilon"]
+        if radius is None:
+            radius = compute_default_radius(norm, n_colors, self.default_epsilon)
         return Budget(norm, radius / (spec.high - spec.low))
 
     def values(self, u: Tensor) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ from advsearch.engine.gradients.bench import (
 )
 from advsearch.engine.gradients.derivatives import (
     FACTORS,
-    Estimate,
+    GradientEstimate,
     Probe,
     Reference,
     compare_with_reference,
@@ -45,7 +45,7 @@ __all__ = [
     "FACTORS",
     "OMISSIONS",
     "Bench",
-    "Estimate",
+    "GradientEstimate",
     "GradientPlan",
     "Group",
     "Loss",

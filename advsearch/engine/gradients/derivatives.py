@@ -69,7 +69,7 @@ class Reference(NamedTuple):
     factor: float = 1.0
 
 
-class Estimate(NamedTuple):
+class GradientEstimate(NamedTuple):
     """What one estimator says along a probe: the mean over seeds, the standard
     deviation (`noise`) and median seconds of one estimate. Differences are `factor`
     times as wide as planned.
@@ -115,7 +115,7 @@ def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
 
 
 def compare_with_reference(
-    estimate: Estimate,
+    estimate: GradientEstimate,
     reference: Reference,
     others: Sequence[Reference] = (),
     probe: Probe | None = None,
@@ -351,7 +351,7 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
 
 def measure_estimates(
     bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
-) -> list[Estimate]:
+) -> list[GradientEstimate]:
     """Measure one estimator of one control's groups along some probes of them.
 
     Args:
@@ -370,7 +370,7 @@ def measure_estimates(
         slopes = [float(gradient @ probe.direction) for gradient in gradients]
         mean = statistics.fmean(slopes)
         estimates.append(
-            Estimate(
+            GradientEstimate(
                 estimator, mean, statistics.stdev(slopes), repeats, seconds, factor
             )
         )
@@ -477,7 +477,11 @@ def _try_estimators(
         for probe, estimate in zip(wanted, stored, strict=True):
             others = list(references.values())
             row = compare_with_reference(
-                Estimate(**estimate), references[probe.name], others, probe, bench.spp
+                GradientEstimate(**estimate),
+                references[probe.name],
+                others,
+                probe,
+                bench.spp,
             )
             if row.status == "ok":
                 good.add(probe.name)

@@ -647,7 +647,7 @@ class GradientBench:
         differences = gradients.measure_reference(bench, probe, repeats=(2, 4))
         slope = float(self.reference.value @ self.part.select(probe.direction))
         noise = self.reference.error * abs(slope)
-        estimate = gradients.Estimate(
+        estimate = gradients.GradientEstimate(
             self._reference_estimator, slope, noise, repeats=1, seconds=0.0
         )
         if gradients.compare_with_reference(estimate, differences).status != "biased":

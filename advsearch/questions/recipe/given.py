@@ -666,8 +666,7 @@ def _draw_panels(
             ax=list(all_axes),
             shrink=0.7 / len(all_axes),
             location="bottom",
-            # TODO: label it by what all panels show, not by the last prediction
-            label=prediction,
+            label="lead of the right label" if by_margin else "share of predictions",
         )
 
 

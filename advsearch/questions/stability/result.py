@@ -207,7 +207,7 @@ def make_view(result: StabilityResult) -> ShownResult:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CaseOutcome:
     """What a case measured.
 
     Attributes:
@@ -227,7 +227,7 @@ class Outcome:
     ending: str = ""
     measured: Mapping[str, float] = field(default_factory=dict)
 
-    def with_checks(self, *more: Check, **known: Any) -> Outcome:
+    def with_checks(self, *more: Check, **known: Any) -> CaseOutcome:
         """Return the outcome with more checks, and changed fields."""
         return replace(self, checks=[*self.checks, *more], **known)
 
@@ -250,7 +250,7 @@ class Case:
     group: str
     holds: str
     slow: bool
-    measure: Callable[[], Outcome]
+    measure: Callable[[], CaseOutcome]
 
     def run(self) -> CaseRow:
         """Run the case. An exception means that it falls short, and is the reason.
@@ -263,12 +263,12 @@ class Case:
             outcome = self.measure()
         except InputError as error:
             failure = check_range(f"refused: {error}", 1.0, 0.0, 0.0)
-            outcome = Outcome([failure], ending="refused")
+            outcome = CaseOutcome([failure], ending="refused")
         except Exception as error:
             failure = check_range(
                 f"raised {type(error).__name__}: {error}", 1.0, 0.0, 0.0
             )
-            outcome = Outcome([failure], finite=False, ending="raised")
+            outcome = CaseOutcome([failure], finite=False, ending="raised")
         failed = [check for check in outcome.checks if not check.ok]
         status = OK
         if failed:
@@ -294,13 +294,13 @@ ALL_CASES: list[Case] = []
 
 def register_case(
     group: str, name: str, *, slow: bool = False
-) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
+) -> Callable[[Callable[[], CaseOutcome]], Callable[[], CaseOutcome]]:
     """Register a function as a case.
 
     The first sentence of its docstring, which users see, states what must hold.
     """
 
-    def register(measure: Callable[[], Outcome]) -> Callable[[], Outcome]:
+    def register(measure: Callable[[], CaseOutcome]) -> Callable[[], CaseOutcome]:
         """Append the case of a function, and return the function itself."""
         first_paragraph, _, _ = (measure.__doc__ or "").partition("\n\n")
         requirement = " ".join(first_paragraph.split())
@@ -314,7 +314,7 @@ def register_case(
 
 def register_cases(
     group: str,
-    measure: Callable[..., Outcome],
+    measure: Callable[..., CaseOutcome],
     rows: Iterable[tuple[str, str, dict[str, Any]]],
 ) -> None:
     """Register a case for each row of a table.

@@ -26,8 +26,8 @@ from advsearch.extend import (
     workbench,
 )
 from advsearch.questions.stability.result import (
+    CaseOutcome,
     Check,
-    Outcome,
     check_condition,
     check_range,
 )
@@ -176,7 +176,7 @@ def check_scene(
     other_scene: Mapping[str, object] | None = None,
     apart: Bounds = (None, MAX_PICTURE_DIFFERENCE),
     **scene: object,
-) -> Outcome:
+) -> CaseOutcome:
     """Render a scene, differentiate it, and search from there.
 
     The gradient is compared with differences, which takes most of the time. Always
@@ -247,7 +247,7 @@ def check_scene(
         )
     is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
     is_finite = is_finite and renderer.non_finite == 0
-    return Outcome(
+    return CaseOutcome(
         checks,
         finite=is_finite,
         relative_error=relative_error,

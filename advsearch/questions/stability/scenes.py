@@ -28,8 +28,8 @@ from advsearch.extend import (
 from advsearch.questions.stability.result import (
     ALL_CASES,
     Case,
+    CaseOutcome,
     CaseRow,
-    Outcome,
     StabilityConfig,
     StabilityResult,
     check_condition,
@@ -154,7 +154,7 @@ register_cases(
 )
 
 
-def refuse_texel(value: float, as_file: bool) -> Outcome:
+def refuse_texel(value: float, as_file: bool) -> CaseOutcome:
     """Require that a texel that is no light, in a file or an array, is rejected."""
     radiance = make_gray_environment(0.3).radiance.copy()
     radiance[4, 10] = value
@@ -172,11 +172,13 @@ def refuse_texel(value: float, as_file: bool) -> Outcome:
             render_image(renderer, renderer.start, 0, 1)
     except InputError as error:
         is_clear = "texels" in str(error) and "\n" not in str(error)
-        return Outcome(
+        return CaseOutcome(
             [check_condition("refused in a sentence that counts the texels", is_clear)],
             ending="refused",
         )
-    return Outcome([check_condition("refused", False)], ending="rendered all the same")
+    return CaseOutcome(
+        [check_condition("refused", False)], ending="rendered all the same"
+    )
 
 
 REFUSED = "The map is refused before anything is rendered."
@@ -187,7 +189,7 @@ for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan
         register_cases("radiometric", refuse_texel, table)
 
 
-def leave_plateau(low: float, high: float) -> Outcome:
+def leave_plateau(low: float, high: float) -> CaseOutcome:
     """Search from a white picture without any gradient.
 
     The way out is a lower exposure.
@@ -222,7 +224,9 @@ def leave_plateau(low: float, high: float) -> Outcome:
         "gradient at the start", float(slope.abs().max()), 0.0, 0.0
     )
     counts = {"evaluations without a gradient": float(n_flat)}
-    return Outcome([start_check, *checks], ending=", ".join(endings), measured=counts)
+    return CaseOutcome(
+        [start_check, *checks], ending=", ".join(endings), measured=counts
+    )
 
 
 LEAVES_PLATEAU = (
@@ -304,7 +308,7 @@ register_cases(
 
 
 @register_case("materials", "clear-glass", slow=True)
-def look_through_glass() -> Outcome:
+def look_through_glass() -> CaseOutcome:
     """A texel behind clear glass has the right gradient, and nothing is NaN."""
     controls: ControlSettings = {
         "texture": {"resolution": 8},
@@ -316,7 +320,7 @@ def look_through_glass() -> Outcome:
 
 
 @register_case("materials", "texels-0-and-1")
-def texels_at_the_ends() -> Outcome:
+def texels_at_the_ends() -> CaseOutcome:
     """Texels at the ends of the range have a gradient, and the search moves them
     inwards only.
     """
@@ -439,7 +443,7 @@ register_cases(
 
 
 @register_case("light", "projector-through-glass")
-def project_through_glass() -> Outcome:
+def project_through_glass() -> CaseOutcome:
     """Light that meets glass on its way leaves picture and gradient finite."""
     arguments = projector_case(azimuth=describe_mug().get_number("camera.azimuth"))
     return check_scene(**arguments, plugins=make_glass_ball())  # type: ignore[arg-type]
@@ -648,7 +652,7 @@ register_cases(
 
 
 @register_case("geometry", "million-triangles", slow=True)
-def million() -> Outcome:
+def million() -> CaseOutcome:
     """Finite, right, and like the coarse mesh of the same shape."""
     fine_mesh, coarse_mesh = (
         assets.normalise_mesh(workbench.make_sphere(*counts))
@@ -684,7 +688,7 @@ def million() -> Outcome:
 
 
 @register_case("geometry", "gimbal-angles", slow=True)
-def gimbal() -> Outcome:
+def gimbal() -> CaseOutcome:
     """At a pitch of 90 degrees the gradients by angles and by the rotation vector are
     right.
     """
@@ -721,7 +725,7 @@ def gimbal() -> Outcome:
     )
 
 
-def full_turn(controls: ControlSettings) -> Outcome:
+def full_turn(controls: ControlSettings) -> CaseOutcome:
     """Check that 0 and 360 degrees are the same, in picture, gradient and steps."""
     renderer = make_renderer(controls)
     zero = torch.zeros_like(renderer.start)
@@ -880,7 +884,7 @@ def condition_number(hessian: Tensor) -> float:
 
 
 @register_case("stiff", "badly-scaled-range")
-def wide_range() -> Outcome:
+def wide_range() -> CaseOutcome:
     """The derivative does not depend on how wide the searched range is."""
     wide = {"pose": {"x": [-1e4, 1e4]}}
     narrow = {"pose": {"x": [-0.3, 0.3]}}
@@ -904,7 +908,7 @@ def wide_range() -> Outcome:
 
 
 @register_case("stiff", "light-rotation-texel", slow=True)
-def light_rotation_texel() -> Outcome:
+def light_rotation_texel() -> CaseOutcome:
     """All three move, the condition number is printed, and the objective's unit does
     not matter.
     """
@@ -1007,7 +1011,7 @@ register_cases(
 
 
 @register_case("noise", "heavy-tails-of-a-moving-mesh", slow=True)
-def heavy_render(count: int = 24) -> Outcome:
+def heavy_render(count: int = 24) -> CaseOutcome:
     """The plan takes differences of the loss for what moves a mesh, which have no heavy
     tail.
 

@@ -28,6 +28,7 @@ from advsearch.scene.formation import (
     Surfaces,
     round_sample_count,
 )
+from advsearch.scene.geometry import get_positioned_part
 from advsearch.scene.grounds import is_enclosed
 from advsearch.scene.mitsuba_backend import parts
 from advsearch.scene.mitsuba_backend.meshes import (
@@ -204,7 +205,7 @@ class MitsubaScene:
             lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
             translations = [parts.translate_mesh(description.meshes[OBJECT], lobes)]
             translations += [
-                parts.translate_part(description.get_positioned_part(part))
+                parts.translate_part(get_positioned_part(description, part))
                 for part in description.parts
             ]
             for translation in translations:

@@ -24,6 +24,7 @@ from advsearch.scene import parts
 from advsearch.scene.assets import Float32Array
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
+from advsearch.scene.geometry import get_positioned_part
 from advsearch.scene.mitsuba_backend.meshes import (
     fill_base_color,
     make_base_texture,
@@ -146,10 +147,10 @@ def _put_part(
         _put_haze(xml_scene, part, remaining_inputs)
     elif isinstance(part, parts.MeshPart):
         xml_scene[part.name] = _make_mesh(
-            description.get_positioned_part(part), remaining_inputs
+            get_positioned_part(description, part), remaining_inputs
         )
     else:
-        xml_scene |= translate_part(description.get_positioned_part(part)).plugins
+        xml_scene |= translate_part(get_positioned_part(description, part)).plugins
     if not isinstance(xml_scene.get(part.name, {}), Mapping):
         raise InputError(
             f"out: stock Mitsuba has nothing for {part.name}; export a run without it"

@@ -11,13 +11,14 @@ import torch
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.grounds import LUMINANCE, compute_irradiance
+from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.importing.files import make_safe_name
 from advsearch.scene.library import (
     import_environment,
     list_environments,
     load_environment,
 )
+from advsearch.scene.photographed_ground import compute_irradiance
 from advsearch.scene.places.place_file import (
     read_place,
     read_place_file,

@@ -29,7 +29,6 @@ from advsearch.scene.assembly import IMAGE_INPUTS
 from advsearch.scene.assets import BoolArray, Float32Array
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
-from advsearch.scene.grounds import compute_irradiance as unshadowed
 from advsearch.scene.mitsuba_backend.surface import (
     RAYS_PER_PIXEL,
     LightMaps,
@@ -46,6 +45,7 @@ from advsearch.scene.mitsuba_backend.texel_rays import (
     trace_texel_rays,
     world_to_map,
 )
+from advsearch.scene.photographed_ground import compute_irradiance as unshadowed
 from advsearch.scene.predictor import LinearMap
 from advsearch.scene.raster import Charts, rasterize_charts
 from advsearch.scene.renderer import Renderer

@@ -1,7 +1,7 @@
 """A tiny policy that turns towards the bundled mug, by behaviour cloning in rendered
 pictures; for task `command`.
 
-    python benchmarks/turn_towards.py turn.pt2 [--pictures 400] [--rounds 60] [--seed 0]
+    python tools/turn_towards.py turn.pt2 [--pictures 400] [--rounds 60] [--seed 0]
 
 It gets a picture (N, 3, 32, 32) and a state, `speed` (N, 1) in m/s, and returns a yaw
 rate (N, 1) in rad/s, over 0 to the left. The teacher is pure pursuit (Coulter 1992,

@@ -1,0 +1,144 @@
+"""A photograph, or a part of one, that a scene is rendered into."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from advsearch.scene.assets import Float32Array
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.image_quality import make_noise, measure_noise
+from advsearch.scene.importing.pictures import average_area
+
+# points at which depth is looked up in a pixel, along each side
+MIN_DEPTH_POINTS = 2
+MAX_DEPTH_POINTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class BackdropPhotograph:
+    """A photograph, or a part of one, that a scene is rendered into."""
+
+    spec: str  # how it was asked for: a path, and perhaps the part
+    levels: npt.NDArray[np.uint8]  # (H, W, 3) sRGB of the full photograph
+    digest: str  # SHA-256 of the levels, in hexadecimal
+    crop: tuple[int, int, int, int]  # left, top, width and height in pixels
+    # (H, W) levels: 255 where the photograph shows what is before the object; None if
+    # nothing is
+    front: npt.NDArray[np.uint8] | None = None
+    # (H, W) metres along the camera's axis, infinite where unknown; None if no depth is
+    depth: Float32Array | None = None
+    front_spec: str = ""  # how one of them was asked for
+
+    @property
+    def full_size(self) -> tuple[int, int]:
+        """Height and width of the full photograph, pixels."""
+        return self.levels.shape[0], self.levels.shape[1]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the part that is used, pixels."""
+        return self.crop[3], self.crop[2]
+
+    @property
+    def is_cropped(self) -> bool:
+        """Whether only a part of the photograph is used."""
+        return self.size != self.full_size
+
+    def resample(self, resolution: tuple[int, int]) -> Tensor:
+        """Return the part in display-linear values at (height, width) pixels.
+
+        Each pixel is the mean over the area that it covers, in linear light. Where the
+        photograph has fewer pixels than that, it is interpolated.
+
+        Returns:
+            (H, W, 3) float32 in [0, 1].
+        """
+        return self._resample_part(decode_all_levels()[self.levels], resolution)
+
+    def resample_front(self, resolution: tuple[int, int]) -> Tensor | None:
+        """Return what is before the object, (H, W, 1) float32 in [0, 1], or None."""
+        if self.front is None:
+            return None
+        fractions = self.front[..., None].astype(np.float32) / np.float32(255.0)
+        return self._resample_part(fractions, resolution)
+
+    def resample_depth(self, resolution: tuple[int, int]) -> Tensor | None:
+        """Return the depth (H S, W S) float32 in metres at S x S points of each pixel.
+
+        They are so many that the edges in the depth are followed, at most
+        `MAX_DEPTH_POINTS` along each side. None if there is no depth.
+        """
+        if self.depth is None:
+            return None
+        left, top, width, height = self.crop
+        part = self.depth[top : top + height, left : left + width]
+        needed = math.ceil(max(height / resolution[0], width / resolution[1]))
+        n_points = min(max(needed, MIN_DEPTH_POINTS), MAX_DEPTH_POINTS)
+        picks = [
+            ((np.arange(n_points * n_pixels) + 0.5) * side / (n_points * n_pixels))
+            for n_pixels, side in zip(resolution, part.shape, strict=True)
+        ]
+        rows, columns = (pick.astype(np.intp) for pick in picks)
+        return torch.from_numpy(part[np.ix_(rows, columns)])
+
+    def make_noise(self, resolution: tuple[int, int], sigma: float | None) -> Tensor:
+        """Return noise (H, W, 3) float32, display-referred, as the photograph has.
+
+        It is made in the pixels of the photograph and resampled as that is, so that it
+        is as coarse. The same photograph gives the same noise.
+
+        Args:
+            resolution: height and width in pixels.
+            sigma: standard deviation in levels at that resolution; None: that of the
+                photograph.
+        """
+        part = self.levels[
+            self.crop[1] : self.crop[1] + self.crop[3],
+            self.crop[0] : self.crop[0] + self.crop[2],
+        ]
+        seed = int(self.digest[:8], 16)
+        if sigma is not None:
+            return make_noise(np.full(3, sigma / 255.0), resolution, seed)
+        noise = make_noise(measure_noise(part) / 255.0, self.size, seed)
+        return _resample_image(noise.numpy(), resolution)
+
+    def _resample_part(
+        self, image: Float32Array, resolution: tuple[int, int]
+    ) -> Tensor:
+        """Return the used part of an image (H, W, C) at (height, width) pixels."""
+        left, top, width, height = self.crop
+        part = image[top : top + height, left : left + width]
+        return _resample_image(part, resolution)
+
+
+def _resample_image(image: Float32Array, resolution: tuple[int, int]) -> Tensor:
+    """Resample an image (H, W, C) to (height, width) pixels.
+
+    Along an axis with more pixels it is averaged down, along one with fewer it is then
+    interpolated.
+    """
+    height, width = image.shape[:2]
+    averaged = average_area(
+        image, min(height, resolution[0]), min(width, resolution[1])
+    )
+    resampled = torch.from_numpy(averaged)
+    if tuple(averaged.shape[:2]) == resolution:
+        return resampled
+    enlarged = torch.nn.functional.interpolate(
+        resampled.permute(2, 0, 1)[None],
+        size=resolution,
+        mode="bilinear",
+        align_corners=False,
+    )
+    return enlarged[0].permute(1, 2, 0).contiguous()
+
+
+def decode_all_levels() -> Float32Array:
+    """Return the display-linear values (256,) of all levels of 8-bit sRGB."""
+    return srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255.0))

@@ -1,0 +1,168 @@
+"""The ground that shows the photograph of an environment's map."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from advsearch.scene.assets import EnvironmentAsset, Float32Array, Mesh
+
+N_SECTORS = 128
+N_RINGS = 64
+MIN_RING_RADIUS = 0.01
+MAX_RING_RADIUS = 1000.0
+"""Radii of the innermost and the outermost ring of vertices, in heights of the camera.
+Beyond, the map itself is seen, less than 0.06 degrees below the horizon.
+"""
+
+
+class Photograph:
+    """The ground that shows the photograph of an equirectangular map.
+
+    It catches what the scene does to the light of the map.
+
+    A photographed environment shows the floor that its camera stood on. That part of
+    the map is projected from the height of the camera onto the plane z = 0, and the
+    plane gets the reflectance that shows the photograph where nothing is in the way of
+    the light:
+
+        reflectance(p) = pi map(from (0, 0, height) to p) / E
+        E = irradiance of the map's upper half on the plane
+
+    A diffuse surface in the irradiance E' looks like `reflectance E' / pi = map E' /
+    E`: the photograph times what the scene leaves of the light, and adds to it. That is
+    the quotient form of differential rendering (Debevec, Rendering synthetic objects
+    into real scenes, SIGGRAPH 1998, section 5) in one render instead of two, and an
+    ordinary scene: every derivative, guide and mask is that of a plane with a texture.
+
+    Where the photograph shows what is brighter than a white floor in this light, a
+    lamp, a window low down or its reflection, the reflectance is above 1. Such texels
+    still look as photographed.
+
+    Args:
+        radiance: (H, W, 3) linear radiance of the map, row 0 straight up.
+        height: height of the camera above the ground, object sizes.
+        rotation: rotation of the map about the vertical, degrees.
+
+    Attributes:
+        mesh: the plane.
+        base_color: its texture, see `compute_reflectance`.
+    """
+
+    def __init__(self, radiance: Float32Array, height: float, rotation: float) -> None:
+        """Make the plane and its texture; arguments are those of the class."""
+        self._map_rows = radiance.shape[0]
+        # the last row at or above the horizon, where the plane's texture begins
+        self._horizon_row = (self._map_rows - 1) // 2
+        self.mesh = self._make_mesh(height, rotation)
+        self.base_color = self.compute_reflectance(
+            torch.from_numpy(np.asarray(radiance, dtype=np.float32))
+        )
+
+    def _make_mesh(self, height: float, rotation: float) -> Mesh:
+        """Make rings of faces around the point below the camera.
+
+        Radii are in heights of the camera: a ring at radius r is seen atan(r) away from
+        straight down, and that angle is its row in the map. The plane's texture is the
+        lower half of the map, `compute_reflectance`; texture coordinates are a point's
+        column and row in it.
+
+        Args:
+            height: height of the camera, object sizes.
+            rotation: rotation of the map about the vertical, degrees.
+        """
+        radii = np.concatenate(
+            [[0.0], np.geomspace(MIN_RING_RADIUS, MAX_RING_RADIUS, N_RINGS)]
+        )
+        map_columns = np.linspace(0.0, 1.0, N_SECTORS + 1)
+        radius, map_column = np.meshgrid(radii, map_columns, indexing="ij")
+        azimuth = 0.5 * math.pi - 2.0 * math.pi * map_column + math.radians(rotation)
+        vertices = height * np.stack(
+            [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
+            axis=-1,
+        )
+        # from straight up
+        polar = math.pi - np.arctan(radius)
+        n_rows = self._map_rows - self._horizon_row
+        # counted from the horizon; the map's first and last row are the poles
+        lower_row = polar / math.pi * (self._map_rows - 1) - self._horizon_row
+        uvs = np.stack([map_column, 1.0 - (lower_row + 0.5) / n_rows], axis=-1)
+        normals = np.tile(
+            np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
+        )
+        return Mesh(
+            vertices.reshape(-1, 3).astype(np.float32),
+            _make_ring_faces(),
+            normals,
+            uvs.reshape(-1, 2).astype(np.float32),
+        )
+
+    def compute_reflectance(self, radiance: Tensor) -> Tensor:
+        """Return the plane's texture (h, W, 3) for a map (H, W, 3) of any size.
+
+        Row 0 is the horizon, the last one is straight down, and columns are those of
+        the map. The height h is that of the lower half of the map that the plane was
+        made of: a map of another size is interpolated to these rows. A reflectance is
+        pi times radiance over irradiance, and 0 where no light comes from above.
+        Differentiable.
+        """
+        rows = radiance.shape[0]
+        map_row = torch.arange(
+            self._horizon_row, self._map_rows, device=radiance.device
+        ) * ((rows - 1) / (self._map_rows - 1))
+        upper = map_row.floor().long().clamp_max(rows - 2)
+        fraction = (map_row - upper)[:, None, None].to(radiance.dtype)
+        lower_half = radiance[upper] + fraction * (
+            radiance[upper + 1] - radiance[upper]
+        )
+        irradiance = compute_irradiance(radiance)
+        return torch.where(
+            irradiance > 0.0, lower_half * math.pi / irradiance.clamp_min(1e-30), 0.0
+        )
+
+
+def _make_ring_faces() -> npt.NDArray[np.uint32]:
+    """Return the faces (F, 3) of the rings around the point below the camera.
+
+    Between two rings each sector is two triangles. Vertices lie ring by ring, each of
+    `N_SECTORS` + 1, the last at the position of the first. The first ring has a radius
+    of 0, so that its sectors are one triangle each: the other would have no area.
+    """
+    ring_starts = np.arange(N_RINGS)[:, None] * (N_SECTORS + 1)
+    inner = (ring_starts + np.arange(N_SECTORS)).ravel()
+    outer = inner + N_SECTORS + 1
+    outer_triangles = np.stack([outer, inner, outer + 1], axis=1)
+    # without those of the first ring
+    inner_triangles = np.stack([inner, inner + 1, outer + 1], axis=1)[N_SECTORS:]
+    return np.concatenate([outer_triangles, inner_triangles]).astype(np.uint32)
+
+
+@lru_cache(maxsize=4)
+def get_photograph(
+    environment: EnvironmentAsset, height: float, rotation: float
+) -> Photograph:
+    return Photograph(environment.radiance, height, rotation)
+
+
+def compute_irradiance(radiance: Tensor) -> Tensor:
+    """Return the irradiance (3,) of a map (H, W, 3) on unshadowed level ground.
+
+    It is the integral of radiance times the cosine of the angle from straight up, over
+    the upper half. Row 0 is straight up, the last one straight down. Differentiable.
+    """
+    rows, columns = radiance.shape[:2]
+    # Angles from straight up at which rows begin and end. The first and the last row
+    # are half as high as the others, since their middle is a pole.
+    row_bounds = (
+        torch.arange(rows + 1, device=radiance.device, dtype=torch.float64) - 0.5
+    ) * (math.pi / (rows - 1))
+    # Integral of cos sin (sin is the length of a row) over the angle from straight up;
+    # clamped, as nothing comes from below the horizon.
+    antiderivative = row_bounds.clamp(0.0, math.pi / 2.0).sin().square() / 2.0
+    weights = (antiderivative.diff() * (2.0 * math.pi / columns)).to(radiance.dtype)
+    return (radiance.sum(dim=1) * weights[:, None]).sum(dim=0)

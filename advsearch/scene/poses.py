@@ -1,0 +1,94 @@
+"""How settings pose meshes: matrices (4, 4) in numpy, column vectors, z up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from advsearch.scene.assets import Float64Array, make_pose
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.settings import POSE
+
+
+def make_rotation(yaw: float, pitch: float, roll: float) -> Float64Array:
+    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix.
+
+    That is first a turn about x by the roll, then about y, then about z.
+    """
+    # cosine and sine of each
+    (cz, sz), (cy, sy), (cx, sx) = (
+        (math.cos(math.radians(a)), math.sin(math.radians(a)))
+        for a in (yaw, pitch, roll)
+    )
+    rz = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
+    ry = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
+    rx = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
+    return np.asarray(rz @ ry @ rx)
+
+
+def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
+    """Return a mesh around the object as the settings have it.
+
+    It is posed about its own middle, where it stands, by the settings `pose:NAME.yaw`
+    and so on, and stays on the height that it stands on; without any it stays as it is.
+    Its material is set by `material:NAME.roughness` and so on.
+    """
+    parameters = {}
+    for parameter in POSE:
+        value = values.get(f"pose:{part.name}.{parameter.name}")
+        if value is not None:
+            parameters[parameter.name] = value
+    if parameters:
+        positions = compute_base_vertices(part)
+        parameters = {
+            **{parameter.name: float(parameter.default) for parameter in POSE},
+            **parameters,
+        }
+        part = replace(
+            part,
+            to_world=compute_pose(positions, float(positions[:, 2].min()), parameters)
+            @ part.to_world,
+        )
+    return replace(
+        part, material=part.material.with_values(values, f"material:{part.name}.")
+    )
+
+
+def compute_base_vertices(part: MeshPart) -> Float64Array:
+    """Return where the vertices (V, 3) of a mesh are in its base pose."""
+    return np.asarray(
+        part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T
+        + part.to_world[:3, 3]
+    )
+
+
+def compute_pose(
+    positions: Float64Array, floor: float, parameters: Mapping[str, float]
+) -> Float64Array:
+    """Return the pose (4, 4) that parameters of `settings.POSE` give to vertices.
+
+    It scales and rotates about the middle of their bounding box, puts the lowest at the
+    height `floor`, and then shifts by x, y and z. Without the shift the middle stays
+    above the same point of the ground.
+
+    Args:
+        positions: (V, 3) of the vertices.
+        floor: height of what they stand on.
+        parameters: parameters by name; angles in degrees.
+    """
+    center = (positions.min(axis=0) + positions.max(axis=0)) / 2.0
+    linear = parameters["scale"] * make_rotation(
+        parameters["yaw"], parameters["pitch"], parameters["roll"]
+    )
+    lowest = float(((positions - center) @ linear.T)[:, 2].min())
+    # `- linear @ center` moves the middle to the origin
+    translation = (
+        np.array([parameters["x"], parameters["y"], floor + parameters["z"] - lowest])
+        - linear @ center
+    )
+    # back above the same point; the height follows from the floor instead
+    translation[:2] += center[:2]
+    return make_pose(linear, translation)
