@@ -162,7 +162,8 @@ def test_boxes_of_a_detector_agree_where_they_overlap_by_half() -> None:
     shifted = {"found": [{"label": "cup", "box": [1, 0, 5, 2]}, {"label": "cup", "box": [0, 0, 4, 2]}]}
     far = {"found": [{"label": "cup", "box": [3, 0, 7, 2]}]}
     rows = []
-    for number, payload in enumerate((shifted, far, {"found": []}, None)):
+    payloads: list[Any] = [shifted, far, {"found": []}, None]
+    for number, payload in enumerate(payloads):
         row = make_row(f"{number}", True, True)
         predictions = [
             prediction.model_copy(update={"payload": value})
