@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import resource
 import statistics
 import subprocess
 import sys
@@ -36,8 +37,12 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
+
+import torch
+from torch import Tensor
 
 from advsearch import threads
 
@@ -46,9 +51,9 @@ threads.configure()
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from simulated_cluster import Simulated, SimulatedWorkers
-from sweep import ConstantRenderer, resident
 
 from advsearch.attacks import Evaluation
+from advsearch.controls import Space
 from advsearch.engine.journal import WorkItem
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import job as swept_scene
@@ -58,6 +63,8 @@ from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Store
+from advsearch.scene.formation import ImageFormation
+from advsearch.scene.gradients import GradientPlan
 from advsearch.tasks import Judgement, Prediction
 
 SECONDS = 0.5
@@ -69,6 +76,37 @@ BATCHES = 40
 
 WORKERS = (1, 3, 10, 30, 100, 300, 1000)
 """Simulated ones."""
+
+
+class ConstantRenderer:
+    """A gray image for every configuration, in the place of a renderer."""
+
+    non_finite = 0
+    plan = GradientPlan(())
+
+    def __init__(self, space: Space, size: tuple[int, int]) -> None:
+        self.space = space
+        self.start = space.start
+        self.scene = SimpleNamespace(assembly=dict)
+        self.image = torch.full((*size, 3), 0.5)
+        self.formation = ImageFormation(resolution=size)
+
+    def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        return self.image
+
+
+def measure_memory() -> int:
+    """Return the bytes of this process that are in memory now.
+
+    Where that is not known, the maximum so far.
+    """
+    try:
+        n_pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        maximum = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return maximum if sys.platform == "darwin" else 1024 * maximum
+    return n_pages * resource.getpagesize()
+
 
 ASKED_TWO = 1.9
 ASKED_ONE = 0.97
@@ -310,13 +348,13 @@ def stored(rows: int) -> list[bool]:
         def advance(self, n: int = 1, **info: float | str) -> None:
             self.done += n
             if not self.memory and self.done >= rows // 10:
-                self.memory = resident()
+                self.memory = measure_memory()
 
     watch = Watch()
     with without_rendering():
         _, seconds, _ = swept(20_000, rows, watch)
     speed = rows / seconds
-    growth = (resident() - watch.memory) / 2**20
+    growth = (measure_memory() - watch.memory) / 2**20
     print(
         f"  stored     {speed:.0f} rows a second (asked {ASKED_ROWS:.0f}), which "
         "bounds the number of workers:"

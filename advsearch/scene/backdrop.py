@@ -39,7 +39,10 @@ from torch import Tensor
 from advsearch.errors import FileFormatError, InputError
 from advsearch.pictures import check_decodable, open_image, to_8bit_levels
 from advsearch.scene.assets import Float64Array, ObjectAsset
-from advsearch.scene.backdrop_photograph import BackdropPhotograph, decode_all_levels
+from advsearch.scene.backdrop_photograph import (
+    BackdropPhotograph as BackdropPhotograph,
+)
+from advsearch.scene.backdrop_photograph import decode_all_levels
 from advsearch.scene.camera_model import (
     BROWN_CONRADY,
     EQUIRECTANGULAR,

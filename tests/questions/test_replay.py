@@ -149,6 +149,7 @@ def test_a_texture_of_a_room_is_tried_in_photographs(tmp_path: Path) -> None:
         assert attack_once(AttackConfig(**SHORT | settings | scene, run=str(run))).found
         replayed = advsearch.replay(run, backdrop=folder, trials=6, run=tmp_path / f"{name}-replay")
         assert [row.way for row in replayed.table[1:]] == [PHOTOGRAPH] * (len(replayed.table) - 1)
+        assert replayed.transfer is not None
         transfers.append(replayed.transfer)
     assert [transfer.photographs for transfer in transfers] == [6, 5], "not in the photograph that was searched"
     assert all(transfer.holding <= transfer.clean_right <= transfer.photographs for transfer in transfers)

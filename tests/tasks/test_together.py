@@ -96,7 +96,8 @@ def test_all_models_have_a_derivative() -> None:
     )
     image = torch.full((1, 1, 3), 0.5, requires_grad=True)
     torch.stack([output.sum() for output in model(image)[0]]).sum().backward()
-    torch.testing.assert_close(image.grad, sum(one.weight.detach().sum(dim=0) for one in layers)[None, None])
+    weights = torch.stack([layer.weight.detach() for layer in layers])
+    torch.testing.assert_close(image.grad, weights.sum(dim=(0, 1))[None, None])
 
 
 # ---- what is judged -------------------------------------------------------------------------------------------------
