@@ -239,7 +239,7 @@ def cache_per_scene(
     results_by_scene: WeakKeyDictionary[Any, dict[Any, R]] = WeakKeyDictionary()
 
     @wraps(compute)
-    def compute_cached(scene: AnyScene, *args: P.args, **kwargs: P.kwargs) -> R:
+    def compute_cached(scene: AnyScene, /, *args: P.args, **kwargs: P.kwargs) -> R:
         results = results_by_scene.setdefault(scene, {})
         key = (args, tuple(kwargs.items()))
         if key not in results:
