@@ -15,24 +15,30 @@ from pathlib import Path
 import pytest
 
 import advsearch
-from advsearch.catalog import BUILT_INS
+from advsearch import registry
+from advsearch.catalog import BUILT_INS, is_present
+from advsearch.experiment import Experiment
 from advsearch.settings import HEADER
 
 PACKAGE = Path(advsearch.__file__).parent
-
-
 CORE = ("attack", "sweep", "render")
-
-
 REMOVABLE = [part for part in BUILT_INS if part.kind == "experiment" and part.name not in CORE]
-
-
 CORE_PARTS = {
     "control": "pose camera texture material light environment geometry",
     "policy": "random grid pgd adam cmaes nes auto sobol restarts portfolio",
     "task": "classification detection",
     "reader": "obj ply stl gltf glb vrm",
 }
+"""Parts that are not removed, those in their modules included."""
+
+
+def test_every_part_of_the_catalog_is_there_and_is_what_it_says() -> None:
+    for part in BUILT_INS:
+        assert is_present(part.target.partition(":")[0]), part
+        assert not part.help.endswith("."), part
+    for name, experiment in registry.EXPERIMENTS.items():
+        assert isinstance(experiment, Experiment)
+        assert experiment.settings.command == name and experiment.result.command == name
 
 
 def copy_package(folder: Path, without: tuple[str, ...] = ()) -> None:
@@ -46,11 +52,49 @@ def copy_package(folder: Path, without: tuple[str, ...] = ()) -> None:
             path.with_suffix(".py").unlink()
 
 
-def run_python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(folder)}
-    return subprocess.run(
-        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+RUN = """
+import contextlib, io, json, sys
+from advsearch.cli.main import main
+from advsearch.config import CONFIGS
+results = [list(CONFIGS)]
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as error:
+        status = main(words)
+    results.append([status, out.getvalue(), error.getvalue()])
+print(json.dumps(results))
+"""
+
+
+def run_commands(folder: Path, *commands: list[str]) -> tuple[list[str], list[tuple[int, str, str]]]:
+    """Run commands of the package in a folder, in one process, and return the names of its configurations and of each
+    command the status, the output and the messages."""
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, json.dumps(commands)],
+        cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    configurations, *results = json.loads(done.stdout)
+    return configurations, [tuple(result) for result in results]
+
+
+SMALL = ["--control", "pose", "--resolution", "32", "--spp", "2", "--run"]
+ATTACK = ["attack", "--object", "mug", "--steps", "2", "--trials", "6", "--verify-spp", "2", "--no-baseline"]
+
+
+@pytest.mark.medium
+def test_without_all_removable_experiments_the_tool_works(tmp_path: Path) -> None:
+    names = tuple(part.name for part in REMOVABLE)
+    copy_package(tmp_path, names)
+    configurations, (shown_help, listed, unknown, attacked) = run_commands(
+        tmp_path, ["--help"], ["list", "objects"], ["harden"], [*ATTACK, *SMALL, "kept", "--json"]
     )
+    assert configurations == ["attack", "render", "sweep"]
+    assert shown_help[0] == 0 and "  attack " in shown_help[1]
+    assert not [name for name in names if f"\n  {name} " in shown_help[1]]
+    assert listed[0] == 0 and "mug" in listed[1]
+    assert unknown[0] == 2 and "unknown command 'harden'" in unknown[2]
+    assert attacked[0] == 0, attacked[2]
+    assert (tmp_path / "runs" / "kept" / "report.html").is_file()
 
 
 def list_removable_modules() -> dict[str, list[str]]:
@@ -63,45 +107,7 @@ def list_removable_modules() -> dict[str, list[str]]:
     return found
 
 
-SETUP = """from setuptools import setup
-
-setup(
-    name="advsearch-count",
-    version="1",
-    py_modules=["advsearch_count"],
-    entry_points={"advsearch.experiments": ["count = advsearch_count:count"]},
-)
-"""
-
-
 @pytest.mark.medium
-def test_without_all_removable_experiments_the_tool_works(tmp_path: Path) -> None:
-    names = tuple(part.name for part in REMOVABLE)
-    copy_package(tmp_path, names)
-    shown_help = run_python(tmp_path, "-m", "advsearch", "--help")
-    assert shown_help.returncode == 0, shown_help.stderr
-    assert "  attack " in shown_help.stdout
-    assert not [name for name in names if f"\n  {name} " in shown_help.stdout]
-    listed = run_python(tmp_path, "-m", "advsearch", "list", "objects")
-    assert listed.returncode == 0 and "mug" in listed.stdout
-    unknown = run_python(tmp_path, "-m", "advsearch", "harden")
-    assert unknown.returncode == 2 and "unknown command 'harden'" in unknown.stderr
-    imports = (
-        "import advsearch; from advsearch.config import CONFIGS; import advsearch.viewer.pages; "
-        "import advsearch.questions.attack.carry_out, advsearch.questions.sweep.carry_out; print(*CONFIGS)"
-    )
-    known = run_python(tmp_path, "-c", imports)
-    assert known.returncode == 0, known.stderr
-    assert known.stdout.split() == ["attack", "render", "sweep"]
-    attacked = run_python(
-        tmp_path,
-        *("-m", "advsearch", "attack", "--object", "mug", "--control", "pose", "--steps", "2", "--trials", "6"),
-        *("--resolution", "32", "--spp", "2", "--verify-spp", "2", "--no-baseline", "--run", "kept", "--json"),
-    )
-    assert attacked.returncode == 0, attacked.stderr
-    assert (tmp_path / "runs" / "kept" / "report.html").is_file()
-
-
 def test_without_all_removable_parts_the_tool_works(tmp_path: Path) -> None:
     copy_package(tmp_path)
     for module in list_removable_modules():
@@ -110,17 +116,15 @@ def test_without_all_removable_parts_the_tool_works(tmp_path: Path) -> None:
             shutil.rmtree(path)
         else:
             path.with_suffix(".py").unlink()
-    listed = run_python(tmp_path, "-m", "advsearch", "list", "controls")
-    assert listed.returncode == 0, listed.stderr
-    assert [line.split()[0] for line in listed.stdout.splitlines()] == CORE_PARTS["control"].split()
-    words = ["--control", "pose", "--resolution", "32", "--spp", "2", "--run"]
-    swept = run_python(tmp_path, "-m", "advsearch", "sweep", "--object", "mug", "--samples", "2", *words, "swept")
-    assert swept.returncode == 0, swept.stderr
-    attack = ["attack", "--object", "mug", "--steps", "2", "--trials", "6", "--verify-spp", "2", "--no-baseline"]
-    attacked = run_python(tmp_path, "-m", "advsearch", *attack, *words, "attacked", "--json")
-    assert attacked.returncode == 0, attacked.stderr
-    exported = run_python(tmp_path, "-m", "advsearch", "export", "attacked", "--out", "rows.csv")
-    assert exported.returncode == 0, exported.stderr
+    _, (listed, *done) = run_commands(
+        tmp_path,
+        ["list", "controls"],
+        ["sweep", "--object", "mug", "--samples", "2", *SMALL, "swept"],
+        [*ATTACK, *SMALL, "attacked", "--json"],
+        ["export", "attacked", "--out", "rows.csv"],
+    )
+    assert [line.split()[0] for line in listed[1].splitlines()] == CORE_PARTS["control"].split()
+    assert [status for status, _, _ in done] == [0, 0, 0], done
 
 
 def test_no_control_imports_another_one() -> None:
@@ -133,6 +137,17 @@ def test_no_control_imports_another_one() -> None:
             if isinstance(node, ast.ImportFrom) and node.module in modules - {module}:
                 found.add((module, node.module))
     assert found == set()
+
+
+SETUP = """from setuptools import setup
+
+setup(
+    name="advsearch-count",
+    version="1",
+    py_modules=["advsearch_count"],
+    entry_points={"advsearch.experiments": ["count = advsearch_count:count"]},
+)
+"""
 
 
 @pytest.mark.medium
