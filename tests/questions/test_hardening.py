@@ -123,7 +123,9 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     made, lessons = student(), pupils()
     ticks: list[int] = []
     course = course_of(made, rate=0.04, epochs=12)
+    worst_images = [one.worst_image.clone() for one in lessons]
     before = course.score(lessons)
+    assert all(map(torch.equal, worst_images, (one.worst_image for one in lessons))), "what judges is not changed"
     course.round(1, lessons, tick=lambda: ticks.append(1))
     after = course.score(lessons)
     assert len(ticks) == course.count_steps(lessons) == 12
