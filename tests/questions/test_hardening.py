@@ -160,14 +160,6 @@ def tinted(number: int) -> TextureLesson:
     return Tinted((number % 3,), levels, nothing, domain, nothing, nothing, torch.full((3,), 0.5))
 
 
-def test_scoring_a_student_changes_no_texture_that_it_is_judged_by() -> None:
-    lesson = tinted(0)
-    texture = lesson.texture
-    values = texture.clone()
-    course_of(student()).score([lesson])
-    assert lesson.texture is texture and torch.equal(texture, values)
-
-
 def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """An adversarial texture is adversarial for the crop, turn and colours that it was searched under."""
     seen = list[tuple[list[int], int, bool]]()
