@@ -274,7 +274,7 @@ def write_folders(
         if item.object != name or is_hidden:
             continue
         photograph = rendering.load_photograph(item.photograph)
-        height, width = photograph.shape[:2]
+        height, width = photograph.full_size
         positions = rendering.project_object(
             item, rendering.load_object(item.mesh, item.unit)
         )

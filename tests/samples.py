@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import tempfile
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenEXR
 
+from advsearch.engine.loading import Scene, load_scene
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult, load_attack_summary
 from advsearch.questions.region.result import RegionResult
@@ -271,3 +274,10 @@ def write_photograph_folder(folder: Path, name: str = "obj_000002", **entries: A
                       "object_to_camera": item.pose.tolist(), **entries}  # fmt: skip
             photograph.with_suffix(".json").write_text(json.dumps(stated), "utf-8")
     return folder
+
+
+@lru_cache
+def load_photographed_box() -> Scene:
+    """Return a box in the photographs of a folder, of which the control `backdrop` chooses one."""
+    folder = write_photograph_folder(Path(tempfile.mkdtemp()) / "photographs", set={"ground.size": 0.0})
+    return load_scene(str(PHOTOGRAPHS / "models" / "obj_000002.ply"), backdrop=folder, unit="mm")

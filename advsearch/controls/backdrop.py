@@ -14,17 +14,16 @@ takes the shadow where it is.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from advsearch.controls.base import Control, Values
-from advsearch.controls.environment import rotate_map
 from advsearch.controls.ranges import ParameterValue
+from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
 from advsearch.scene.assembly import PHOTOGRAPH_INPUT
 from advsearch.scene.assets import Float64Array
@@ -32,6 +31,7 @@ from advsearch.scene.backdrop import has_plane
 from advsearch.scene.camera_model import CameraModel, make_pinhole
 from advsearch.scene.description import SCENE_ENVIRONMENT, SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.settings import Parameter
 
 # of a pose, in object sizes and of a cosine: how far the plane may be off
@@ -61,8 +61,11 @@ class BackdropControl(Control):
         setting = settings.get("which") if isinstance(settings, Mapping) else None
         if isinstance(setting, Mapping):
             setting = setting.get("choices")
-        names = [setting] if isinstance(setting, str) else setting or []
-        options = [name for name in names if isinstance(name, str)]
+        if isinstance(setting, str):
+            setting = [setting]
+        if not isinstance(setting, Sequence):
+            return (which,)  # not set, or nothing that could be a name
+        options = [name for name in setting if isinstance(name, str)]
         if not options:
             return (which,)
         return (
@@ -153,7 +156,7 @@ class BackdropControl(Control):
         return {name: value.clone() for name, value in inputs.items()}
 
 
-@lru_cache(maxsize=256)
+@cache_per_scene
 def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tensor]:
     """Return the inputs by which a scene is seen as in one of its photographs.
 

@@ -13,9 +13,13 @@ from advsearch.scene.description import load_description
 from advsearch.scene.gradients import ESTIMATORS
 from advsearch.scene.settings import SETTINGS
 from hostile import SHORT, shown
+from samples import load_photographed_box
 
 every_control = pytest.mark.parametrize("kind", CONTROLS)
-NEEDED: dict[str, dict[str, Any]] = {"mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]}}
+NEEDED: dict[str, dict[str, Any]] = {
+    "mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},
+    "backdrop": {"which": ["000001.jpg", "000003.jpg"]},
+}
 """What a control cannot be made without."""
 
 
@@ -27,9 +31,10 @@ BESIDE = "bottle@0.4,0.1; vase@-0.3,0.3"
 
 def bound(kind: str, object: str = "mug") -> Control:
     """A control with its defaults in a scene, alone."""
-    return make_space(
-        [make_control(kind, NEEDED.get(kind))], load_description(SUITS.get(kind, object), things=BESIDE)
-    ).controls[0]
+    scene = load_description(SUITS.get(kind, object), things=BESIDE)
+    if kind == "backdrop":
+        scene = load_photographed_box().description
+    return make_space([make_control(kind, NEEDED.get(kind))], scene).controls[0]
 
 
 @every_control
@@ -55,7 +60,7 @@ def test_a_setting_of_the_scene_and_the_parameter_of_that_name_are_one_declarati
     fixed = {"camera.ev", "camera.lamps", "camera.drops", "camera.drop_size", "camera.drop_seed"}  # searched by nobody
     for name, declared in SETTINGS.items():
         kind, _, parameter = name.partition(".")
-        if kind in CONTROLS and name not in fixed:
+        if kind in CONTROLS and name not in fixed and kind != "backdrop":  # of the photograph, not of the choice
             (own,) = (one for one in CONTROLS[kind].parameters if one.name == parameter)
             assert own is declared, name
 

@@ -23,6 +23,7 @@ from advsearch.engine.loading import load_scene, make_controls
 from advsearch.errors import InputError
 from advsearch.models import Model, Preprocessing
 from advsearch.tasks import Classification, Facts, Prediction, Sight, Task, make_task
+from samples import load_photographed_box
 
 LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.5, 2.0, 0.0]])
 PICTURES = torch.rand(2, 4, 4, 3, generator=torch.Generator().manual_seed(0))
@@ -255,7 +256,10 @@ def test_a_control_that_destroys_what_it_is_handed() -> None:
 def test_what_a_space_hands_out_may_be_destroyed(kind: str) -> None:
     """A loop of one's own gets tensors that nothing else reads."""
     scenes: dict[str, Any] = {"body": {"object": "person"}, "things": {"object": "mug", "things": "bottle@0.4,0.1"}}
-    space = compose(make_controls([kind]), load_scene(**scenes[kind]).description if kind in scenes else MUG)
+    scene = load_scene(**scenes[kind]).description if kind in scenes else MUG
+    if kind == "backdrop":
+        scene = load_photographed_box().description
+    space = compose(make_controls([kind]), scene)
     u = space.start.clone()
     first = {
         ask: copy_value(getattr(space, ask)(u)) for ask in ("inputs", "get_printable_colors", "get_numeric_values")
