@@ -267,7 +267,7 @@ def swept(
         return [Evaluation.from_judgement(answer, seconds=0.03) for _ in sent]
 
     def seconds_of(sent: Any) -> float:
-        return drawn[(sent if isinstance(sent, int) else sent[2].number) % len(drawn)]
+        return drawn[(sent if isinstance(sent, int) else sent[2].index) % len(drawn)]
 
     pool = Timed(call=seen, seconds=seconds_of, load=0.0, lag=LAG, again=None)
     pool.add(workers)
