@@ -131,22 +131,23 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         instances: the sampled controls by name.
     """
     where = f"`grid` {name}"
-    control_name, dot, rest = name.partition(".")
+    control_name, _, rest = name.partition(".")
     # An instance may stand on either side: KIND:INSTANCE.PARAMETER, or
     # KIND.PARAMETER:INSTANCE.
     parameter_name, last_colon, last_instance = rest.partition(":")
     kind, first_colon, first_instance = control_name.partition(":")
+    instance_suffix = last_instance or first_instance
     if control_name in instances:
         instance = control_name
     else:
-        instance = families.make_instance_name(kind, last_instance or first_instance)
-    if control_name in _LISTED_SETTINGS and not dot:
+        instance = families.make_instance_name(kind, instance_suffix)
+    if name in _LISTED_SETTINGS:  # such as "model", which is no control
         raise InputError(
-            f"{where}: several of them are given as a list: "
-            f"{_LISTED_SETTINGS[control_name]}"
+            f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
         )
     control = _find_control(instances, kind, instance, where)
     if kind == MITSUBA_CONTROL:
+        # mitsuba:KEY, and a key may itself contain dots and colons
         return _parse_key_axis(name, values, control)
 
     parameters = _find_parameters(values, instances, control, parameter_name, instance)
@@ -155,9 +156,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
-    families.check_instance_name(
-        where, last_instance or first_instance, last_colon or first_colon
-    )
+    families.check_instance_name(where, instance_suffix, last_colon or first_colon)
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
@@ -273,7 +272,8 @@ def parse_axis_values(
     values: Sequence[Any] = (
         raw_values if isinstance(raw_values, (list, tuple)) else [raw_values]
     )
-    if isinstance(raw_values, str) and ":" in raw_values and not parameter.options:
+    takes_range = not parameter.options  # the name of an option may have a colon
+    if isinstance(raw_values, str) and ":" in raw_values and takes_range:
         values = _parse_range(where, raw_values, is_angle)
     if not values:
         raise InputError(
@@ -281,9 +281,10 @@ def parse_axis_values(
             "FIRST:LAST:COUNT or a list"
         )
     _check_count(where, len(values))
+    # NumPy's scalars become Python's
     choices = [value.item() if hasattr(value, "item") else value for value in values]
     spec = parse_spec(where, parameter, {"choices": choices})
-    assert isinstance(spec, OneOf)
+    assert isinstance(spec, OneOf)  # as choices always are
     _check_different(where, spec.values, is_angle)
     has_names = any(isinstance(value, str) for value in spec.values)
     if not parameter.options and not has_names:
@@ -559,7 +560,7 @@ class Points:
     ) -> None:
         self.grid = ProductIndex(tuple(len(axis.values) for axis in axes))
         self.samples = samples
-        self.count = self.grid.count * samples
+        self.count = self.grid.count * samples  # images of the scene
         self.n_parts = choose_n_parts(self.count * n_scenes)
         self.space = space
         self._start = domain.start.numpy().astype(np.float64)
@@ -573,8 +574,8 @@ class Points:
         self._large_blocks: list[_SampledBlock] = []
         self.sampled_numbers = tuple(self._assign_blocks(domain))
         self._columns = [number.column for number in self.sampled_numbers]
-        # Each number cuts [0, 1] into equal shares, one or several for each of its
-        # parts.
+        # Tables divide the range of a sampled number into parts, which cut [0, 1] into
+        # equal shares: one for each part, or several for an option with more weight.
         n_shares = [
             len(number.part_of_share or number.parts) for number in self.sampled_numbers
         ]
@@ -587,27 +588,45 @@ class Points:
             large_dimensions, "random", seed, "large draws"
         )
         self.is_sampled = small_dimensions + large_dimensions > 0
-        # If nothing is sampled, the samples of a grid point are repeats of one draw,
-        # each with its own noise.
-        n_draws = samples if self.is_sampled else 1
-        time_axis = next(
-            (index for index, axis in enumerate(axes) if axis.is_time), None
+        self.units = self._make_units(
+            axes,
+            images_until_repeat=repeat_after_scenes * self.count,
+            n_photographs=n_photographs,
         )
-        self.units = Units(
-            self.grid.sizes,
-            frames=time_axis,
-            samples=n_draws,
-            again=repeat_after_scenes * self.count,
-            noise=samples // n_draws,
-            photographs=n_photographs,
-            scene=self.count if n_photographs > 1 else 1,
-        )
+        # Scenes with the same layout get the same meaning from a draw.
         numbers = tuple(
             (number.name, number.column, len(number.parts))
             for number in self.sampled_numbers
         )
         self.sampled_layout = (small_dimensions, numbers)
         self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
+
+    def _make_units(
+        self, axes: Sequence[Axis], *, images_until_repeat: int, n_photographs: int
+    ) -> Units:
+        """Return which images belong to one independent unit, such as a drive.
+
+        Args:
+            axes: axes of the grid; images along an axis of time are frames of a drive.
+            images_until_repeat: images after which the draws repeat; 0 for never.
+            n_photographs: photographs of a folder, in which the scenes are in turn; 1
+                without a folder.
+        """
+        # If nothing is sampled, the samples of a grid point are repeats of one draw,
+        # each with its own noise.
+        n_draws = self.samples if self.is_sampled else 1
+        time_axis = next(
+            (index for index, axis in enumerate(axes) if axis.is_time), None
+        )
+        return Units(
+            self.grid.sizes,
+            frames=time_axis,
+            samples=n_draws,
+            again=images_until_repeat,
+            noise=self.samples // n_draws,
+            photographs=n_photographs,
+            scene=self.count if n_photographs > 1 else 1,
+        )
 
     def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
         """Fill the lists of grid coordinates and sampled blocks from the blocks.
@@ -632,7 +651,7 @@ class Points:
                 continue
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
-            begin = _count_columns(blocks)
+            begin = _count_columns(blocks)  # the first column that is free
             is_ball = block.norm == "l2"
             n_columns = block.size
             if is_ball:
@@ -640,8 +659,9 @@ class Points:
             columns = slice(begin, begin + n_columns)
             blocks.append(_SampledBlock(block, coordinates, columns))
             control = controls[group.control]
-            is_short = block.size <= MAX_TABLE_COMPONENTS and not is_ball
-            if is_short and control.slots:
+            # In a ball a component has no range of its own.
+            is_in_tables = block.size <= MAX_TABLE_COMPONENTS and not is_ball
+            if is_in_tables and control.slots:  # a control without slots has no ranges
                 yield from self._describe_sampled(
                     control, group.parameter, coordinates, begin
                 )
@@ -669,6 +689,7 @@ class Points:
             )
             return
         for component, column in enumerate(range(coordinates.start, coordinates.stop)):
+            # the bounds of equal parts of the range, as coordinates, then as values
             edges = torch.linspace(
                 float(self._lower[column]),
                 float(self._upper[column]),
@@ -676,7 +697,7 @@ class Points:
                 dtype=torch.float64,
             )
             edge_values = spec.interpolate(edges, log=parameter.log).tolist()
-            suffix = f".{component}" if parameter.shape else ""
+            suffix = f".{component}" if parameter.shape else ""  # of a vector
             yield SampledNumber(
                 full_name + suffix,
                 parameter.unit,
@@ -743,7 +764,7 @@ class Points:
         Args:
             first: number of the first image in the scene.
             count: count of images.
-            before: images of the scenes before this one.
+            before: images of the scenes before this one, which used up as many draws.
         """
         u = np.repeat(self._start[None], count, axis=0)
         indices = self._axis_indices(first, count)
@@ -780,6 +801,7 @@ class Points:
         """
         block = sampled.block
         if block.options:
+            # a uniform number of exactly 1 belongs to the last option
             option = np.minimum(np.floor(uniform * block.options), block.options - 1)
             return np.asarray((option + 0.5) / block.options)
         if block.norm != "l2" or block.epsilon is None:
@@ -818,7 +840,7 @@ class Points:
         indices = self._axis_indices(first_image, len(u))
         coordinates = u.split(self.space.sizes, dim=1)
         for control, control_u in zip(self.space.controls, coordinates, strict=True):
-            if _is_described_by_base(control):
+            if _is_described_by_base(control):  # then all images at once, which is fast
                 columns = self._describe_columns(control, control_u, indices)
                 for name, unit, values in columns:
                     for row, value in zip(rows, values, strict=True):
@@ -862,7 +884,7 @@ class Points:
         cached = self._description_cache.get(key)
         if cached is not None:
             return cached
-        if control.refines:
+        if control.refines:  # takes inputs of other controls, and so needs all of u
             description = dict(self.space.describe(u, (control,)))
         else:
             description = dict(control.describe(control_u))

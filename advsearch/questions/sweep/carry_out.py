@@ -387,7 +387,7 @@ def _run_config(
     resumed = _find_resumable(config)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    context: Any = nullcontext(resumed)
+    context: Any = nullcontext(resumed)  # None without a run directory
     if config.run is not None and resumed is None:
         context = create_before_work(config)
     if config.twins is not None:
@@ -480,16 +480,7 @@ def _add_adversarial_arm(
             "to sweep"
         )
     fixed_controls = make_configured_controls(attack_config, attack_config.controls)
-    varied_names = {control.name for control in sampled}
-    varied_names |= {axis.instance for axis in axes}
-    fixed_names = {control.name for control in fixed_controls}
-    clashes = sorted(varied_names & fixed_names)
-    if clashes:
-        raise InputError(
-            f"adversarial_of: the adversarial configuration of {directory} sets "
-            f"{clashes[0]}, so it can't vary; leave it "
-            "out of `grid` and `controls`"
-        )
+    _check_not_varied(fixed_controls, sampled, axes, directory)
     u = torch.from_numpy(read_configuration(directory))
     arm = directory.resolve().name
     if arm == CLEAN:
@@ -535,6 +526,35 @@ def row_parameters(config: SweepConfig) -> set[str]:
     return {*space.describe(space.start), *space.describe(center)}
 
 
+def _check_not_varied(
+    fixed_controls: Sequence[Control],
+    sampled: Sequence[Control],
+    axes: Sequence[Axis],
+    attack_run: Path,
+) -> None:
+    """Check that a sweep does not vary what an adversarial configuration sets.
+
+    Args:
+        fixed_controls: controls of the attack.
+        sampled: controls that are sampled.
+        axes: axes of the grid.
+        attack_run: run directory of the attack, for the message.
+
+    Raises:
+        InputError: a control is both fixed and varied.
+    """
+    varied_names = {control.name for control in sampled}
+    varied_names |= {axis.instance for axis in axes}
+    fixed_names = {control.name for control in fixed_controls}
+    clashes = sorted(varied_names & fixed_names)
+    if clashes:
+        raise InputError(
+            f"adversarial_of: the adversarial configuration of {attack_run} sets "
+            f"{clashes[0]}, so it can't vary; leave it "
+            "out of `grid` and `controls`"
+        )
+
+
 def _make_job(
     config: SweepConfig,
     named_scenes: Sequence[NamedScene],
@@ -557,26 +577,18 @@ def _make_job(
     Raises:
         InputError: something in the settings does not fit together.
     """
-    # A control that travels along the path is added where none does.
-    travel_settings = ("path", "shutter", "rolling") if config.path is not None else ()
-    naming.check_run_settings(config.model_copy(update=dict.fromkeys(travel_settings)))
+    # These settings need a control that travels along the path. With a `path` they are
+    # left out of the check, since `add_frames` adds such a control where none does.
+    unchecked = ("path", "shutter", "rolling") if config.path is not None else ()
+    naming.check_run_settings(config.model_copy(update=dict.fromkeys(unchecked)))
     sampled = make_configured_controls(config, controls)
     grid = config.grid
     if config.path is not None:
         sampled, grid = add_frames(config, sampled)
     axes = parse_axes(grid, sampled)
-    if config.samples is not None and not sampled:
-        raise InputError(
-            "samples: expected `controls` beside it, which says what is drawn by "
-            "chance; add `controls=pose`, say, or "
-            "leave `samples` out"
-        )
-    if not axes and not sampled and len(named_scenes) * len(models) == 1:
-        raise InputError(
-            "grid: expected something that varies, got nothing; add an axis such as "
-            "`grid` pose.yaw=0:360:24, or "
-            "`controls=pose` `samples=100`"
-        )
+    _check_something_varies(
+        config, axes, sampled, n_combinations=len(named_scenes) * len(models)
+    )
     named_scenes = _add_adversarial_arm(config, named_scenes, sampled, axes)
     check_scenes(named_scenes, sampled, axes)
     axes = _with_camera_units(axes, named_scenes)
@@ -597,7 +609,39 @@ def _make_job(
         warnings += job.bind_controls(named_scene, job.image_sizes[0]).list_notes(
             named_scene.scene.description
         )
-    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
+    unique_warnings = tuple(dict.fromkeys(warnings))  # scenes may share one
+    return replace(job, warnings=unique_warnings)
+
+
+def _check_something_varies(
+    config: SweepConfig,
+    axes: Sequence[Axis],
+    sampled: Sequence[Control],
+    n_combinations: int,
+) -> None:
+    """Check that a sweep has more than one image to evaluate.
+
+    Args:
+        config: the settings.
+        axes: axes of the grid.
+        sampled: controls that are sampled.
+        n_combinations: scenes times models.
+
+    Raises:
+        InputError: `samples` asks for draws of nothing, or nothing varies at all.
+    """
+    if config.samples is not None and not sampled:
+        raise InputError(
+            "samples: expected `controls` beside it, which says what is drawn by "
+            "chance; add `controls=pose`, say, or "
+            "leave `samples` out"
+        )
+    if not axes and not sampled and n_combinations == 1:
+        raise InputError(
+            "grid: expected something that varies, got nothing; add an axis such as "
+            "`grid` pose.yaw=0:360:24, or "
+            "`controls=pose` `samples=100`"
+        )
 
 
 def _with_camera_units(
@@ -681,11 +725,11 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
     Args:
         config: settings of the sweep.
     """
-    passed: Scene | None = config.python_object(naming.SCENE, config.object)
-    if passed is not None:
-        environment = passed.description.environment_name
+    session_scene: Scene | None = config.python_object(naming.SCENE, config.object)
+    if session_scene is not None:  # passed by a Python caller
+        environment = session_scene.description.environment_name
         return expand_photographs(
-            config, [NamedScene(config.object, environment, passed)]
+            config, [NamedScene(config.object, environment, session_scene)]
         )
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
@@ -727,8 +771,16 @@ def expand_photographs(
 
     They stay as they are if a control draws the photograph, or the grid names it.
     """
-    names = [*config.controls, *(name.partition(".")[0] for name in config.grid)]
-    if any(getattr(config.find_control_type(n), "kind", "") == BACKDROP for n in names):
+    control_names = [
+        *config.controls,
+        *(axis_name.partition(".")[0] for axis_name in config.grid),
+    ]
+    kinds = [
+        # a name that is no control has no kind
+        getattr(config.find_control_type(name), "kind", "")
+        for name in control_names
+    ]
+    if BACKDROP in kinds:
         return tuple(scenes)
     expanded = list[NamedScene]()
     for named_scene in scenes:

@@ -135,8 +135,10 @@ def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
 def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
     """Draw the map of a sweep on matplotlib axes."""
     x_axis, y_axis = cells.axes
+    # Cells are 1 wide and high, and their centers are whole numbers.
     extent = (-0.5, len(x_axis.values) - 0.5, -0.5, len(y_axis.values) - 0.5)
     counts = np.array(cells.configurations, dtype=float)
+    # The accuracy of a single prediction is only 0 or 1: its margin says more.
     if counts.max() > 1:
         measure = ACCURACY
         no_values = np.full(counts.shape, np.nan)
@@ -293,6 +295,7 @@ def make_sweep_view(summary: SweepSummary) -> ShownResult:
     if summary.configurations > 0:
         ended_early = summary.looked_at < summary.planned
     else:
+        # Without a count, either all images lack the object, or none was evaluated.
         ended_early = not summary.out_of_view
     return ShownResult(_verdict(summary), sections, facts, says_interrupted=ended_early)
 
@@ -325,6 +328,7 @@ def _text_sections(
     yield ResultPart.make_table(
         summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
     )
+    # The axis "answer" is the two scenes, clean and adversarial: `_arms_table` has it.
     if axes.keys() - {"answer"}:
         introduction = READING
         if summary.beside:
@@ -520,6 +524,7 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     has_outcomes = any(row.outcomes for row in rows)
     lines = []
     for row in listed:
+        # no bar where the accuracy is not known, or 0
         bar = "#" * round((row.accuracy or 0.0) * BAR_LENGTH)
         accuracy, interval = _accuracy_cells(row)
         cells = [
@@ -548,7 +553,7 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
         for pair in result.beside.pairs:
             yield from _arm_claims(result.beside.answer, pair, population, note)
         if result.beside.pairs:
-            return
+            return  # the other claims are about both scenes together
     yield from _accuracy_claims(result, population, note)
     distance = find_detection_distance(result)
     if distance:
@@ -568,7 +573,11 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
 
 
 def _describe_population(result: SweepSummary) -> tuple[str, str]:
-    """Return what the rates of a sweep are over, and a caution about the interval."""
+    """Return what the rates of a sweep are over, and a caution about the interval.
+
+    A sweep has a grid, samples (then it has a `sampler`), or both; imported rows have
+    neither. Only independent random draws need no caution.
+    """
     configurations = "configurations"
     if result.drives:
         configurations = f"frames of {result.drives[0].drives} drives"
@@ -875,7 +884,8 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     distances = tuple(_center_distance(row) for row in rows)
     k = np.array([row.correct for row in rows])
     n = np.array([row.configurations for row in rows])
-    # of a binomial test on each side, at one of the distances
+    # Of a binomial test at one of the distances: 2.5 % on each side, divided by the
+    # number of tests (Bonferroni).
     significance = 0.025 / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
@@ -930,7 +940,7 @@ def _bound_distance(
     is_above_half = p_at_least < significance
     is_below_half = p_at_most < significance
     low = max(distance[is_above_half], default=None)
-    is_beyond_low = distance > (low or 0.0)
+    is_beyond_low = distance > (low or 0.0)  # all are, without a lower bound
     high = min(distance[is_below_half & is_beyond_low], default=None)
     return None if low is None else float(low), None if high is None else float(high)
 
@@ -977,6 +987,7 @@ def distance_sentence(estimate: DetectionDistance) -> str:
     loose = _loose_sentence(estimate, unit)
     farthest = f"{estimate.distances[-1]:.3g} {unit}"
     if not estimate.is_monotone:
+        # The dips come first: the estimate is only about what is beyond them.
         if distance is not None:
             beyond = f"Beyond that the share falls below a half at {distance} {unit}"
         elif estimate.is_above_half:
@@ -1040,6 +1051,7 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     if significant:
         clauses = "; ".join(_dip_clause(dip, unit) for dip in significant)
         return [f"No one distance from which on it is seen: right in {clauses}."]
+    # the farthest distance at which the estimate has at least half of the images right
     detected_until = estimate.distance or 0.0
     if estimate.is_above_half:
         detected_until = estimate.distances[-1]

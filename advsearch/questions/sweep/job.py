@@ -185,6 +185,7 @@ class Job:
         images_before = scene * self.images_per_scene
         first_in_scene = numbers.start - images_before
         queries = list[Query]()
+        # Controls may depend on the size of the images: each size has its own points.
         for size, points in self.load_points(scene).items():
             configurations = points.make_configurations(
                 first_in_scene, len(numbers), images_before
@@ -287,22 +288,11 @@ class Job:
             return Space((), None)
         space = make_space(controls, description)
         if named_scene.fixed_controls:
-            held_controls = space.controls[: len(named_scene.fixed_controls)]
-            start = torch.cat([control.start for control in held_controls])
-            if named_scene.u is not None and len(named_scene.u) != len(start):
-                raise InputError(
-                    "adversarial_of: the adversarial configuration of "
-                    f"{named_scene.arm} has {len(named_scene.u)} "
-                    f"numbers, and {named_scene.object} takes {len(start)}: it is "
-                    "another "
-                    "object, or it has changed since; "
-                    "do the run again"
-                )
-            space = space.fix_first_controls(
-                start if named_scene.u is None else named_scene.u
-            )
+            space = _fix_controls(named_scene, space)
+        # `check_scenes` has checked the environment
+        set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
         for group in space.groups:
-            if group.setting in named_scene.scene.description.requested - {ENVIRONMENT}:
+            if group.setting in set_by_user:
                 raise InputError(
                     f"`controls` {group.control}: draws {group.parameter} by chance, "
                     f"and `set` {group.setting} fixes "
@@ -340,6 +330,33 @@ class Job:
             describe=lambda: values,
             judge=self.config.judge,
         )
+
+
+def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
+    """Fix the first controls of a space to the configuration of a scene.
+
+    Args:
+        named_scene: scene with fixed controls; without a configuration `u`, these are
+            fixed to their start, as in the clean arm.
+        space: space of all controls, with the fixed ones first.
+
+    Raises:
+        InputError: the adversarial configuration does not fit the scene.
+    """
+    fixed_controls = space.controls[: len(named_scene.fixed_controls)]
+    start = torch.cat([control.start for control in fixed_controls])
+    if named_scene.u is None:
+        return space.fix_first_controls(start)
+    if len(named_scene.u) != len(start):
+        raise InputError(
+            "adversarial_of: the adversarial configuration of "
+            f"{named_scene.arm} has {len(named_scene.u)} "
+            f"numbers, and {named_scene.object} takes {len(start)}: it is "
+            "another "
+            "object, or it has changed since; "
+            "do the run again"
+        )
+    return space.fix_first_controls(named_scene.u)
 
 
 def check_scenes(
@@ -469,7 +486,7 @@ class SweptScene:
         config = job.config
         self.number = number
         self.job = job
-        self.points = job.load_points(number)
+        self.points = job.load_points(number)  # by image size
         # renderers of the scene without its object, by size, made on demand
         self._empty_renderers: dict[ImageSize, Renderer] = {}
         self.renderers = {size: self._make_renderer(size) for size in self.points}
@@ -545,6 +562,7 @@ class SweptScene:
         evaluations = self._make_evaluations(
             queries, images, judgements, seconds, wrong_images
         )
+        # what concerns the batch
         evaluations[-1] = replace(
             evaluations[-1],
             light=[predictor.summarize() for predictor in self.predictors.values()],
@@ -836,7 +854,7 @@ def verify_worst(
     verifier = Verifier(
         Journal(run, ParallelEvaluator(problem)), ladder, stages, has_success=False
     )
-    verifier.choose_spp({"worst": u})
+    verifier.choose_spp({"worst": u})  # sets `spp` and `sample_count` of its state
     verifier.begin_stage(
         "checking the worst configuration with fresh renders", config.trials
     )
@@ -845,7 +863,7 @@ def verify_worst(
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
-    wrong_trials = [trial for trial in trials if trial.success]
+    wrong_trials = [trial for trial in trials if trial.success]  # of an attack
     counts = Trials(len(wrong_trials), len(trials), spp)
     verified_rate = make_rate(counts, trials, wrong_trials)
     has_converged = sample_count is not None and sample_count.converged
