@@ -96,6 +96,7 @@ def make_page(run: Path, result: Result) -> str | None:
     scripts = ["make.js", "attack.js"]
     if turned_object:
         scripts.append("object.js")
+    # `about` is what the result is of, in a few names
     view = replace(view, sections=sections, facts=facts, about=about)
     return make_view_page(run, result, view, data=data, scripts=scripts)
 
@@ -238,6 +239,7 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
         rows.append([name, clean, adversarial, _range_text(changed)])
         bars.append(_range_bar(changed))
     heads = ("parameter", "clean", "adversarial", "in its range")
+    # indices of the columns with any text
     columns = [
         column for column in range(len(heads)) if any(row[column] for row in rows)
     ]

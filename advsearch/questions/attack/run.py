@@ -257,6 +257,7 @@ def search_and_verify(
     """
     problem = journal.problem
     first_spp = problem.spp  # a preparation may choose another one for the search
+    # numbers of trials after which a verdict may be reached
     looks = TRIAL_LOOKS if problem.conditions is None else OVER_LOOKS
     findings = RunState()
     verifier = Verifier(
@@ -266,7 +267,7 @@ def search_and_verify(
         journal, stages, findings, printable=printable, close_looks=close_looks
     )
     if smallest:
-        # raises for what has no budget, before anything is rendered
+        # only a check: raises for what has no budget, before anything is rendered
         scale_domain(problem.domain, 1.0)
     try:
         with interruptible():
@@ -327,8 +328,9 @@ def search_with_baselines(
     findings.search = searches.search(
         "search", policy, steps, problem.seed, frames=findings.frames, seconds=seconds
     )
-    # renders of the search itself, without those of the ranking
     if seconds is not None:
+        # The other searches get the renders that fitted into the time, without those of
+        # the ranking at the end.
         history = findings.search.history
         steps = max(1, history[-1].renders) if history else 1
     if searches.printable:
@@ -367,6 +369,7 @@ def choose_policy(
         InputError: the policy needs the gradient of a model that has none, or does not
             use the derivatives that a setting concerns.
     """
+    # "box" is a range alone; blocks with another norm have a budget epsilon
     norms = {block.norm for block in problem.domain.blocks}
     if isinstance(problem.model.module, RemoteNetwork):
         if policy.name == "auto":

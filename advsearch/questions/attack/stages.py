@@ -166,7 +166,7 @@ def _measure_gradients(
     """
     renderer = problem.renderer
     progress = stages.progress
-    counts_renders = not full or deterministic
+    counts_renders = not full or deterministic  # a quick choice takes no times
     seed = seeds.stream(problem.seed, "measure")
     bench = Bench(
         renderer,
@@ -280,6 +280,7 @@ def choose_predictor(
 
     candidates: list[Callable[[], PredictedSearch]] = []  # cheapest first
     if matrix_refusal is None and problem.conditions is None:
+        # a single matrix predicts all images, if no condition varies
         candidates.append(lambda: Transport(problem, steps, clean_matrix=clean))
     else:
         if surface_refusal is None:
@@ -300,6 +301,7 @@ def choose_predictor(
         instead = "rendered" if matrix_refusal else "predicted by matrices"
         stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
+    # No candidate is left, so each has been refused.
     assert matrix_refusal is not None and surface_refusal is not None
     # The user is told the reason that is easier to change: more steps, if matrices pay
     # then; or that of matrices where no camera moves.
@@ -394,6 +396,25 @@ class Searches:
             hint = f"{steps} pictures predicted and {n_traced} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
 
+    def _mark_domain(self, domain: Domain, policy: Policy[Any]) -> Domain:
+        """Return a domain that states what its evaluations are: predicted or rendered.
+
+        Predicted ones may be exact, that is without noise, and may draw conditions
+        themselves, for policies that use their gradients.
+
+        Args:
+            domain: domain to search.
+            policy: policy that searches it.
+        """
+        predictor = self.findings.predictor
+        if predictor is None:
+            return replace(domain, exact=False, draws_conditions=False)
+        return replace(
+            domain,
+            exact=predictor.is_exact,
+            draws_conditions=predictor.draws_conditions and policy.uses_gradient,
+        )
+
     def search(
         self,
         kind: str,
@@ -452,18 +473,9 @@ class Searches:
             on_replay = ignore_replay if predictor is None else predictor.replay
             return self.journal.evaluate_all(queries, self._evaluate, on_replay)
 
-        domain = domain or self.problem.domain
-        if predictor is None:
-            domain = replace(domain, exact=False, draws_conditions=False)
-        else:
-            domain = replace(
-                domain,
-                exact=predictor.is_exact,
-                draws_conditions=predictor.draws_conditions and policy.uses_gradient,
-            )
         result = search(
             evaluate,
-            domain,
+            self._mark_domain(domain or self.problem.domain, policy),
             policy,
             steps=steps,
             seed=seed,
@@ -506,6 +518,24 @@ class Searches:
             )
 
 
+def _choose_verification_samples(
+    verifier: Verifier, results: Sequence[SearchResult], adversarial: Tensor
+) -> None:
+    """Choose the samples per pixel of a verification, and store them in its state.
+
+    Args:
+        verifier: verifier of the attack.
+        results: results of all searches; their cost limits what the choice may cost.
+        adversarial: (d,) the adversarial configuration.
+    """
+    problem = verifier.problem
+    n_images = sum(
+        (result.renders + result.gradients) * problem.n_draws for result in results
+    )
+    configurations = {"adversarial": adversarial, "clean": problem.domain.start}
+    verifier.choose_spp(configurations, search_samples=n_images * problem.spp)
+
+
 def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     """Verify with fresh seeds what the searches claim, paired with the clean scene.
 
@@ -520,23 +550,18 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         is_smallest: whether the smallest change was searched.
     """
     findings = verifier.state
-    problem = verifier.problem
     candidate = findings.search
     baseline = findings.baseline
     unprinted = findings.unprinted
     if candidate is None:
         raise RuntimeError("nothing was searched, so there is nothing to verify")
-    adversarial = problem.domain.project(candidate.best_u)
+    adversarial = verifier.problem.domain.project(candidate.best_u)
     results = [
         result for result in (candidate, baseline, unprinted) if result is not None
     ]
     if not is_smallest or findings.sample_count is None:
-        n_images = sum(
-            (result.renders + result.gradients) * problem.n_draws for result in results
-        )
-        configurations = {"adversarial": adversarial, "clean": problem.domain.start}
-        verifier.choose_spp(configurations, search_samples=n_images * problem.spp)
-    n_groups = len(results)
+        _choose_verification_samples(verifier, results, adversarial)
+    n_groups = len(results)  # groups of trials, one for each configuration
     if not verifier.has_clean_trials:
         n_groups += 1
     verifier.begin_stage(
@@ -685,6 +710,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         problem.domain,
         likely=None if transport is None else transport.is_likely_success,
     )
+    # `passes` makes `n_trials` trials: so many repeats make enough of them
     n_repeats = math.ceil(MIN_CONFIRMING_TRIALS / n_trials)
     if bracket.u is not None:
         verifier.begin_stage(
@@ -699,6 +725,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         winner = replace(
             results[bracket.found_by], best_u=bracket.u, ending=Ending.FOUND
         )
+    # one result, with the cost of all searches
     findings.search = replace(
         winner,
         renders=sum(result.renders for result in results),
@@ -741,6 +768,7 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     rule = problem.rule
     if known is None or not known.examples or rule.is_conditional:
         return
+    # A model that is wrong about the clean scene fails without any change.
     if rule.is_already_wrong(count_right(findings.clean_trials, 1)):
         return
     failures = known.examples[:MAX_TRIED_FAILURES]

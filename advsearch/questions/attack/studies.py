@@ -158,7 +158,7 @@ def attacks_of(settings: JsonObject) -> BatchFunction:
                 ending = attack_once(config, clean=clean).summary.ending
                 finished.append((study_attack.name, str(path), _read_files(path)))
                 if ending in SETTLED:
-                    break
+                    break  # no larger epsilon is needed
         return finished
 
     return make_chain
@@ -179,8 +179,8 @@ def distribute_attacks(
     """Have workers make the attacks of a study that have not begun, if requested.
 
     Args:
-        config: config of the study.
-        chains: all of its attacks.
+        config: settings of the study.
+        chains: all of its attacks, in chains of growing epsilon.
         run: its run directory, which gets the files.
         progress: reports it.
 

@@ -74,6 +74,7 @@ def attack_verdict(summary: AttackSummary) -> str:
             f"The search claims a wrong prediction that is not confirmed: {claim} "
             f"in {rate}."
         )
+    # the search has ended without finding anything
     reason = _REASONS.get(ending, f"The search ended: {ending}.")
     return (
         f"No change of {budget_text(summary)} was found that {goal}: {claim} in "
@@ -319,6 +320,7 @@ def _error_clause(
     """
     labels = verified.labels
     if summary.task == words.COMMAND and not summary.target and len(labels) == 1:
+        # such as "(steering above it)"
         direction = next(iter(labels)).replace("action outside its envelope ", "")
         if direction and not summary.minimises:
             claim += f" {direction}"

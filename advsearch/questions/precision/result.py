@@ -379,11 +379,13 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     clock.
     """
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
+    # of each point with a time by the clock: whether it took twice the processor time
     waited = [
         point.wall_seconds > 2.0 * point.seconds
         for point in points
         if point.wall_seconds is not None
     ]
+    is_busy = 2 * sum(waited) > len(waited)  # more than half of them
     warnings = []
     if heavy:
         warnings.append(
@@ -391,7 +393,7 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
             "that repeats say too little and "
             "it has no interval; a denoiser or more `rounds` help"
         )
-    if 2 * sum(waited) > len(waited):
+    if is_busy:
         warnings.append(
             "the machine was busy with something else: by the clock, most pictures and "
             "gradients took over twice their "
@@ -649,7 +651,8 @@ def _draw_line(
                 "linewidth": 0.8,
                 "shrinkA": 3,
             }
-            axes.annotate("", (x, y * 0.72), (x, y), arrowprops=arrow)
+            arrow_tip = y * 0.72  # the axis is logarithmic: as long for every point
+            axes.annotate("", (x, arrow_tip), (x, y), arrowprops=arrow)
     axes.plot(
         # an empty line, whose entry in the legend has marker and line
         [],
@@ -686,7 +689,7 @@ def _plain_axis(axis: Any) -> None:
             if low <= factor * 10.0**power <= high
         ]
         if len(ticks) >= 3:
-            break
+            break  # else the next factors give more ticks
     axis.set_major_locator(FixedLocator(ticks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.set_minor_formatter(NullFormatter())

@@ -157,6 +157,7 @@ def estimate_reference(
         for jackknife_value in jackknife_values
     )
     scatter = math.sqrt((count - 1) / count * sum_of_squares)
+    # with the factor of Efron's formula; two parts are too few to tell a bias
     bias_estimate = 0.0
     if count > 2:
         bias_estimate = (count - 1) * float(np.linalg.norm(center - value))

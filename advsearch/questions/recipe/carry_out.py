@@ -101,7 +101,8 @@ def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     recipe = _load_recipe(context)
     runs = plan_runs(recipe, config)
     description.check_powers(recipe, runs, config.recipe)
-    if _read_noted_recipe(context) is None:
+    is_new = _read_noted_recipe(context) is None
+    if is_new:  # a resumed run was checked when it began
         check_recipe(recipe, config)
         check_figures(recipe, check_runs(runs), config.recipe)
     context.run.store.write_note(
@@ -212,6 +213,7 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
         photographs = workbench.load_photographs()
         for run in photographed:
             directory = Path(config.photographs) / Path(run.config.object).stem
+            # only a check: raises if a file cannot be used
             photographs.list_files(directory, run.config.task)
     for figure in recipe.figures:
         kind, _ = read_figure_options(figure, config.recipe)
@@ -241,7 +243,7 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
             for name, value in run.config.to_json().items()
             if name not in ("seed", WORKERS_COLUMN)
         }
-        key = f"{distinct_settings} {run.around}"
+        key = f"{distinct_settings} {run.around}"  # settings have no hash, text has
         if key not in parameters_of_settings:
             # the search around whose distribution this run samples
             search = config_of_run[run.around] if run.around else None
@@ -301,6 +303,7 @@ def check_figures(
     for index, described in enumerate(recipe.figures, start=1):
         kind, options = read_figure_options(described, where)
         location = f"It stands in {where}, figure {index} ({kind})"
+        # the part that all others are compared with; it needs none of the columns
         baseline = getattr(options, "beside", None)
         _check_option_parts(recipe, options, baseline, location)
         parts = options.of or tuple(columns)
@@ -312,7 +315,7 @@ def check_figures(
         if not columns_of_part:
             continue
         for option in COLUMN_OPTIONS:
-            value = getattr(options, option, None) or ()
+            value = getattr(options, option, None) or ()  # a name, or several
             names = [value] if isinstance(value, str) else value
             for name in names:
                 _check_column(
@@ -349,9 +352,9 @@ def _check_column(
     """Check that all parts of a figure have a column.
 
     Args:
-        recipe: recipe with groups, all parts have a column of the group.
+        recipe: the recipe; if it has groups, all parts have a column of the group.
         name: name of the column.
-        option: option of the figure, which names it.
+        option: option of the figure that names the column.
         columns_of_part: names of columns of each part of the figure.
         location: location of the figure, for messages.
 
@@ -369,6 +372,7 @@ def _check_column(
         if matching.isdisjoint(columns)
     ]
     if len(lacking) == len(columns_of_part):
+        # the message lists the columns that any part has
         for columns in columns_of_part.values():
             known |= {
                 column for column in columns if not column.endswith(ANY_PARAMETER)
@@ -491,7 +495,8 @@ def _range_around(
     lower, upper, center = (to_scale(value) for value in (*search_range, mean))
     # A uniform distribution of deviation s is 2 sqrt(3) s wide.
     half_width = math.sqrt(3.0) * deviation * (upper - lower)
-    if parameter.periodic and upper - lower >= FULL_TURN:
+    is_full_turn = parameter.periodic and upper - lower >= FULL_TURN
+    if is_full_turn:  # an angle beyond the bounds is one inside of them
         half_width = min(half_width, FULL_TURN / 2)
         bounds = [center - half_width, center + half_width]
     else:
@@ -570,6 +575,7 @@ def _read_frame(
     units = dict[str, str]()
     surfaces = dict[str, Any]()
     for run, result in done:
+        # kinds of stored rows by the part that they count for; an attack has trials
         row_kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIAL_NAMES)}
         if isinstance(run.config, SweepConfig):
             row_kinds = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -77,7 +77,7 @@ def read_rows(
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
-    draws = None
+    draws = None  # how the rows of a sweep follow from draws
     with Store.open_to_read(folder) as store:
         if summary.command == "sweep":
             draws = workbench.read_units(store, is_sampled=summary.sampler is not None)
@@ -90,7 +90,7 @@ def read_rows(
                 name: stored["value"] for name, stored in row.values.items()
             }
             units |= {name: stored["unit"] for name, stored in row.values.items()}
-            unit = f"{folder.name} {row.kind} {row.id}"
+            unit = f"{folder.name} {row.kind} {row.id}"  # each row by itself
             if row.kind == "sweep" and draws is not None:
                 unit = f"{seed} {draws.find_unit(row.step)}"
             if summary.command == "attack":
@@ -310,7 +310,7 @@ def describe_extremes(
 
     descriptions = []
     for tally in (lowest, highest):
-        n_ties = shares.count(tally.fraction or 0.0) - 1
+        n_ties = shares.count(tally.fraction or 0.0) - 1  # without the tally itself
         ties = ""
         if n_ties:
             plural_ending = "s" if n_ties > 1 else ""
@@ -432,7 +432,7 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     series = [options.names.get(value, value) for value in series_values]
     cells, bin_centers = _count_cells(rows, series_values, options)
     totals = _count_series("all", rows, series_values, options)
-    bars = dict(cells)
+    bars = dict(cells)  # the cells, and the baseline if there is one
 
     text = _describe_cells(cells, series, bin_centers is not None, options)
     text += _describe_series(cells, totals, series, options)
@@ -558,12 +558,13 @@ def _describe_cells(
 
     text = list[str]()
     where = f" where {options.axis_label}" if is_binned else ""
+    has_several_series = len(series) > 1
     for index, name in enumerate(series):
         tallies = [row[index].with_name(row_name) for row_name, row in cells.items()]
         n_known = sum(tally.total > 0 for tally in tallies)
-        if len(series) > 1 and n_known < 2:
+        if has_several_series and n_known < 2:
             continue  # a single row is described by `_describe_series`
-        lowest = f"For {name}, lowest" if len(series) > 1 else "Lowest"
+        lowest = f"For {name}, lowest" if has_several_series else "Lowest"
         text += describe_extremes(
             tallies,
             lowest_prefix=f"{lowest}{where}",
@@ -607,22 +608,32 @@ def _describe_series(
     )
     # one text, so that figures by other columns do not repeat it
     text = [" ".join(sentences)]
-    if not options.wrong or options.series != MODEL_COLUMN:
-        return text
-    for index, name in enumerate(series[1:], start=1):
-        # The mean over rows of the errors divided by those of the first model; rows
-        # in which that has none are left out.
+    if options.wrong and options.series == MODEL_COLUMN:
+        text += _describe_mean_errors(cells, series)
+    return text
+
+
+def _describe_mean_errors(cells: Cells, models: Sequence[str]) -> Iterator[str]:
+    """Yield the mean corruption error (mCE) of each model but the first, in a sentence.
+
+    That is the mean over rows of the model's error divided by the first model's. Rows
+    in which the first model has no errors are left out.
+
+    Args:
+        cells: for each row a tally of errors for each model.
+        models: names of the models.
+    """
+    for index, name in enumerate(models[1:], start=1):
         ratios = []
         for tallies in cells.values():
             if tallies[0].fraction:
                 ratios.append((tallies[index].fraction or 0.0) / tallies[0].fraction)
         if ratios:
             mean = 100.0 * sum(ratios) / len(ratios)
-            text.append(
-                f"Relative to {series[0]}, in AlexNet's place, the mCE of "
+            yield (
+                f"Relative to {models[0]}, in AlexNet's place, the mCE of "
                 f"{name} is {mean:.0f} %."
             )
-    return text
 
 
 def _compare_with_baseline(
@@ -834,7 +845,7 @@ def _draw_lines(
         axes: axes of matplotlib.
         cells: for each bin a tally for each series.
         series: names for the legend.
-        bin_positions: bin positions of the bins along the horizontal axis.
+        bin_positions: positions of the bins along the horizontal axis.
     """
     for index, name in enumerate(series):
         positions = list[float]()
@@ -900,6 +911,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
     Raises:
         InputError: if a part has no rows or other configurations.
     """
+    # without the columns that only other parts have
     renderings = _select_part(rows, options.of[0]).dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(
@@ -1149,6 +1161,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
         )
         gains = _compute_gains(run_rates, rates_by_count)
         if workers > fewest and len(gains):
+            # 100 % if twice the workers give twice the throughput
             efficiency = 100 * gains.median() * fewest / workers
             sentence += (
                 f", {_format_spread(gains)} times as many as "
@@ -1158,8 +1171,8 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     min_runs = min(map(len, rates_by_count.values()))
     if min_runs > 1:
         # The median of the population lies outside the range of n runs only if all n
-        # are on one side of it.
-        # The chance of that is 0.5^n for either side.
+        # are on one side of it. The chance of that is 0.5^n for either side, together
+        # 0.5^(n - 1).
         confidence = 100 * (1 - 0.5 ** (min_runs - 1))
         text.append(
             f"Medians of {min_runs} runs, one of each object, with the lowest and the "

@@ -136,11 +136,10 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     # KIND.PARAMETER:INSTANCE.
     parameter_name, last_colon, last_instance = rest.partition(":")
     kind, first_colon, first_instance = control_name.partition(":")
-    instance_suffix = last_instance or first_instance
     if control_name in instances:
         instance = control_name
     else:
-        instance = families.make_instance_name(kind, instance_suffix)
+        instance = families.make_instance_name(kind, last_instance or first_instance)
     if name in _LISTED_SETTINGS:  # such as "model", which is no control
         raise InputError(
             f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
@@ -156,7 +155,9 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
-    families.check_instance_name(where, instance_suffix, last_colon or first_colon)
+    families.check_instance_name(
+        where, last_instance or first_instance, last_colon or first_colon
+    )
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",

@@ -178,6 +178,7 @@ class Sweep:
                 else:
                     missing = self._find_missing()
                 first_row = missing[0].start if missing else self.n_rows - 1
+                # loaded here, so that its time counts for the stage "setup"
                 self._scenes.load(self._scene_of(first_row))
                 self._evaluate_rows(missing, predictions)
                 worst = self._find_worst(predictions, verify=True)
@@ -490,6 +491,7 @@ class Sweep:
             rows = [self.run.store.read_row(KIND, row_number)]
         row = next(row for row in rows if row is not None and row.step == row_number)
         image, model = divmod(row_number, self.n_models)
+        # the queries of all models about this one image
         _, _, query = self.job.make_queries(range(image, image + 1))[model]
         scene = self._scene_of(row_number)
         worst = WorstConfiguration(
@@ -573,7 +575,8 @@ class Sweep:
         seconds = self.stages.seconds
         verified = worst.verified if worst else None
         formation, gains = self._describe_formation()
-        # Rates are of these rows, and their intervals of the units that they belong to.
+        # Rates are of these rows, and their intervals of the units that they belong to:
+        # of drives, say, since the frames of one are not independent.
         rows = np.flatnonzero(predictions.is_counted)
         right = predictions.is_right[rows]
         units = self.units.find_unit(rows)
@@ -744,11 +747,13 @@ class Sweep:
                 "that a check takes: noise may take part in it."
             )
         for rates in changes:
-            if (
+            # surely less than half of the predictions change, and all should
+            is_blind = (
                 rates.claim == "must_change"
                 and rates.interval is not None
                 and rates.interval[1] < 0.5
-            ):
+            )
+            if is_blind:
                 n_same = rates.configurations - rates.correct
                 yield (
                     f"{rates.model} says the same in {n_same} of "

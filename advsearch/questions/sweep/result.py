@@ -79,6 +79,7 @@ def count_by_unit(
     right_in_unit = sum_per_unit(right, units)
     unit_size = sum_per_unit(np.ones(len(right)), units)
     interval = None
+    # several predictions of one unit don't tell how much units differ
     if len(unit_size) > 1 or len(right) == 1:
         interval = rate_interval(right_in_unit, unit_size)
     outcome_counts = None
@@ -254,6 +255,7 @@ def _compare_pairs(
     """
     clean, adversarial = right
     clean_outcome, adversarial_outcome = outcome
+    # without the p-value
     difference, interval, _ = compare_paired(clean, adversarial, draws)
     return PairedRates(
         model=model,
@@ -498,6 +500,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     tables = list[AxisRow]()
     for name in rows.attrs["units"]:
         values, indices = np.unique(rows[name].astype(object), return_inverse=True)
+        # A single value varies nothing; very many make no table.
         if 1 < len(values) <= MAX_LISTED_VALUES:
             axis = TableAxis(name, "", values.tolist(), indices)
             tables += axis.make_rows(right, rows["unit"])
@@ -505,6 +508,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
         column: _join_names(rows, column)
         for column in ("object", "environment", "model")
     }
+    # fields that the log of 3DB says nothing about: None
     unknown = dict.fromkeys(
         ("image_formation", "cells", "worst", "sampler", "renders_per_second")
     )

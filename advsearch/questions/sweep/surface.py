@@ -204,9 +204,10 @@ def _permutation_p_value(
     )
     statistic = _likelihood_ratio(k, n, failures, images)
     n_permutations = len(max_statistics)
-    # 1e-9: equal statistics may differ by rounding.
-    # permutations whose largest statistic is at least that of the part
-    n_above = n_permutations - np.searchsorted(max_statistics, statistic - 1e-9)
+    # permutations whose largest statistic is at least that of the part, except for
+    # rounding
+    tolerance = 1e-9
+    n_above = n_permutations - np.searchsorted(max_statistics, statistic - tolerance)
     return np.asarray((1 + n_above) / (1 + n_permutations))
 
 
@@ -415,7 +416,7 @@ def map_surface(
         What the summary says.
     """
     job = scenes.job
-    wrong = _read_wrong(scenes, rows)
+    wrong = _read_wrong(scenes, rows)  # (scenes, images, models)
     assets = {
         named_scene.object: named_scene.scene.description.object
         for named_scene in job.scenes
