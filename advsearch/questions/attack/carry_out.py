@@ -507,18 +507,9 @@ def _bind_task(
         member_facts = scene_facts
         if ensemble is not None:
             member_facts = ensemble.select_facts(member, scene_facts)
-        judging.check_truth(
-            member, network, parts.scene, member_facts, config.image_settings
+        member = _prepare_task(
+            parts, member, network, member_facts, is_calibrated=shows
         )
-        if shows:
-            member = judging.calibrate_task(
-                member,
-                network,
-                [parts.scene],
-                config.label,
-                config.judge,
-                config.image_settings,
-            )
         member_tasks.append(member)
         warnings += [remark for remark in member.remarks if remark not in warnings]
     if ensemble is None:
@@ -575,6 +566,41 @@ def with_evaluation_only(config: AttackConfig) -> AttackConfig:
     if config.policy_name not in POLICIES:
         changes["policy"] = AttackConfig.model_fields["policy"].default
     return config.model_copy(update=changes)
+
+
+def _prepare_task(
+    parts: AttackParts,
+    task: Task,
+    model: Model,
+    scene_facts: Facts,
+    *,
+    is_calibrated: bool,
+) -> Task:
+    """Check that a model can be right about the scene, and calibrate its task.
+
+    Args:
+        parts: the parts of the attack.
+        task: task of the model.
+        model: the model, or one member of an ensemble.
+        scene_facts: ground truth of the clean scene.
+        is_calibrated: whether the task is calibrated, for which a clean image may be
+            rendered; else it is only checked.
+
+    Raises:
+        InputError: no prediction of the model would be right.
+    """
+    config = parts.config
+    judging.check_truth(task, model, parts.scene, scene_facts, config.image_settings)
+    if not is_calibrated:
+        return task
+    return judging.calibrate_task(
+        task,
+        model,
+        [parts.scene],
+        config.label,
+        config.judge,
+        config.image_settings,
+    )
 
 
 def open_executor(

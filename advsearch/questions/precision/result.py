@@ -543,18 +543,7 @@ def _draw_errors(
     _draw_theory(axes, points)
     _plain_axis(axes.xaxis)
     _plain_axis(axes.yaxis)
-    goal = result.goal * PERCENT
-    (lower, upper) = axes.get_ylim()
-    if lower < goal < upper:
-        axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
-        axes.annotate(
-            f"{goal:g} %",
-            (1.0, goal),
-            xycoords=("axes fraction", "data"),
-            ha="right",
-            va="bottom",
-            fontsize=8,
-        )
+    _draw_goal(axes, result.goal * PERCENT)
     axes.grid(True, which="major")
     axes.legend(
         loc="upper left",
@@ -573,6 +562,21 @@ def _make_label(name: str, slope: PrecisionSlope | None) -> str:
         return name
     theory = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
     return f"{name}  {slope.slope:.2f}{theory}".replace(" -", f" {MINUS}")
+
+
+def _draw_goal(axes: Any, goal: float) -> None:
+    """Draw a dotted line at the error that is the goal, in percent, if it is in view."""
+    lower, upper = axes.get_ylim()
+    if lower < goal < upper:
+        axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
+        axes.annotate(
+            f"{goal:g} %",
+            (1.0, goal),
+            xycoords=("axes fraction", "data"),
+            ha="right",
+            va="bottom",
+            fontsize=8,
+        )
 
 
 def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:

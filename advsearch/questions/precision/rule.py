@@ -294,18 +294,6 @@ def fit_line(
     # two degrees of freedom are used up by slope and offset
     quantile = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0))
     half_width = quantile * float(line.stderr)
-    difference = slope - MONTE_CARLO_SLOPE
-    if not or_steeper:
-        difference = abs(difference)
-    agrees: bool | None = False
-    if difference <= SLOPE_TOLERANCE:
-        agrees = True
-    elif difference <= half_width:
-        agrees = None
-    theory: float | None = MONTE_CARLO_SLOPE
-    if or_steeper is None:
-        theory = None
-        agrees = None
     return PrecisionSlope(
         quantity=known[0].quantity,
         control=known[0].control,
@@ -314,10 +302,32 @@ def fit_line(
         interval=(slope - half_width, slope + half_width),
         offset=float(line.intercept),
         points=len(known),
-        theory=theory,
+        theory=None if or_steeper is None else MONTE_CARLO_SLOPE,
         or_steeper=bool(or_steeper),
-        agrees=agrees,
+        agrees=_agrees_with_theory(slope, half_width, or_steeper),
     )
+
+
+def _agrees_with_theory(
+    slope: float, half_width: float, or_steeper: bool | None
+) -> bool | None:
+    """Return whether a slope is that of theory; None if that is not known.
+
+    Args:
+        slope: slope of log error against log samples.
+        half_width: half the width of its interval.
+        or_steeper: whether a steeper slope agrees, too; None if theory says nothing.
+    """
+    if or_steeper is None:
+        return None
+    difference = slope - MONTE_CARLO_SLOPE  # negative if steeper
+    if not or_steeper:
+        difference = abs(difference)
+    if difference <= SLOPE_TOLERANCE:
+        return True
+    if difference <= half_width:  # noise may be the reason
+        return None
+    return False
 
 
 def describe_disagreement(
@@ -406,11 +416,7 @@ def recommend_count(
     if explaining_line:
         error = _error_on_line(explaining_line, spp)
     else:
-        slope = MONTE_CARLO_SLOPE
-        if line:
-            slope = max(line.slope, MIN_EXTRAPOLATED_SLOPE)
-        errors = [point.rms for point in ordered]
-        error = _interpolate_value(ordered, spp, errors, slope)
+        error = _interpolate_error(ordered, spp, line)
     seconds = [point.seconds for point in ordered]
     return Recommended(
         quantity=ordered[0].quantity,
@@ -467,6 +473,24 @@ def _solve_line(
     if samples <= MAX_EXTRAPOLATION * largest:
         return samples, "extrapolated"
     return None, "extrapolated"
+
+
+def _interpolate_error(
+    ordered: Sequence[PrecisionPoint], spp: int, line: PrecisionSlope | None
+) -> float:
+    """Return the error at a sample count, interpolated between points.
+
+    Args:
+        ordered: points by ascending samples.
+        spp: the sample count.
+        line: fitted line, whose slope the error follows beyond the last point; None
+            follows theory.
+    """
+    slope = MONTE_CARLO_SLOPE
+    if line:
+        slope = max(line.slope, MIN_EXTRAPOLATED_SLOPE)
+    errors = [point.rms for point in ordered]
+    return _interpolate_value(ordered, spp, errors, slope)
 
 
 def confirm_recommendation(

@@ -213,7 +213,7 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
         photographs = workbench.load_photographs()
         for run in photographed:
             directory = Path(config.photographs) / Path(run.config.object).stem
-            # only a check: raises if a file cannot be used
+            # only a check: raises if the task cannot evaluate a photograph
             photographs.list_files(directory, run.config.task)
     for figure in recipe.figures:
         kind, _ = read_figure_options(figure, config.recipe)

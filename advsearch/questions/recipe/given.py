@@ -818,6 +818,19 @@ def _draw_panel(
             linewidth=0,
         )
     )
+    _draw_outline(axes, names)
+    axes.set_title(label, fontsize=9, loc="center", pad=14)
+    # room for the names of the ingredients around the triangle
+    axes.set(xlim=(-0.12, 1.12), ylim=(-0.14, 1.0), aspect="equal")
+    axes.axis("off")
+    return triangles
+
+
+def _draw_outline(axes: Any, names: Sequence[str]) -> None:
+    """Draw the triangle of all mixtures, with the name of an ingredient at each corner.
+
+    A corner is the mixture that is that ingredient alone.
+    """
     pure = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     outline = [_to_plane(mixture) for mixture in pure]
     closed_outline = np.array([*outline, outline[0]])
@@ -833,10 +846,6 @@ def _draw_panel(
             va="top" if is_base else "bottom",
             fontsize=8,
         )
-    axes.set_title(label, fontsize=9, loc="center", pad=14)
-    axes.set(xlim=(-0.12, 1.12), ylim=(-0.14, 1.0), aspect="equal")
-    axes.axis("off")
-    return triangles
 
 
 def _to_plane(mixture: Mixture) -> tuple[float, float]:

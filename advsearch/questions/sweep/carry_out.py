@@ -306,6 +306,7 @@ def _describe_scenes(
         values = dict.fromkeys(getattr(scene, name) for scene in loaded)
         settings[name] = ",".join(values)
     if len(loaded) > 1:
+        # These differ between scenes, and no setting states several of them.
         settings |= {"size": None, "set": {}}
     return settings
 
@@ -421,7 +422,8 @@ def _find_resumable(config: SweepConfig) -> Path | None:
     if config.overwrite or not is_run(path) or not config_file.is_file():
         return None
     stored = SweepConfig.from_yaml(config_file, config.session_settings)
-    if stored.to_json() != config.make_repeatable().to_json() or is_finished(path):
+    has_same_settings = stored.to_json() == config.make_repeatable().to_json()
+    if not has_same_settings or is_finished(path):
         return None
     return path
 
@@ -725,12 +727,18 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
     Args:
         config: settings of the sweep.
     """
+    return expand_photographs(config, _load_named_scenes(config))
+
+
+def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
+    """Load the scenes of a configuration, each in its first photograph, if any.
+
+    See `load_scenes` for which these are.
+    """
     session_scene: Scene | None = config.python_object(naming.SCENE, config.object)
     if session_scene is not None:  # passed by a Python caller
         environment = session_scene.description.environment_name
-        return expand_photographs(
-            config, [NamedScene(config.object, environment, session_scene)]
-        )
+        return [NamedScene(config.object, environment, session_scene)]
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
     first_environment = environments[0] if config.environment else None
@@ -739,29 +747,21 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
         for name in objects
     }
     if first_environment is None:
-        return expand_photographs(
-            config,
-            [
-                NamedScene(name, scene.description.environment_name, scene)
-                for name, scene in scenes.items()
-            ],
-        )
+        return [
+            NamedScene(name, scene.description.environment_name, scene)
+            for name, scene in scenes.items()
+        ]
     first_scene = scenes[objects[0]].description
     # Environments are loaded once, with the first object, and given to all others.
     maps = {first_environment: first_scene.environment}
     for name in environments[1:]:
         scene = load_scene(first_scene.object, name)
         maps[name] = scene.description.environment
-    return expand_photographs(
-        config,
-        [
-            NamedScene(
-                name, environment, scenes[name].with_environment(maps[environment])
-            )
-            for name in objects
-            for environment in maps
-        ],
-    )
+    return [
+        NamedScene(name, environment, scenes[name].with_environment(maps[environment]))
+        for name in objects
+        for environment in maps
+    ]
 
 
 def expand_photographs(

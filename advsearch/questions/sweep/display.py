@@ -743,20 +743,32 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
             ("identity switches", tracks.switches, "", ""),
             ("longest gap of its track", tracks.longest_gap, " s", ""),
         ]
-    rows = []
-    for name, value, unit, remark in rates:
-        if value is None:
-            continue
-        # fractions are shown in percent
-        factor = 100.0 if unit == " %" else 1.0
-        interval = "-"
-        if value.interval:
-            low, high = value.interval
-            interval = f"{low * factor:.3g} to {high * factor:.3g}{unit}"
-        mean = f"{value.mean * factor:.3g}{unit}{remark}"
-        worst = f"{value.worst * factor:.3g}{unit}"
-        rows.append((name, mean, interval, worst))
-    return rows
+    return [
+        _format_drive_row(name, value, unit, remark)
+        for name, value, unit, remark in rates
+        if value is not None
+    ]
+
+
+def _format_drive_row(
+    name: str, value: OverDrives, unit: str, remark: str
+) -> tuple[str, str, str, str]:
+    """Return the texts of a rate over drives: name, mean, interval and worst drive.
+
+    Args:
+        name: name of the rate.
+        value: the rate; a dash stands for an interval that it lacks.
+        unit: unit with a space before it; fractions of the unit " %" become percent.
+        remark: remark on the mean, after it.
+    """
+    factor = 100.0 if unit == " %" else 1.0
+    interval = "-"
+    if value.interval:
+        low, high = value.interval
+        interval = f"{low * factor:.3g} to {high * factor:.3g}{unit}"
+    mean = f"{value.mean * factor:.3g}{unit}{remark}"
+    worst = f"{value.worst * factor:.3g}{unit}"
+    return name, mean, interval, worst
 
 
 def surface_sentences(surface: SurfaceMap) -> list[str]:
@@ -988,15 +1000,7 @@ def distance_sentence(estimate: DetectionDistance) -> str:
     farthest = f"{estimate.distances[-1]:.3g} {unit}"
     if not estimate.is_monotone:
         # The dips come first: the estimate is only about what is beyond them.
-        if distance is not None:
-            beyond = f"Beyond that the share falls below a half at {distance} {unit}"
-        elif estimate.is_above_half:
-            beyond = (
-                "Beyond that it is right in at least half of the pictures, up to "
-                f"{farthest}"
-            )
-        else:
-            beyond = "Beyond that it is right in less than half of the pictures"
+        beyond = _clause_beyond_dips(estimate, distance, farthest, unit)
         return " ".join(filter(None, [*dips, f"{beyond}; {interval}.", loose]))
     if distance is not None:
         sentence = f"Seen from {distance} {unit} in half of the pictures, {interval}."
@@ -1011,6 +1015,27 @@ def distance_sentence(estimate: DetectionDistance) -> str:
             f"{unit}; {interval}."
         )
     return " ".join(filter(None, [sentence, *dips, loose]))
+
+
+def _clause_beyond_dips(
+    estimate: DetectionDistance, distance: str | None, farthest: str, unit: str
+) -> str:
+    """Return how often the model is right beyond the last dip of its detections.
+
+    Args:
+        estimate: estimate of the detection distance.
+        distance: the estimated distance; None if it is not among the measured ones.
+        farthest: the farthest distance that was measured, with its unit.
+        unit: unit of the distance.
+    """
+    if distance is not None:
+        return f"Beyond that the share falls below a half at {distance} {unit}"
+    if estimate.is_above_half:
+        return (
+            "Beyond that it is right in at least half of the pictures, up to "
+            f"{farthest}"
+        )
+    return "Beyond that it is right in less than half of the pictures"
 
 
 def _interval_clause(estimate: DetectionDistance, unit: str) -> str:

@@ -699,12 +699,7 @@ class SweptScene:
             if change == WITHOUT_OBJECT:
                 changed_images = self._render_empty(size, queries)
             else:
-                changed_images = torch.stack(
-                    [
-                        change_image(image, change, problem.model.cameras)
-                        for image in images
-                    ]
-                )
+                changed_images = _change_images(images, change, problem.model.cameras)
             changed_judgements = problem.judge_images(
                 changed_images, configurations, values
             )
@@ -823,6 +818,17 @@ class SceneLoader:
                 f"task {self.job.config.task_name}: features are read of classifiers"
             )
         return features_of(self.job.models[0])
+
+
+def _change_images(images: Tensor, change: str, n_cameras: int) -> Tensor:
+    """Apply a change, such as "black", to each of several images (n, H, W, 3).
+
+    Args:
+        images: the images, each of all cameras side by side.
+        change: name of the change.
+        n_cameras: number of cameras; the image of each is changed by itself.
+    """
+    return torch.stack([change_image(image, change, n_cameras) for image in images])
 
 
 def verify_worst(

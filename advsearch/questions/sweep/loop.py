@@ -20,7 +20,7 @@ from torch import Tensor
 
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.domain import split_into_batches
-from advsearch.cluster import InProcess, Workers
+from advsearch.cluster import BatchResult, InProcess, Workers
 from advsearch.engine.journal import (
     Journal,
     ParallelEvaluator,
@@ -233,17 +233,8 @@ class Sweep:
         self.stages.progress.advance(self.n_rows - sum(map(len, missing)))
         self._sweep_begin = time.monotonic()
         for done in self._executor.compute(self._make_batches(missing)):
-            queries = [query for *_, query in done.items]
-            if done.lost:
-                evaluations = [
-                    make_lost_evaluation(query, done.lost) for query in queries
-                ]
-            else:
-                evaluations = done.value
-            evaluations = [
-                replace(evaluation, machine=done.machine) for evaluation in evaluations
-            ]
-            evaluated = list(zip(queries, evaluations, strict=True))
+            evaluated = _pair_evaluations(done)
+            queries = [query for query, _ in evaluated]
             self._save_images(evaluated)
             self._add_costs(self.journal.store(evaluated, id_is_number=True))
             # Models of one size share an image, which counts for the first of them.
@@ -253,8 +244,9 @@ class Sweep:
             )
             scene = self._scene_of(queries[0].index)
             # What concerns a batch stands in its last evaluation.
-            self._transport[done.worker, scene] = evaluations[-1].light or []
-            if any(evaluation.non_finite for evaluation in evaluations):
+            _, last_evaluation = evaluated[-1]
+            self._transport[done.worker, scene] = last_evaluation.light or []
+            if any(evaluation.non_finite for _, evaluation in evaluated):
                 self._note_non_finite()
             for query, evaluation in evaluated:
                 predictions.add(query.index, evaluation.required_judgement)
@@ -802,6 +794,22 @@ class Sweep:
 def _get_names(items: Iterable[Any]) -> list[str]:
     """Return the names of models or controls."""
     return [item.name for item in items]
+
+
+def _pair_evaluations(done: BatchResult) -> list[tuple[Query, Evaluation]]:
+    """Return the queries of a batch with their evaluations.
+
+    Evaluations state the machine that made them. If the worker of the batch died, they
+    state that the evaluation is lost.
+    """
+    queries = [query for *_, query in done.items]
+    evaluations = done.value
+    if done.lost:
+        evaluations = [make_lost_evaluation(query, done.lost) for query in queries]
+    return [
+        (query, replace(evaluation, machine=done.machine))
+        for query, evaluation in zip(queries, evaluations, strict=True)
+    ]
 
 
 def _make_axis_rows(
