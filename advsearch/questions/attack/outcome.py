@@ -222,7 +222,7 @@ def _summarize(
     """Return what `summary.json` holds.
 
     Args:
-        findings: what the attack found.
+        findings: findings of the attack.
         journal: journal of the run.
         clean: image of the clean scene.
         adversarial: image of the adversarial scene.
@@ -367,9 +367,9 @@ def _ambient_light(findings: RunState) -> AmbientLight | None:
         )
         for lux, verification in sorted(findings.ambient_verifications.items())
     ]
-    # The first point is the scene's own light, in which the scene was verified.
+    # The first point is the scene's own light, in which the scene was verified. Points
+    # count up to the first that does not hold, whatever holds beyond it.
     n_holding = 0
-    # What holds beyond the first light in which it does not is not counted.
     while n_holding < len(points) and points[n_holding].holds:
         n_holding += 1
     return AmbientLight(
@@ -756,9 +756,9 @@ def _describe_failure(
 
     Args:
         problem: problem of the attack.
-        failure: as the search found it.
+        failure: the failure, as the search found it.
         number: number in the list.
-        verification: None if it was not tried.
+        verification: verification of the failure; None if it was not tried.
     """
     configuration = {
         name: DescribedValue.of(value)

@@ -250,8 +250,8 @@ def _find_python_only(
 
     Args:
         config: the settings.
-        scene: loaded.
-        model: as the caller passed it, and so on.
+        scene: the loaded scene.
+        model: model as the caller passed it; so are the others.
         task: task of the model.
         objective: objective of the search.
         policy: policy of the search.
@@ -286,7 +286,7 @@ def _load_scene(
     """Return a scene, loaded with the options that belong to it.
 
     Args:
-        scene: loaded, a file, a name, or a dictionary of Mitsuba.
+        scene: loaded scene, a file, a name, or a dictionary of Mitsuba.
         shape: its object, if it has several.
         options: options of the attack.
     """

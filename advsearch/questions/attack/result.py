@@ -405,10 +405,10 @@ def save_images(
     and an animation of the search that ends with the adversarial scene.
 
     Args:
-        run: where they are saved.
+        run: run directory into which they are saved.
         problem: problem of the attack.
         findings: findings of the attack.
-        scene_images: those of the scenes, `clean` and `adversarial`.
+        scene_images: images of both scenes, by `clean` and `adversarial`.
     """
     for name, image in scene_images.items():
         _save_scene_image(run, problem, name, image)
@@ -468,7 +468,7 @@ def save_trial(
     """Save the image of a trial, and the same with marks.
 
     Args:
-        run: where it is saved.
+        run: run directory into which it is saved.
         problem: problem of the attack.
         findings: findings of the attack; an image that it does not have is rendered
             again.
@@ -502,7 +502,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     are simplified, so that all together have `MAX_FACES` at most, which a note says.
 
     Args:
-        run: where it is written.
+        run: run directory into which it is written.
         problem: problem of the attack.
         u: (d,) the adversarial configuration.
     """
@@ -596,7 +596,7 @@ def evaluate_drive(
         problem: problem of the attack.
         u: (d,) the adversarial configuration; None evaluates the clean scene only.
         spp: samples per pixel.
-        run: where the images are saved; None saves none.
+        run: run directory for the images; None saves none.
 
     Returns:
         How many frames are right; None if no path varies.
@@ -711,7 +711,7 @@ def save_drive(
     """Save frames as an animation, NAME.webp, and some side by side, NAME.png.
 
     Args:
-        run: where they are saved.
+        run: run directory into which they are saved.
         name: name of the files.
         images: (h, w, 3) in sRGB.
         seconds: seconds from the first frame to the last.

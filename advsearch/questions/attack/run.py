@@ -250,7 +250,7 @@ def search_and_verify(
         ladder: samples per pixel that a verification may take.
         specialise: whether what the search does not need may be left out, and images be
             predicted.
-        measure: which gradient estimators are measured.
+        measure: choice of the gradient estimators that are measured.
         deterministic: whether counts decide instead of times.
         chooses_spp: whether a full measurement may choose the samples per pixel of the
             search.
@@ -362,7 +362,7 @@ def choose_policy(
 
     Args:
         policy: the requested one.
-        problem: is searched.
+        problem: problem that is searched.
         gradient_setting: the setting that concerns derivatives; None if none does.
 
     Raises:

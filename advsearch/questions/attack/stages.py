@@ -91,11 +91,11 @@ def plan_renders(
     same.
 
     Args:
-        policy: what searches; only one that uses gradients has them measured.
+        policy: policy of the search; only for one with gradients they are measured.
         journal: journal of the run.
         stages: reports what is measured.
         specialise: whether what the search does not need may be left out.
-        measure: which gradient estimators are measured.
+        measure: choice of the gradient estimators that are measured.
         deterministic: whether counts decide instead of times.
         chooses_spp: whether a full measurement may choose the samples per pixel.
     """
@@ -238,9 +238,8 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     if was_right_once and not in_any_case:
         return False
     verifier.choose_spp({"clean": problem.domain.start})
-    verifier.begin_stage(
-        "checking the clean scene with fresh renders", verifier.looks[0]
-    )
+    min_trials = verifier.looks[0]  # the first look decides, or more trials follow
+    verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
     verifier.try_clean()
     return problem.rule.is_already_wrong(
         count_right(findings.clean_trials, findings.spp)
@@ -264,7 +263,7 @@ def choose_predictor(
     stored in `findings` and reported.
 
     Args:
-        policy: what searches.
+        policy: policy of the search.
         journal: journal of the run.
         stages: reports the preparation.
         findings: findings of the attack.
@@ -363,7 +362,7 @@ class Searches:
     Attributes:
         journal: replays stored evaluations, and stores the others.
         stages: reports the progress.
-        findings: so far; their `predictor` predicts images.
+        findings: findings so far; their `predictor` predicts images.
         printable: whether objectives include print terms.
         close_looks: further renders of candidates that are close to the best, at most.
     """
@@ -385,7 +384,7 @@ class Searches:
             name: name of the stage.
             title: title for the progress.
             steps: steps of the search.
-            shorter: which settings shorten it.
+            shorter: sentence about the settings that shorten it.
         """
         n_renders = count_planned_renders(steps, max_extra_repeats=self.close_looks)
         samples = format_count(self.problem.spp, "sample")

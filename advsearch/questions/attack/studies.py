@@ -74,7 +74,7 @@ class StudyAttack:
     """One attack of a study.
 
     Attributes:
-        config: its settings.
+        config: settings of the attack.
         name: name of its directory.
         subject: the object or the model that tells it from the others.
         epsilon: epsilon of a curve; None otherwise.
@@ -540,9 +540,9 @@ def _try_on_models(
         names: names of the models.
         spp: samples per pixel of the trials.
         configurations: (d,) the adversarial ones, by the model that was attacked.
-        models: is filled: what each model predicts of the clean scene.
-        cells: is filled: what each model predicts of an adversarial scene, by the model
-            that was attacked. What is done before an interrupt stays.
+        models: list to fill with what each model predicts of the clean scene.
+        cells: mapping to fill with what each model predicts of an adversarial scene, by
+            the model that was attacked. What is done before an interrupt stays.
     """
     config = study.context.config
     study.progress.stage("loading the models to try the scenes on")

@@ -315,8 +315,8 @@ def _error_clause(
     Args:
         summary: summary of the attack.
         verified: the rate of the trials.
-        thing: what is evaluated.
-        claim: what a trial counts as.
+        thing: the object that is evaluated, as "this mug".
+        claim: clause for what a trial counts as, "the model is wrong about it" say.
     """
     labels = verified.labels
     if summary.task == words.COMMAND and not summary.target and len(labels) == 1:
@@ -359,7 +359,7 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
 
     Args:
         summary: summary of the attack.
-        thing: what is evaluated.
+        thing: the object that is evaluated, as "this mug".
     """
     target = summary.target or []
     target_names = " or ".join(target)

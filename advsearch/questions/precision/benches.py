@@ -423,7 +423,7 @@ class GradientPart:
 
     Attributes:
         name: name of the control, with the parameters if a control has several parts.
-        groups: which have the coordinates.
+        groups: groups of the coordinates.
         estimators: estimators that are valid for all of them.
     """
 

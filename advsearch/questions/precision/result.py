@@ -361,11 +361,9 @@ def describe_recommendation(recommendation: Recommended, goal: float) -> str:
             f"{goal_text}: not reached by anything that was measured; give it more "
             "`seconds` or a larger `error`"
         )
-    basis = (
-        ""
-        if recommendation.basis in ("interpolated", "fitted")
-        else f" ({recommendation.basis})"
-    )
+    # Only the exceptions are named, such as "extrapolated".
+    is_usual = recommendation.basis in ("interpolated", "fitted")
+    basis = "" if is_usual else f" ({recommendation.basis})"
     return (
         f"{goal_text}: {recommendation.estimator}, {recommendation.spp} samples, "
         f"{recommendation.seconds:.2g} s{basis}"

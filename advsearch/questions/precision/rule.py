@@ -184,7 +184,7 @@ def summarize_samples(
     measurement and heavy tails have none.
 
     Args:
-        setting: which was measured.
+        setting: the setting that was measured.
         samples: the measurements, each with its relative "error", and with "cosine" and
             times if they are known.
         reference_error: relative error of what they were compared with.
@@ -367,8 +367,11 @@ def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
         for a, b in pairwise(known)
         if b.spp > a.spp
     ]
+    if len(slopes) < 2:
+        return False
     # Slopes are negative: the steepest is the smallest.
-    return len(slopes) >= 2 and slopes[-1] > 0.5 * min(*slopes[:-1], 0.0)
+    steepest_before = min(*slopes[:-1], 0.0)
+    return slopes[-1] > 0.5 * steepest_before
 
 
 def round_up_exactly(point: PrecisionPoint, samples: float) -> int:

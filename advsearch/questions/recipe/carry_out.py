@@ -263,7 +263,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
 
     Args:
         config: the settings of the run.
-        search: those of the search; None of a run that samples around none.
+        search: settings of the search; None of a run that samples around none.
     """
     if search is None and isinstance(config, SweepConfig):
         return workbench.row_parameters(config)
@@ -512,7 +512,7 @@ def _add_photographs(
     """Add photographs to the runs that they are compared with.
 
     Args:
-        folder: has a directory of photographs for each object, of its name.
+        folder: folder with a directory of photographs for each object, of its name.
         runs: the runs to add them to.
         run: the run of the recipe.
 

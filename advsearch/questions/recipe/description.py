@@ -252,7 +252,7 @@ class PlannedRun:
     Attributes:
         name: name of its directory.
         part: part of the recipe.
-        config: its settings.
+        config: settings of the run.
         around: the directory of the run whose result it samples around; None of others.
     """
 

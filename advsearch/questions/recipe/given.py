@@ -338,8 +338,8 @@ def _collect_labels(
 
     Args:
         labels_of_pair: predictions by (shape, texture).
-        shape: which the first have, with other textures.
-        texture: which the second have, with other shapes.
+        shape: shape of the first predictions, with other textures.
+        texture: texture of the second predictions, with other shapes.
     """
     same_shape = list[str]()
     same_texture = list[str]()

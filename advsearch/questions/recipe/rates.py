@@ -294,7 +294,7 @@ def describe_extremes(
         lowest_prefix: beginning of the sentence about the lowest, such as "Lowest".
         highest_prefix: beginning of the part about the highest.
         things: plural of what the tallies are of.
-        verb: what is counted.
+        verb: word for what is counted, "right" or "wrong" say.
     """
     known = [tally for tally in fractions if tally.total]
     if len(known) < 2:
@@ -590,7 +590,7 @@ def _describe_series(
     Args:
         cells: for each row a tally for each series.
         totals: totals of each series over all rows.
-        series: their names.
+        series: names of the series.
         options: options of the figure.
     """
     if not options.series or len(series) < 2:
@@ -651,8 +651,8 @@ def _compare_with_baseline(
         name: name of the part.
         tallies: tallies of the part, for each series.
         totals: totals of the others, for each series.
-        series: their names.
-        verb: what is counted.
+        series: names of the series.
+        verb: word for what is counted, "right" or "wrong" say.
     """
     text = []
     for series_name, tally, total in zip(series, tallies, totals, strict=True):
@@ -978,8 +978,8 @@ def _add_agreement(
     Args:
         bars: tallies by object, or `ALL_OBJECTS`; each gets one more.
         pairs: pairs of renderings and other images.
-        table: which gets a row for each object.
-        series_name: what the other images are.
+        table: rows of the table, to which one for each object is added.
+        series_name: name of the other images.
     """
     for name, tallies in bars.items():
         object_pairs = pairs
@@ -1075,7 +1075,8 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 def _describe_where(right: bool, pairs: Rows) -> str:
     """Describe how often both predictions are right, or wrong, if the first one is.
 
-    The first is about the rendering, the second about the other image of a pair.
+    The first is about the rendering, the second about the other image of a pair. "It"
+    in the sentence is the model, of which the sentence before speaks.
 
     Args:
         right: whether the first is right.

@@ -64,7 +64,7 @@ class Axis:
     Attributes:
         control: kind of the control.
         instance: name of the control; that of its kind unless it has another.
-        parameter: what varies.
+        parameter: the parameter that varies.
         values: numbers or names.
     """
 
@@ -127,7 +127,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
 
     Args:
         name: name of the parameter, as the user wrote it.
-        values: values of it.
+        values: values of the parameter.
         instances: the sampled controls by name.
     """
     where = f"`grid` {name}"
@@ -263,7 +263,7 @@ def parse_axis_values(
 
     Args:
         where: how messages name the axis.
-        parameter: what varies.
+        parameter: the parameter that varies.
         raw_values: a string, a value, or a list.
 
     Raises:
@@ -396,9 +396,9 @@ def add_grid_axes(
     only in the grid stay as the scene has them.
 
     Args:
-        controls: the sampled ones.
+        controls: controls that are sampled.
         axes: axes of the grid.
-        scene: which decides the default ranges of a control.
+        scene: the scene, which decides the default ranges of a control.
     """
     control_by_name = {control.name: control for control in controls}
     for instance in dict.fromkeys(axis.instance for axis in axes):
@@ -418,9 +418,11 @@ def add_grid_axes(
 
 def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, object]:
     """Return the settings of a sampled control, with its default ranges spelled out."""
-    settings = control.to_settings()
+    # Kind and name are no parameters: the class and the instance state them.
     settings = {
-        name: value for name, value in settings.items() if name not in ("kind", "name")
+        name: value
+        for name, value in control.to_settings().items()
+        if name not in ("kind", "name")
     }
     if control.has_requested_search:
         # Ranges were set, so that its other parameters have no default range.

@@ -292,8 +292,8 @@ def _describe_scenes(
     """Return the settings that describe the scenes.
 
     Args:
-        scenes: as they were passed.
-        loaded: those that are loaded: all of them or none.
+        scenes: scenes as the caller passed them.
+        loaded: the loaded ones: all of them or none.
     """
     if not loaded:
         names = [
@@ -382,8 +382,8 @@ def _run_config(
 
     Args:
         config: the settings.
-        scenes: those that are loaded; empty to load the ones that the settings name.
-        models: as the caller passed them; so are all others.
+        scenes: loaded scenes; empty to load the ones that the settings name.
+        models: models as the caller passed them; so are all others.
     """
     resumed = _find_resumable(config)
     if config.run is not None and resumed is None:
@@ -574,7 +574,7 @@ def _make_job(
         named_scenes: the clean scenes.
         models: names, files or modules.
         task: task of all models.
-        controls: which are sampled.
+        controls: controls that are sampled.
 
     Raises:
         InputError: something in the settings does not fit together.

@@ -315,7 +315,7 @@ def _text_sections(
 
     Args:
         summary: summary of the sweep.
-        axes: axes from `_group_axes`.
+        axes: rows of each axis by its name, from `_group_axes`.
     """
     if summary.beside is not None and summary.ending != INTERRUPTED:
         for pair in summary.beside.pairs:
@@ -351,8 +351,8 @@ def _arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
 
     Args:
         answer: name of the adversarial run.
-        pair: pair of the model.
-        task: its name.
+        pair: counts of the model in both arms.
+        task: name of the task.
     """
     arms = (("clean", pair.clean), (answer, pair.answer))
     has_outcomes = any(counts.outcomes for _, counts in arms)
@@ -403,7 +403,7 @@ def _page_parts(
 
     Args:
         summary: summary of the sweep.
-        axes: axes from `_group_axes`.
+        axes: rows of each axis by its name, from `_group_axes`.
     """
     distance = find_detection_distance(summary)
     if distance:
@@ -620,8 +620,8 @@ def _arm_claims(
 
     Args:
         answer: name of the adversarial run.
-        pair: pair of one model.
-        population: what the rates are over.
+        pair: counts of one model in both arms.
+        population: description of what the rates are over, "points of the grid" say.
         note: a caution about the interval.
     """
     arms = {
@@ -648,7 +648,7 @@ def _accuracy_claims(
 
     Args:
         result: result of the sweep.
-        population: what the rates are over.
+        population: description of what the rates are over, "points of the grid" say.
         note: a caution about the interval.
     """
     # Objects and environments are not sampled.

@@ -63,7 +63,7 @@ def add_frames(
     chooses among them and nothing is sampled, then all are swept.
 
     Args:
-        config: config with a `path`.
+        config: settings with a `path`.
         sampled: the controls that are sampled.
 
     Returns:
@@ -299,9 +299,9 @@ class Drives:
         """Compute the rates of one model over drives.
 
         Args:
-            drives: those with all their frames.
-            model: its index.
-            answer: which scene they have, clean or adversarial, by its name; empty if
+            drives: drives with all their frames.
+            model: index of the model.
+            answer: name of the scene that they have, clean or adversarial; empty if
                 the sweep has no adversarial one.
         """
         n_frames = len(self.times)
@@ -410,7 +410,7 @@ class Drives:
         loose if a track would be on it with less overlap.
 
         Args:
-            model: its index.
+            model: index of the model.
             steps: (n, frames) numbers of the rows.
             drive: (n,) the draw of each drive; drives of one draw differ in noise
                 alone.
@@ -453,7 +453,7 @@ class Drives:
 
         Args:
             scenes: scenes of the sweep.
-            run: where they are written.
+            run: run directory into which they are written.
         """
         all_scenes = [*range(len(self._job.scenes))]
         drives = self._select_complete(all_scenes, 0)

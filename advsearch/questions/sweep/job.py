@@ -51,11 +51,11 @@ class NamedScene:
     """One of the scenes of a sweep.
 
     Attributes:
-        object: its name.
-        environment: its name.
-        scene: as it was loaded.
+        object: name of the object.
+        environment: name of the environment.
+        scene: the loaded scene.
         fixed_controls: controls that do not vary.
-        u: (d,) their configuration; None leaves the scene as it is.
+        u: (d,) the configuration of these; None leaves the scene as it is.
         arm: name of the arm of a comparison without and with the adversarial
             configuration of a run; empty if nothing is compared.
         photograph: name of the photograph of a folder that it is in; empty if it is in
@@ -91,7 +91,7 @@ class Job:
     Attributes:
         config: the settings.
         scenes: the scenes.
-        models: all of which get the same images.
+        models: the models, all of which get the same images.
         tasks: one for each model.
         controls: the sampled ones.
         axes: axes of the grid.
@@ -214,7 +214,7 @@ class Job:
 
         Args:
             number: number of the image in the sweep.
-            model: its index.
+            model: index of the model.
             points: points of the scene.
             u: (d,) the configuration.
             values: values of the controls.
@@ -245,9 +245,9 @@ class Job:
         Parameters of the controls that the scene itself fixes are left out.
 
         Args:
-            scene: its index.
-            model: its index.
-            environment: what lights the scene instead of its own environment.
+            scene: index of the scene.
+            model: index of the model.
+            environment: name of the environment that replaces that of the scene.
             values: values of the controls.
         """
         named_scene = self.scenes[scene]
@@ -456,7 +456,7 @@ def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledN
 
     Args:
         versions: the number in each scene.
-        n_parts: into which its range is cut.
+        n_parts: number of equal parts of its range.
     """
     number = versions[0]
     if all(version.parts == number.parts for version in versions):
@@ -587,7 +587,7 @@ class SweptScene:
             queries: queries of this scene.
             images: images by size, then by the number of the image.
             judgements: judgements by the number of the query.
-            seconds: that each query took.
+            seconds: seconds that each query took.
             wrong_images: numbers of the images in which any model is wrong.
         """
         evaluations = list[Evaluation]()
@@ -652,8 +652,8 @@ class SweptScene:
         """Return an evaluation of the first model with the images that are stored.
 
         Args:
-            evaluation: without them.
-            query: what is evaluated.
+            evaluation: the evaluation without images.
+            query: the query that was evaluated.
             image: image of the query.
             is_wrong: whether the prediction of any model is wrong.
         """
@@ -846,7 +846,7 @@ def verify_worst(
 
     Args:
         problem: problem of its scene and model.
-        config: config of the sweep.
+        config: settings of the sweep.
         u: (d,) the configuration.
         run: None stores nothing.
         stages: stages of the sweep.

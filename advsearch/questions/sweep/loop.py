@@ -226,7 +226,7 @@ class Sweep:
 
         Args:
             missing: numbers of the rows that are not stored yet.
-            predictions: which gets the judgement of each.
+            predictions: predictions so far, to which the judgement of each is added.
         """
         title = "rendering and classifying"
         self.stages.begin("sweep", title, self.n_rows, hint=self._sweep_hint())
@@ -519,7 +519,7 @@ class Sweep:
         """Render the worst configuration again, and save its image.
 
         Args:
-            worst: as the sweep had it.
+            worst: the configuration, as the sweep evaluated it.
             problem: problem of its scene and model.
             u: (d,) the configuration.
         """
@@ -641,6 +641,7 @@ class Sweep:
                     named_scene.scene.description, self.job.image_sizes[0]
                 )
                 names = dict(named_scene.names)
+                # The adversarial scene has the gain of its clean scene.
                 names.pop("answer", None)
                 gains[", ".join(names.values())] = description.gain
         if len(set(gains.values())) != 1:
@@ -755,10 +756,13 @@ class Sweep:
 
     def _drive_remarks(self) -> Iterator[str]:
         """Yield what few drives can show at best."""
+        # of the model with the fewest; enough if no drives are swept
         n_drives = min(
             (rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES
         )
-        if n_drives == 1 and self.units.noise == 1:
+        # repeats of one drive have a remark of their own, from `explain_repeats`
+        is_repeated = self.units.noise > 1
+        if n_drives == 1 and not is_repeated:
             yield "One drive says nothing of others: there is no interval over drives."
         elif 1 < n_drives < ENOUGH_DRIVES:
             lower_bound = max_lower_bound(n_drives)

@@ -130,7 +130,7 @@ def make_sweep_page(
 
     Args:
         runs: directory and summary of each; None without a summary yet.
-        sources: what the explorer reads of each.
+        sources: rows and thumbnails of each, which the explorer reads.
     """
     explored = [
         (source, *run)
@@ -409,7 +409,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
 
     Args:
         runs: run directories.
-        folder: which is written.
+        folder: directory that is written.
 
     Returns:
         The page's path.

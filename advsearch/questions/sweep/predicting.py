@@ -251,6 +251,7 @@ def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> 
     """
     height, width = renderer.formation.resolution
     light_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
+    # a view is traced in two halves to tell its noise, and once as images are
     check_spp = N_VIEWS * (2 * CHECK_SPP + spp)
     fixed_spp = light_samples / (height * width) + check_spp
     return math.ceil(MIN_SAVING_FACTOR * fixed_spp / (spp - PREDICTION_SPP))
@@ -516,7 +517,7 @@ class SweepPredictor:
         too many are cached, the oldest is released.
 
         Args:
-            group: its index.
+            group: index of the group.
             number: number of an image of the group, in the scene.
         """
         if group in self._predictors:

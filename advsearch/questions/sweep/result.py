@@ -117,7 +117,7 @@ def count_independent(
     Args:
         correct: right predictions.
         n_predictions: predictions.
-        interval: by default that of Clopper and Pearson.
+        interval: interval of the accuracy; by default that of Clopper and Pearson.
     """
     if not n_predictions:
         return CountedPredictions(
@@ -213,7 +213,7 @@ class Predictions:
         configuration. Pairs are counted only if both predictions are.
 
         Args:
-            models: their names.
+            models: names of the models.
             units: how rows follow from draws.
 
         Returns:
@@ -248,7 +248,7 @@ def _compare_pairs(
     """Compare the predictions of a model without and with an adversarial scene.
 
     Args:
-        model: its name.
+        model: name of the model.
         right: (2, n) whether each is right, first without.
         outcome: (2, n) indices among `OUTCOMES`.
         draws: (n,) the draw of each pair.
@@ -461,7 +461,7 @@ def import_threedb(
 
     Args:
         folder: folder of 3DB.
-        run: by default ``runs/NAME-3db-NNN``.
+        run: run directory; by default ``runs/NAME-3db-NNN``.
         overwrite: whether another run may be there.
 
     Raises:

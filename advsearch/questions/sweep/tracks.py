@@ -61,7 +61,7 @@ class _Track:
     """A track.
 
     Attributes:
-        number: which stays the same.
+        number: number of the track, which stays the same.
         box: (4,) in the last frame: a detected one, or, where the track was missed, the
             last detected one moved by `missed` times its speed.
         speed: (4,) change of the box per frame.
