@@ -116,7 +116,7 @@ def make_result(
     search = findings.search
     run = journal.run
     stages.progress.stage("making the pictures and the report")
-    u = problem.domain.start
+    u = problem.domain.start  # without a search, both scenes are the clean one
     if search is not None:
         u = problem.domain.project(search.best_u)
     # After Ctrl-C no more images are rendered than needed.
@@ -127,7 +127,7 @@ def make_result(
     if run is not None:
         images = {"clean": clean, "adversarial": adversarial}
         _write_files(run, problem, findings, u, images, artifacts)
-    drive = None
+    drive = None  # both scenes along a path, if one varies by chance
     if not findings.interrupted:
         searched_u = None if search is None else u
         drive = evaluate_drive(problem, searched_u, findings.spp, run)

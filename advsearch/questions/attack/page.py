@@ -219,7 +219,7 @@ def _find_trial_images(images: Path) -> list[Picture]:
     marked_names = [name for name in names if name.endswith(MARKED)]
     pictures = []
     for name in (marked_names or names)[:MAX_TRIAL_IMAGES]:
-        trial = "".join(filter(str.isdigit, name))
+        trial = "".join(filter(str.isdigit, name))  # of "verification-07.png" 07
         pictures.append(Picture(f"images/{name}", f"trial {trial}"))
     return pictures
 

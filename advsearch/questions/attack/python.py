@@ -124,6 +124,7 @@ def attack(
     _check_can_use_workers(scene, model, task, objective, session_controls, options)
     scene = _load_scene(scene, object, options)
 
+    # the settings as `run.yaml` states them
     config = _make_config(
         scene, model, task, controls, objective, policy, over, metrics, run, options
     )
@@ -135,6 +136,7 @@ def attack(
     config = config.with_python_only_parts(python_only)
     _check_single(config)
 
+    # The caller's objects are used, and what is only named is made.
     searched, random_controls = make_attack_controls(config, controls, over)
     if not isinstance(policy, Policy):
         policy = make_policy(config.policy_name, **config.policy_options)

@@ -742,7 +742,7 @@ def select_evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
 
     Args:
         count: count of all frames.
-        max_count: max count of the indices.
+        max_count: maximum number of indices.
     """
     indices = np.linspace(0, count - 1, min(count, max_count)).round()
     return np.unique(indices.astype(np.int64))

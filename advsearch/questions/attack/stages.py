@@ -238,7 +238,7 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     if was_right_once and not in_any_case:
         return False
     verifier.choose_spp({"clean": problem.domain.start})
-    min_trials = verifier.looks[0]  # the first look decides, or more trials follow
+    min_trials = verifier.looks[0]  # after which a verdict is first possible
     verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
     verifier.try_clean()
     return problem.rule.is_already_wrong(

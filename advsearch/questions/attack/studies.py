@@ -341,7 +341,7 @@ def _find_label_warnings(config: AttackConfig) -> list[str]:
     """Return the warnings about a label that several objects share."""
     if config.label is None or len(config.objects) <= 1:
         return []
-    bundled = list_objects()
+    bundled = list_objects()  # objects of files have no label of their own
     labels = {
         name: load_object(name).label if name in bundled else None
         for name in config.objects
@@ -360,6 +360,7 @@ def curve(context: RunContext[AttackConfig]) -> CurveResult:
     """
     study = StudyRun(context)
     rows = [_attack_object(study, chain) for chain in study.chains]
+    # None: each control has its own epsilon
     epsilons: list[float | None] = [*sorted(context.config.epsilons)] or [None]
     points = [_compute_accuracy(rows, epsilon) for epsilon in epsilons]
     return study.make_result(CurveResult, epsilons=epsilons, table=rows, curve=points)

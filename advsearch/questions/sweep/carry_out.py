@@ -158,6 +158,7 @@ def sweep(
             "grid: expected a mapping from parameters to values, got "
             f"{type(grid).__name__}"
         )
+    # What is not passed is as in the attack, if there is one.
     attack_run = _find_attack_run(adversarial_of)
     defaults = _load_defaults(attack_run, scene, grid, controls)
     scenes = _as_list(defaults["object"] if scene is None else scene)
@@ -170,6 +171,7 @@ def sweep(
         task = make_task(task)
     loaded = _name_loaded(scenes)
     set_options = _drop_unset(settings)
+    # The settings as `run.yaml` states them, with names in place of objects.
     described: dict[str, object] = {
         "model": ",".join(get_model_name(network) for network in networks),
         "task": to_setting(task) if isinstance(task, Task) else task,
@@ -183,6 +185,7 @@ def sweep(
         naming.check_no_scene_settings(set_options)
     described |= _describe_scenes(scenes, loaded)
     run_setting = {"run": None if run is None else str(run)}
+    # later ones replace earlier ones
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
     config = config.with_python_only_parts(
         _find_python_only(config, networks, loaded, task, tracker, controls)

@@ -126,6 +126,7 @@ def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
     There are none if it has more axes, or too many values. Axes with listed values go
     before those with parts of a range.
     """
+    # a part of a range is its two bounds
     rows = [row for row in summary.axes if not isinstance(row.value, (list, tuple))]
     rows = rows or summary.axes
     names = {row.axis for row in rows}

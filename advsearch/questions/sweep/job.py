@@ -407,6 +407,7 @@ def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
         (control for control in controls if control.name == axis.instance), None
     )
     if control is None:
+        # any value will do, since the name of the setting does not depend on it
         settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
         control = make_control(axis.instance, settings)
     return control.setting_name(axis.parameter)

@@ -504,7 +504,7 @@ class Sweep:
     def _find_right_labels(self, scene: int, model: int, query: Query) -> list[str]:
         """Return the names that count as right in the image of a query."""
         task = self.job.tasks[model]
-        if task.varies:
+        if task.varies:  # the truth depends on the configuration, as a box does
             problem = self._scenes.load(scene).problems[model]
             truth = problem.find_truth(query.u, query.values)
         else:
@@ -670,6 +670,7 @@ class Sweep:
         transport = [
             summary for summaries in self._transport.values() for summary in summaries
         ]
+        # without a batch in this session, what the loaded scene has
         if not self._transport and self._scenes.scene is not None:
             predictors = self._scenes.scene.predictors.values()
             transport = [predictor.summarize() for predictor in predictors]
