@@ -319,35 +319,52 @@ def _error_clause(
         claim: clause for what a trial counts as, "the model is wrong about it" say.
     """
     labels = verified.labels
-    if summary.task == words.COMMAND and not summary.target and len(labels) == 1:
-        # such as "(steering above it)"
-        direction = next(iter(labels)).replace("action outside its envelope ", "")
-        if direction and not summary.minimises:
-            claim += f" {direction}"
     if summary.minimises or summary.task == words.COMMAND:
+        if not summary.minimises and not summary.target and len(labels) == 1:
+            # such as "(steering above it)"
+            direction = next(iter(labels)).replace("action outside its envelope ", "")
+            claim = f"{claim} {direction}" if direction else claim
         return claim[:1].upper() + claim[1:]
-    outcome = words.get_only_outcome(verified.outcomes)
     if len(labels) == 1:
+        outcome = words.get_only_outcome(verified.outcomes)
         predicts = words.format_mistake(
             summary.task, thing, next(iter(labels)), outcome
         )
         return f"The model {predicts}"
     if labels:
-        error = f"is wrong about {thing}"
-        if summary.target:
-            error = f"takes {thing} for one of the targets"
-        if outcome is None and verified.outcomes:
-            outcomes = words.format_outcomes(verified.outcomes, summary.task)
-            return f"The model {error} ({outcomes})"
-        most_frequent = max(labels, key=lambda label: labels[label])
-        calling = words.format_mistake_participle(summary.task, most_frequent, outcome)
-        return f"The model {error}, most often {calling},"
+        return _mixed_error_clause(summary, verified, thing)
     if summary.task != words.CLASSIFICATION:
         return f"The model is wrong about {thing}"
     name = "something else"
     if summary.adversarial:
         name = words.add_article(summary.adversarial.label)
     return f"The model takes {thing} for something else ({name})"
+
+
+def _mixed_error_clause(
+    summary: AttackSummary, verified: VerifiedRate, thing: str
+) -> str:
+    """Return what the model gets wrong if trials have several predictions.
+
+    That is the most frequent prediction, or the outcomes of a detector if there are
+    several.
+
+    Args:
+        summary: summary of the attack.
+        verified: the rate of the trials, with how often each label was predicted.
+        thing: the object that is evaluated, as "this mug".
+    """
+    error = f"is wrong about {thing}"
+    if summary.target:
+        error = f"takes {thing} for one of the targets"
+    outcome = words.get_only_outcome(verified.outcomes)
+    if outcome is None and verified.outcomes:
+        outcomes = words.format_outcomes(verified.outcomes, summary.task)
+        return f"The model {error} ({outcomes})"
+    labels = verified.labels
+    most_frequent = max(labels, key=lambda label: labels[label])
+    calling = words.format_mistake_participle(summary.task, most_frequent, outcome)
+    return f"The model {error}, most often {calling},"
 
 
 def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:

@@ -209,20 +209,7 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
             texture, texture_rows, names_texture[texture]
         )
 
-    text = [
-        "The prediction is the object, whatever its texture: "
-        f"{ClusteredFraction.from_rows('', rows).describe('so')}."
-    ]
-    with_classes = [name for name in names_texture if options.classes.get(name)]
-    if with_classes:
-        flags = pd.concat([names_texture[name] for name in with_classes])
-        total = ClusteredFraction.from_rows("", rows.loc[flags.index], flags)
-        text.append(
-            f"The prediction names the texture ({', '.join(with_classes)}): "
-            f"{total.describe('so')}."
-        )
-        if not total.fraction:
-            text.append("A model that has no class for a texture cannot name it.")
+    text = _describe_named(rows, names_texture, options)
     text.append(_compare_cues(count_predicted(rows, options)))
     text += rates.describe_extremes(
         list(by_shape.values()), "The hardest texture", "the easiest", "textures"
@@ -239,6 +226,35 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
         draw=lambda figure: _draw_cues(figure, by_shape, by_texture),
         size=(6.0, 1.7 + 0.27 * len(by_shape)),
     )
+
+
+def _describe_named(
+    rows: Rows, names_texture: Mapping[str, Any], options: CuesOptions
+) -> list[str]:
+    """Describe how often predictions name the object, and how often its texture.
+
+    Args:
+        rows: rows with object and texture.
+        names_texture: by texture, which of its rows (n,) have a prediction that names
+            the texture.
+        options: options of the figure; a texture without `classes` has no name that a
+            prediction could have.
+    """
+    text = [
+        "The prediction is the object, whatever its texture: "
+        f"{ClusteredFraction.from_rows('', rows).describe('so')}."
+    ]
+    with_classes = [name for name in names_texture if options.classes.get(name)]
+    if with_classes:
+        flags = pd.concat([names_texture[name] for name in with_classes])
+        total = ClusteredFraction.from_rows("", rows.loc[flags.index], flags)
+        text.append(
+            f"The prediction names the texture ({', '.join(with_classes)}): "
+            f"{total.describe('so')}."
+        )
+        if not total.fraction:
+            text.append("A model that has no class for a texture cannot name it.")
+    return text
 
 
 def _names_class(predictions: Any, classes: Sequence[str]) -> Any:

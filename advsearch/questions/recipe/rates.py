@@ -86,26 +86,38 @@ def read_rows(
                 continue
             if row.kind == "sweep" and row.is_out_of_view:
                 continue
-            values: dict[str, Any] = {
-                name: stored["value"] for name, stored in row.values.items()
-            }
             units |= {name: stored["unit"] for name, stored in row.values.items()}
             unit = f"{folder.name} {row.kind} {row.id}"  # each row by itself
             if row.kind == "sweep" and draws is not None:
                 unit = f"{seed} {draws.find_unit(row.step)}"
             if summary.command == "attack":
-                values[TRIAL_COLUMN] = TRIAL_NAMES[row.kind]
                 unit = f"{seed} {row.step}"
-            for name in ("object", "environment", MODEL_COLUMN):
-                value = values.get(name, getattr(summary, name))
-                values[name] = wording.format_figure_value(str(value))
-            values[PREDICTION_COLUMN] = row.label or "none"
-            values["correct"] = bool(row.correct)
-            values["margin"] = row.margin
+            values = _read_row_values(row, summary)
             rows.append(
                 {**values, "time": row.time, PART_COLUMN: part, "unit": unit, **more}
             )
     return rows, units
+
+
+def _read_row_values(row: Any, summary: Any) -> dict[str, Any]:
+    """Return the columns of a stored row: parameters, names and the prediction.
+
+    Args:
+        row: row of a sweep, or trial of an attack.
+        summary: result of the run, with the names that the row does not state.
+    """
+    values: dict[str, Any] = {
+        name: stored["value"] for name, stored in row.values.items()
+    }
+    if summary.command == "attack":
+        values[TRIAL_COLUMN] = TRIAL_NAMES[row.kind]
+    for name in ("object", "environment", MODEL_COLUMN):
+        value = values.get(name, getattr(summary, name))
+        values[name] = wording.format_figure_value(str(value))
+    values[PREDICTION_COLUMN] = row.label or "none"
+    values["correct"] = bool(row.correct)
+    values["margin"] = row.margin
+    return values
 
 
 def make_frame(
@@ -311,10 +323,7 @@ def describe_extremes(
     descriptions = []
     for tally in (lowest, highest):
         n_ties = shares.count(tally.fraction or 0.0) - 1  # without the tally itself
-        ties = ""
-        if n_ties:
-            plural_ending = "s" if n_ties > 1 else ""
-            ties = f" (as {n_ties} other{plural_ending})"
+        ties = _format_ties(n_ties)
         descriptions.append(f"is {tally.name}{ties}: {tally.describe(verb)}")
     widened = (
         f"the intervals of the two, widened for having been chosen among {len(known)},"
@@ -326,6 +335,14 @@ def describe_extremes(
         f"{lowest_prefix} {descriptions[0]}; {highest_prefix} {descriptions[1]}.",
         verdict,
     ]
+
+
+def _format_ties(n_ties: int) -> str:
+    """Return how many others have the same fraction: " (as 2 others)"; "" if none."""
+    if not n_ties:
+        return ""
+    plural_ending = "s" if n_ties > 1 else ""
+    return f" (as {n_ties} other{plural_ending})"
 
 
 def pluralize_column(name: str) -> str:

@@ -692,21 +692,34 @@ class Points:
             )
             return
         for component, column in enumerate(range(coordinates.start, coordinates.stop)):
-            # the bounds of equal parts of the range, as coordinates, then as values
-            edges = torch.linspace(
-                float(self._lower[column]),
-                float(self._upper[column]),
-                self.n_parts + 1,
-                dtype=torch.float64,
-            )
-            edge_values = spec.interpolate(edges, log=parameter.log).tolist()
             suffix = f".{component}" if parameter.shape else ""  # of a vector
             yield SampledNumber(
                 full_name + suffix,
                 parameter.unit,
                 begin + component,
-                tuple(map(list, pairwise(edge_values))),
+                self._cut_range(column, spec, log=parameter.log),
             )
+
+    def _cut_range(
+        self, column: int, spec: Any, *, log: bool
+    ) -> tuple[list[float], ...]:
+        """Cut the range of a coordinate into parts, and return the bounds of each.
+
+        The parts are equal in the coordinate; the bounds are values of the parameter.
+
+        Args:
+            column: index of the coordinate in a configuration.
+            spec: range of the parameter.
+            log: whether the parameter is logarithmic.
+        """
+        edges = torch.linspace(
+            float(self._lower[column]),
+            float(self._upper[column]),
+            self.n_parts + 1,
+            dtype=torch.float64,
+        )
+        edge_values: list[float] = spec.interpolate(edges, log=log).tolist()
+        return tuple(map(list, pairwise(edge_values)))
 
     def find_parts(self, first: int, count: int) -> NDArray[np.int64]:
         """Return the part of each of k sampled numbers that images lie in.
