@@ -28,6 +28,7 @@ from advsearch.attacks.candidates import (
     MAX_CHECKS,
     MAX_CONFIRMATIONS,
     MAX_SEARCHES,
+    Bracket,
     confirm_bracket,
     find_smallest_change,
 )
@@ -189,19 +190,36 @@ def _measure_gradients(
         bench, with_all=full, count_renders=counts_renders
     )
     if full:
-        samples = planning.count_cosine_samples(problem.plan)
-        hint = "counted in samples a pixel; `measure=quick` leaves it out"
-        stages.begin(
-            "setup",
-            "choosing step and samples of gradients",
-            samples,
-            hint=hint,
-            at_most=True,
-        )
-        table = list(planning.measure_cosines(replace(bench, tick=progress.advance)))
-        problem.plan, spp = planning.choose_steps(problem.plan, table)
+        spp = _choose_gradient_steps(problem, bench, stages)
         if chooses_spp and spp is not None:
             problem.spp = spp
+
+
+def _choose_gradient_steps(
+    problem: Problem, bench: Bench, stages: Stages
+) -> int | None:
+    """Choose the steps of finite differences by measurement, for the problem's plan.
+
+    Args:
+        problem: problem whose plan gets the steps.
+        bench: bench of the gradients.
+        stages: reports what is measured.
+
+    Returns:
+        The samples per pixel that suffice for gradients; None if that is not known.
+    """
+    samples = planning.count_cosine_samples(problem.plan)
+    stages.begin(
+        "setup",
+        "choosing step and samples of gradients",
+        samples,
+        hint="counted in samples a pixel; `measure=quick` leaves it out",
+        at_most=True,
+    )
+    measured = replace(bench, tick=stages.progress.advance)
+    table = list(planning.measure_cosines(measured))
+    problem.plan, spp = planning.choose_steps(problem.plan, table)
+    return spp
 
 
 def evaluate_clean_scene(
@@ -304,11 +322,12 @@ def choose_predictor(
     assert matrix_refusal is not None and surface_refusal is not None
     # The user is told the reason that is easier to change: more steps, if matrices pay
     # then; or that of matrices where no camera moves.
-    is_too_short = (
+    pays_with_more_steps = (
         not findings.surface_light_refusal
         and find_matrix_refusal(problem, None, specialise) is None
     )
-    is_about_matrices = is_too_short or surface_refusal.cause is RefusalCause.NO_CAMERA
+    moves_no_camera = surface_refusal.cause is RefusalCause.NO_CAMERA
+    is_about_matrices = pays_with_more_steps or moves_no_camera
     refusal = matrix_refusal if is_about_matrices else surface_refusal
     if not specialise:
         _report_rendering(refusal, stages, findings)
@@ -719,13 +738,25 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         )
     bracket = confirm_bracket(bracket, passes, problem.domain, times=n_repeats)
     findings.bracket = bracket
+    findings.search = _combine_results(results, bracket)
+
+
+def _combine_results(results: Sequence[SearchResult], bracket: Bracket) -> SearchResult:
+    """Return one result of several searches in smaller and smaller budgets.
+
+    It is that of the search that found the smallest change, or of the first if none
+    did, with the cost of all.
+
+    Args:
+        results: results of the searches.
+        bracket: the smallest change, with the number of the search that found it.
+    """
     winner = results[0]
     if bracket.u is not None:
         winner = replace(
             results[bracket.found_by], best_u=bracket.u, ending=Ending.FOUND
         )
-    # one result, with the cost of all searches
-    findings.search = replace(
+    return replace(
         winner,
         renders=sum(result.renders for result in results),
         gradients=sum(result.gradients for result in results),

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -490,12 +490,7 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     cells: dict[str, list[MatrixCell]] = {}
     configurations = _read_configurations(attacked)
     if configurations and not study.interrupted:
-        sample_counts = [
-            summary.sample_count.spp
-            for summary in attacked.values()
-            if summary.sample_count
-        ]
-        spp = config.verify_spp or max([MIN_TRIAL_SPP, *sample_counts])
+        spp = config.verify_spp or _choose_trial_spp(attacked.values())
         with context.until_interrupted():
             _try_on_models(study, names, spp, configurations, models, cells)
     rows = [
@@ -524,6 +519,17 @@ def _read_configurations(attacked: Mapping[str, AttackSummary]) -> dict[str, Ten
         for name, summary in attacked.items()
         if summary.adversarial is not None and summary.run is not None
     }
+
+
+def _choose_trial_spp(summaries: Iterable[AttackSummary]) -> int:
+    """Return the samples per pixel that suffice for the trials of several attacks.
+
+    These are the most that any of them needed, at least `MIN_TRIAL_SPP`.
+    """
+    sample_counts = [
+        summary.sample_count.spp for summary in summaries if summary.sample_count
+    ]
+    return max([MIN_TRIAL_SPP, *sample_counts])
 
 
 def _try_on_models(

@@ -41,7 +41,6 @@ def attack_verdict(summary: AttackSummary) -> str:
     ending = summary.ending
     verified = summary.verified
     thing = _name_thing(summary)
-    after_steps = f"after {format_count(summary.steps, 'step')}"
     if ending == "already wrong":
         wrong = words.format_mistake(
             summary.task, thing, summary.clean.label, get_outcome(summary.clean.payload)
@@ -50,17 +49,8 @@ def attack_verdict(summary: AttackSummary) -> str:
             f"The model already {wrong}: nothing was changed and nothing counts as "
             "found."
         )
-    if verified is None and ending == "interrupted" and summary.adversarial:
-        outcome = get_outcome(summary.adversarial.payload)
-        predicts = words.format_mistake(
-            summary.task, thing, summary.adversarial.label, outcome
-        )
-        return (
-            f"Interrupted {after_steps}. What was found so far is not verified: the "
-            f"model {predicts}."
-        )
     if verified is None:
-        return f"{ending[:1].upper()}{ending[1:]} {after_steps}; nothing is verified."
+        return _unverified_verdict(summary, thing)
     has_paths = summary.drive is not None and len(summary.drive.paths) > 1
     rate = words.format_rate(verified) + condition_text(summary.over, has_paths)
     claim, goal = _clauses(summary, thing)
@@ -80,6 +70,27 @@ def attack_verdict(summary: AttackSummary) -> str:
         f"No change of {budget_text(summary)} was found that {goal}: {claim} in "
         f"{rate}. {reason}"
     )
+
+
+def _unverified_verdict(summary: AttackSummary, thing: str) -> str:
+    """Return what a run found that ended before anything was verified.
+
+    Args:
+        summary: summary of the attack.
+        thing: the object that is evaluated, as "this mug".
+    """
+    ending = summary.ending
+    after_steps = f"after {format_count(summary.steps, 'step')}"
+    if ending == "interrupted" and summary.adversarial:
+        outcome = get_outcome(summary.adversarial.payload)
+        predicts = words.format_mistake(
+            summary.task, thing, summary.adversarial.label, outcome
+        )
+        return (
+            f"Interrupted {after_steps}. What was found so far is not verified: the "
+            f"model {predicts}."
+        )
+    return f"{ending[:1].upper()}{ending[1:]} {after_steps}; nothing is verified."
 
 
 def _name_thing(summary: AttackSummary) -> str:

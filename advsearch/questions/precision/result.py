@@ -630,31 +630,7 @@ def _draw_line(
         alpha=0.55,
     )
     for point in line:
-        x = point.seconds
-        y = PERCENT * point.rms
-        lower, upper = (
-            PERCENT * bound for bound in point.interval or (math.nan, math.nan)
-        )
-        # Neither a missing interval (NaN) nor a very wide one is drawn.
-        if upper < 4.0 * y:
-            axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
-        axes.plot(
-            [x],
-            [y],
-            marker=marker,
-            markersize=5,
-            color=color,
-            markerfacecolor=color if point.is_known else "white",
-        )
-        if not point.is_known:
-            arrow = {
-                "arrowstyle": "-|>",
-                "color": color,
-                "linewidth": 0.8,
-                "shrinkA": 3,
-            }
-            arrow_tip = y * 0.72  # the axis is logarithmic: as long for every point
-            axes.annotate("", (x, arrow_tip), (x, y), arrowprops=arrow)
+        _draw_point(axes, point, color, marker)
     axes.plot(
         # an empty line, whose entry in the legend has marker and line
         [],
@@ -665,6 +641,36 @@ def _draw_line(
         linewidth=1.0,
         label=label,
     )
+
+
+def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> None:
+    """Draw the relative error of one setting with its interval, in percent.
+
+    A known error is a filled marker. An open one with an arrow down is an upper limit.
+    """
+    x = point.seconds
+    y = PERCENT * point.rms
+    lower, upper = (PERCENT * bound for bound in point.interval or (math.nan, math.nan))
+    # Neither a missing interval (NaN) nor a very wide one is drawn.
+    if upper < 4.0 * y:
+        axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
+    axes.plot(
+        [x],
+        [y],
+        marker=marker,
+        markersize=5,
+        color=color,
+        markerfacecolor=color if point.is_known else "white",
+    )
+    if not point.is_known:
+        arrow = {
+            "arrowstyle": "-|>",
+            "color": color,
+            "linewidth": 0.8,
+            "shrinkA": 3,
+        }
+        arrow_tip = y * 0.72  # the axis is logarithmic: as long for every point
+        axes.annotate("", (x, arrow_tip), (x, y), arrowprops=arrow)
 
 
 def _plain_axis(axis: Any) -> None:

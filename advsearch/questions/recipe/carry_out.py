@@ -154,16 +154,7 @@ def _make_result(
 ) -> RecipeResult:
     """Make the result of a recipe; a resumed run adds the seconds it took before."""
     config = context.config
-    recipe_settings = description.apply_command_settings(recipe, config).settings
-    defaults = {
-        "object": "",
-        "environment": SceneConfig.default_environment,
-        "model": "reference",
-    }
-    names = {
-        setting: description.split_name_list(recipe_settings.get(setting) or default)
-        for setting, default in defaults.items()
-    }
+    names = _list_scene_names(recipe, config)
     controls = [name for run, _ in done for name in run.config.controls]
     parts = [
         RecipePart(
@@ -195,6 +186,23 @@ def _make_result(
         previous = read_result(context.resumed)
         result.seconds["total"] += getattr(previous, "seconds", {"total": 0.0})["total"]
     return result
+
+
+def _list_scene_names(recipe: Recipe, config: RecipeConfig) -> dict[str, list[str]]:
+    """Return the names of the objects, environments and models of a recipe.
+
+    These are by the name of the setting: "object", "environment" and "model".
+    """
+    recipe_settings = description.apply_command_settings(recipe, config).settings
+    defaults = {
+        "object": "",
+        "environment": SceneConfig.default_environment,
+        "model": "reference",
+    }
+    return {
+        setting: description.split_name_list(recipe_settings.get(setting) or default)
+        for setting, default in defaults.items()
+    }
 
 
 def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:

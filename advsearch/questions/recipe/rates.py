@@ -1267,6 +1267,19 @@ def _format_spread(values: Any) -> str:
     return f"{median} ({values.min():.3g} to {values.max():.3g})"
 
 
+def _list_surface_cells(surface_table: Any) -> list[Cell]:
+    """Return the cells of a row: the counts of one object, model and kind of part."""
+    return [
+        surface_table.object,
+        wording.shorten_name(surface_table.model),
+        surface_table.part,
+        surface_table.seen,
+        surface_table.compared,
+        surface_table.worse,
+        surface_table.better,
+    ]
+
+
 def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the surface parts that are visible when predictions are wrong.
 
@@ -1294,18 +1307,7 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     text = list[str]()
     for run_surface in surfaces.values():
         text += workbench.surface_sentences(run_surface)
-        for part in run_surface.tables:
-            table.append(
-                [
-                    part.object,
-                    wording.shorten_name(part.model),
-                    part.part,
-                    part.seen,
-                    part.compared,
-                    part.worse,
-                    part.better,
-                ]
-            )
+        table += map(_list_surface_cells, run_surface.tables)
     heads = [
         "object",
         "model",

@@ -356,6 +356,29 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
             f"{where}: expected a COUNT of at least 1, got {count} in {text!r}"
         )
     _check_count(where, count)
+    _check_bounds(where, text, first, last, count, is_angle=is_angle)
+    # After a full turn the last value would be the first one again: it is left out.
+    is_full_turn = is_angle and last - first == FULL_TURN
+    values = np.linspace(first, last, count, endpoint=not is_full_turn)
+    return [float(value) for value in values]
+
+
+def _check_bounds(
+    where: str, text: str, first: float, last: float, count: int, *, is_angle: bool
+) -> None:
+    """Check that a range FIRST:LAST:COUNT has different values in ascending order.
+
+    Args:
+        where: name of the axis in messages.
+        text: the range as the user wrote it.
+        first: first value.
+        last: last value.
+        count: count of values.
+        is_angle: whether the values are angles, which repeat after a full turn.
+
+    Raises:
+        InputError: it has not; the message has the range to write instead.
+    """
     if last < first:
         raise InputError(
             f"{where}: the range {text!r} is reversed; write {last:g}:{first:g}:{count}"
@@ -371,10 +394,6 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
             "repeat; write "
             f"{first:g}:{first + FULL_TURN:g}:{count}"
         )
-    # After a full turn the last value would be the first one again: it is left out.
-    is_full_turn = is_angle and last - first == FULL_TURN
-    values = np.linspace(first, last, count, endpoint=not is_full_turn)
-    return [float(value) for value in values]
 
 
 def _check_count(where: str, count: int) -> None:

@@ -1129,6 +1129,22 @@ def _loose_sentence(estimate: DetectionDistance, unit: str) -> str:
     )
 
 
+def _add_loose_fractions(estimate: DetectionDistance) -> list[float]:
+    """Return at each distance the fraction of images with any box on the object.
+
+    That is the fraction of right images, and that with a loose box only.
+    """
+    return [
+        fraction + n_loose / n_images
+        for fraction, n_loose, n_images in zip(
+            estimate.right_fractions,
+            estimate.loose_counts,
+            estimate.image_counts,
+            strict=True,
+        )
+    ]
+
+
 def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
     """Draw the fraction of detections over the distance on matplotlib axes."""
     low, high = zip(*estimate.intervals, strict=True)
@@ -1149,18 +1165,9 @@ def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
         label="seen in",
     )
     if any(estimate.loose_counts):
-        with_loose = [
-            fraction + n_loose / n_images
-            for fraction, n_loose, n_images in zip(
-                estimate.right_fractions,
-                estimate.loose_counts,
-                estimate.image_counts,
-                strict=True,
-            )
-        ]
         axes.plot(
             estimate.distances,
-            with_loose,
+            _add_loose_fractions(estimate),
             color=GREY,
             marker=".",
             linestyle=":",
