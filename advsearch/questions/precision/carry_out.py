@@ -237,7 +237,7 @@ class QuantityMeasurer:
         u = problem.add_conditions(problem.domain.start)
 
         def margin(image: torch.Tensor) -> float:
-            return -problem.judge(image, u).score
+            return -problem.judge(image, u).score  # a score is a negative margin
 
         bench = PictureBench(
             problem.renderer, u, margin, self._config.compared_samplers

@@ -338,16 +338,17 @@ def make_view(result: PrecisionResult) -> ShownResult:
 
 def make_headline(result: PrecisionResult) -> str:
     """Summarize a result in a sentence: the first setting that reaches the goal."""
-    found = next((row for row in result.recommendations if row.estimator), None)
-    if found is None:
+    # a recommendation without an estimator states that none reaches the goal
+    first = next((row for row in result.recommendations if row.estimator), None)
+    if first is None:
         return (
             "Nothing that was measured is known to reach the error: give it more "
             "`seconds` or a larger `error`."
         )
-    quantity = describe_quantity(found.quantity, found.control)
+    quantity = describe_quantity(first.quantity, first.control)
     return (
-        f"For {100 * result.goal:.3g} % error of {quantity}: {found.spp} samples "
-        f"({found.estimator}), {found.seconds:.2g} s of processor time, here."
+        f"For {100 * result.goal:.3g} % error of {quantity}: {first.spp} samples "
+        f"({first.estimator}), {first.seconds:.2g} s of processor time, here."
     )
 
 
@@ -427,11 +428,11 @@ def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> Result
 
 
 def _format_interval(interval: results.Interval | None) -> str:
-    return (
-        ""
-        if interval is None
-        else (f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}")
-    )
+    """Format an interval in percent: "1.2 to 3.4"; empty without one."""
+    if interval is None:
+        return ""
+    lower, upper = interval
+    return f"{100 * lower:.2g} to {100 * upper:.2g}"
 
 
 GREY = figures.GREY
@@ -559,7 +560,8 @@ def _make_label(name: str, slope: PrecisionSlope | None) -> str:
     if slope is None:
         return name
     theory = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
-    return f"{name}  {slope.slope:.2f}{theory}".replace(" -", f" {MINUS}")
+    label = f"{name}  {slope.slope:.2f}{theory}"
+    return label.replace(" -", f" {MINUS}")  # the sign that figures have
 
 
 def _draw_goal(axes: Any, goal: float) -> None:

@@ -379,7 +379,9 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
     Raises:
         InputError: for the first such part.
     """
-    if is_file_name(name) or recipe != read_recipe(name):
+    # a bundled recipe that a run has noted may have been changed there
+    is_bundled = not is_file_name(name) and recipe == read_recipe(name)
+    if not is_bundled:
         for run in runs:
             run.config.check_powers(f"{name}: parts: {run.part}")
 

@@ -490,10 +490,10 @@ def _split_by_triangle(
     corners: Mapping[Any, Any],
 ) -> list[npt.NDArray[np.bool_]]:
     """Return for each triangle of the diagram which mixtures (n,) lie in it."""
-    triangles = pd.Series(
+    triangle_of_mixture = pd.Series(
         [find_triangle(mixture, options.side) for mixture in mixtures]
     )
-    return [(triangles == triangle).to_numpy() for triangle in corners]
+    return [(triangle_of_mixture == triangle).to_numpy() for triangle in corners]
 
 
 def _make_panels(
@@ -547,6 +547,7 @@ def _read_mixtures(rows: Rows, options: TernaryOptions) -> Float64Array:
         [rates.get_numeric_column(rows, name) for name in options.shares], axis=1
     )
     total = amounts.sum(axis=1, keepdims=True)
+    # not divided by 0, where there is nothing of any
     return amounts / np.where(total == 0.0, 1.0, total)
 
 
@@ -785,6 +786,7 @@ def _mean_interval(values: Float64Array, n_compared: int = 1) -> tuple[float, fl
 
     It is widened for a choice among `n_compared` means (Bonferroni).
     """
+    # the probability on each of the two sides
     alpha = (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * n_compared)
     half_width = NormalDist().inv_cdf(1.0 - alpha) * _standard_error(values)
     mean = values.mean()

@@ -151,6 +151,7 @@ def get_column(rows: Rows, name: str) -> Any:
         InputError: if the column does not exist or lacks values.
     """
     if name not in rows or rows[name].isna().any():
+        # results of a row are no columns to split by
         candidates = rows.columns.drop(["correct", "margin", "time", "unit"])
         known = ", ".join(other for other in candidates if rows[other].notna().all())
         raise InputError(f"figures: expected one of {known}, got {name[:60]!r}")
@@ -353,6 +354,7 @@ def pluralize_column(name: str) -> str:
     if name == TRIAL_COLUMN:
         return "kinds of trials"
     control, _, parameter = name.partition(".")
+    # the parameter "which" chooses among several environments, say
     if parameter in ("", "which"):
         return f"{control}s"
     return f"values of {name}"

@@ -372,6 +372,7 @@ def _worst_configuration(summary: SweepSummary) -> str:
     if summary.worst is None:
         return ""
     values = summary.worst.values
+    # These explain themselves, as "mug, studio", and stand without their names.
     names = ("object", "environment", "backdrop", "model")
     outside = [name for name in names if name in values]
     texts = [shorten_name(values[name].value) for name in outside]
@@ -967,7 +968,8 @@ def _find_crossing(
         distance: (m,) ascending; the line is linear in its logarithm.
         falling: (m,) the line, the fraction of right images at each distance.
     """
-    if not falling[0] >= HALF > falling[-1]:
+    crosses_half = falling[0] >= HALF > falling[-1]
+    if not crosses_half:
         return None
     # negated, since interp needs ascending abscissae
     return float(np.exp(np.interp(-HALF, -falling, np.log(distance))))
