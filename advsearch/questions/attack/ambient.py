@@ -43,7 +43,10 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     def holds(lux: float) -> bool:
         """Verify the configuration in an ambient light, and store the result."""
         title = f"trying it in ambient light of {lux:.3g} lux"
-        verifier.begin_stage(title, 2 * verifier.n_trials, name="ambient", at_most=True)
+        n_renders = (
+            2 * verifier.n_trials
+        )  # of the clean scene, and of the configuration
+        verifier.begin_stage(title, n_renders, name="ambient", at_most=True)
         factor = lux / scene_lux
         # The factor is the key by which workers find the problem in that light.
         evaluator = ParallelEvaluator(
@@ -72,9 +75,9 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     while failing_lux <= MAX_LUX and holds(failing_lux):
         holding_lux = failing_lux
         failing_lux = 2.0 * failing_lux
-    # the last one was beyond `MAX_LUX` and not tried
-    if failing_lux not in findings.ambient_verifications:
-        return  # it holds in direct sun
+    was_tried = failing_lux in findings.ambient_verifications
+    if not was_tried:  # beyond `MAX_LUX`: it holds in direct sun
+        return
     for _ in range(N_BISECTIONS):
         # halfway on a logarithmic scale
         middle_lux = (holding_lux * failing_lux) ** 0.5

@@ -99,7 +99,7 @@ class AttackParts:
         model_and_warnings: the model, and warnings of loading it.
         task: not yet bound to the model.
         controls: the searched ones.
-        random_controls: those that vary by chance.
+        random_controls: controls that vary by chance.
         objective: a name, or the caller's function.
         policy: may be the caller's.
         is_stored: whether the run is stored.
@@ -128,8 +128,8 @@ def load_parts(
 
     Args:
         config: the settings.
-        scene: used instead of the one that the settings name.
-        model: likewise; with both, the attack is not stored.
+        scene: scene to use instead of the one that the settings name.
+        model: model to use likewise; with both, the attack is not stored.
     """
     if scene is None and len(config.objects) > 1:
         raise make_single_value_error("object", config.objects)
@@ -268,7 +268,7 @@ def make_attack_controls(
     Args:
         config: settings of the run; only a search has a budget.
         searched: names, settings or instances.
-        random: likewise.
+        random: names, settings or instances of those that vary by chance.
 
     Raises:
         InputError: a searched control has a distribution.
@@ -345,7 +345,7 @@ def problem_from_config(
 
     Args:
         config: the settings.
-        denoise: used instead of the setting.
+        denoise: denoiser to use instead of the setting.
 
     Returns:
         The problem, and warnings of loading it.
@@ -383,8 +383,8 @@ def make_problem_on(
 
     Args:
         config: the settings; the scene and the model that they name are not used.
-        scene: used instead.
-        model: used instead.
+        scene: scene to use instead.
+        model: model to use instead.
         differentiated: whether derivatives are needed.
     """
     return make_problem(load_parts(config, scene, model), differentiated=differentiated)
@@ -507,18 +507,9 @@ def _bind_task(
         member_facts = scene_facts
         if ensemble is not None:
             member_facts = ensemble.select_facts(member, scene_facts)
-        judging.check_truth(
-            member, network, parts.scene, member_facts, config.image_settings
+        member = _prepare_task(
+            parts, member, network, member_facts, is_calibrated=shows
         )
-        if shows:
-            member = judging.calibrate_task(
-                member,
-                network,
-                [parts.scene],
-                config.label,
-                config.judge,
-                config.image_settings,
-            )
         member_tasks.append(member)
         warnings += [remark for remark in member.remarks if remark not in warnings]
     if ensemble is None:
@@ -538,15 +529,15 @@ def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int
     """
     if problem.conditions is None:
         return config.steps or STEPS, 1
-    default = SIZE_OVER_PREDICTED
+    default_size = SIZE_OVER_PREDICTED
     if problem.conditions.dim == 1:
-        default = SIZE_OVER_SINGLE_PARAMETER
-    steps = config.steps or default[0]
-    if find_matrix_refusal(problem, steps, config.specialise) is not None:
-        # Conditions are rendered.
+        default_size = SIZE_OVER_SINGLE_PARAMETER
+    steps_if_predicted = config.steps or default_size[0]
+    refusal = find_matrix_refusal(problem, steps_if_predicted, config.specialise)
+    if refusal is not None:  # conditions are rendered
         is_box = all(block.norm == "box" for block in problem.domain.blocks)
-        default = SIZE_OVER_NUMBERS if is_box else SIZE_OVER_RENDERED
-    default_steps, default_draws = default
+        default_size = SIZE_OVER_NUMBERS if is_box else SIZE_OVER_RENDERED
+    default_steps, default_draws = default_size
     return config.steps or default_steps, config.draws or default_draws
 
 
@@ -575,6 +566,41 @@ def with_evaluation_only(config: AttackConfig) -> AttackConfig:
     if config.policy_name not in POLICIES:
         changes["policy"] = AttackConfig.model_fields["policy"].default
     return config.model_copy(update=changes)
+
+
+def _prepare_task(
+    parts: AttackParts,
+    task: Task,
+    model: Model,
+    scene_facts: Facts,
+    *,
+    is_calibrated: bool,
+) -> Task:
+    """Check that a model can be right about the scene, and calibrate its task.
+
+    Args:
+        parts: the parts of the attack.
+        task: task of the model.
+        model: the model, or one member of an ensemble.
+        scene_facts: ground truth of the clean scene.
+        is_calibrated: whether the task is calibrated, for which a clean image may be
+            rendered; else it is only checked.
+
+    Raises:
+        InputError: no prediction of the model would be right.
+    """
+    config = parts.config
+    judging.check_truth(task, model, parts.scene, scene_facts, config.image_settings)
+    if not is_calibrated:
+        return task
+    return judging.calibrate_task(
+        task,
+        model,
+        [parts.scene],
+        config.label,
+        config.judge,
+        config.image_settings,
+    )
 
 
 def open_executor(

@@ -468,7 +468,7 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
     for row in result.table:
         cells = [words.shorten_name(row.attacked), row.ending]
         for cell in row.tested:
-            # row and column that this cell is about to get
+            # the row and the column that this cell is about to get
             rate_of_cell[len(rows), len(cells)] = cell.verified.rate
             rate = ", ".join(words.format_rate_cells(cell.verified))
             cells.append(rate + ENDING_MARKS.get(cell.ending, ""))
@@ -528,10 +528,12 @@ def _draw_matrix(result: MatrixResult, axes: Any) -> None:
     for y, row in enumerate(rows):
         for x, cell in enumerate(row.tested):
             text = f"{cell.verified.successes}/{cell.verified.trials}"
+            # readable on the dark end of the color scale
             color = "white" if rates[y][x] > 0.6 else "black"
             axes.text(x, y, text, ha="center", va="center", color=color)
     tested_names = [words.shorten_name(tested.model) for tested in result.tested]
-    rotation = 20 if max(map(len, tested_names)) > 12 else 0
+    has_long_names = max(map(len, tested_names)) > 12
+    rotation = 20 if has_long_names else 0
     axes.set_xticks(range(len(tested_names)), tested_names, rotation=rotation)
     axes.set_yticks(
         range(len(rows)), [words.shorten_name(row.attacked) for row in rows]

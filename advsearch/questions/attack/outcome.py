@@ -101,9 +101,9 @@ def make_result(
     Args:
         findings: findings of the attack.
         journal: journal of the run.
-        stages: which took their time.
-        warnings: so far.
-        object_name: object name of the object under attack.
+        stages: stages of the run, with the seconds that each took.
+        warnings: warnings so far.
+        object_name: name of the object under attack.
         judge: the thing that is evaluated.
         policy: policy by name, as requested.
         objective: objective by name; None for the task's own.
@@ -116,7 +116,7 @@ def make_result(
     search = findings.search
     run = journal.run
     stages.progress.stage("making the pictures and the report")
-    u = problem.domain.start
+    u = problem.domain.start  # without a search, both scenes are the clean one
     if search is not None:
         u = problem.domain.project(search.best_u)
     # After Ctrl-C no more images are rendered than needed.
@@ -127,7 +127,7 @@ def make_result(
     if run is not None:
         images = {"clean": clean, "adversarial": adversarial}
         _write_files(run, problem, findings, u, images, artifacts)
-    drive = None
+    drive = None  # both scenes along a path, if one varies by chance
     if not findings.interrupted:
         searched_u = None if search is None else u
         drive = evaluate_drive(problem, searched_u, findings.spp, run)
@@ -222,7 +222,7 @@ def _summarize(
     """Return what `summary.json` holds.
 
     Args:
-        findings: what the attack found.
+        findings: findings of the attack.
         journal: journal of the run.
         clean: image of the clean scene.
         adversarial: image of the adversarial scene.
@@ -271,6 +271,8 @@ def _summarize(
             ),
         ),
         baseline=_baseline(problem, findings),
+        # The random search may have found a worse configuration than the policy, whose
+        # verification is then `outdone_verification`.
         answer_from="random" if findings.outdone_verification is not None else None,
         policy_verified=findings.outdone_verification
         and make_verified_rate(findings.outdone_verification),
@@ -365,9 +367,9 @@ def _ambient_light(findings: RunState) -> AmbientLight | None:
         )
         for lux, verification in sorted(findings.ambient_verifications.items())
     ]
-    # The first point is the scene's own light, in which the scene was verified.
+    # The first point is the scene's own light, in which the scene was verified. Points
+    # count up to the first that does not hold, whatever holds beyond it.
     n_holding = 0
-    # What holds beyond the first light in which it does not is not counted.
     while n_holding < len(points) and points[n_holding].holds:
         n_holding += 1
     return AmbientLight(
@@ -501,11 +503,13 @@ def _printability(problem: Problem, findings: RunState) -> Printability:
     """Return how printable the scenes are, and what that costs in margin."""
 
     def terms_of(search: SearchResult | None) -> PrintTerms | None:
+        """Measure the print terms of what a search found; None without a search."""
         if search is None:
             return None
         u = problem.domain.project(search.best_u)
         return measure_print_terms(problem.searched_space, u)
 
+    # What printability costs is known if a search without print terms was verified.
     cost = None
     verification = findings.verification
     unprinted = findings.unprinted
@@ -537,7 +541,8 @@ def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
         u: (d,) the configuration.
     """
     start = problem.domain.start
-    # of the searched parameters that are single numbers
+    # Of the searched parameters that are single numbers. The searched ones come first
+    # in the space, and the start has their coordinates only.
     column_of_number = {
         group.name: group.begin
         for group in problem.space.groups
@@ -600,6 +605,7 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
             continue
         coordinates = [0.0, 1.0]
         if block.options:
+            # each option has an equal part of [0, 1]: the centers of these
             coordinates = [
                 (option + 0.5) / block.options for option in range(block.options)
             ]
@@ -750,9 +756,9 @@ def _describe_failure(
 
     Args:
         problem: problem of the attack.
-        failure: as the search found it.
+        failure: the failure, as the search found it.
         number: number in the list.
-        verification: None if it was not tried.
+        verification: verification of the failure; None if it was not tried.
     """
     configuration = {
         name: DescribedValue.of(value)

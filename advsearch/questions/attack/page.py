@@ -96,6 +96,7 @@ def make_page(run: Path, result: Result) -> str | None:
     scripts = ["make.js", "attack.js"]
     if turned_object:
         scripts.append("object.js")
+    # `about` is what the result is of, in a few names
     view = replace(view, sections=sections, facts=facts, about=about)
     return make_view_page(run, result, view, data=data, scripts=scripts)
 
@@ -218,7 +219,7 @@ def _find_trial_images(images: Path) -> list[Picture]:
     marked_names = [name for name in names if name.endswith(MARKED)]
     pictures = []
     for name in (marked_names or names)[:MAX_TRIAL_IMAGES]:
-        trial = "".join(filter(str.isdigit, name))
+        trial = "".join(filter(str.isdigit, name))  # of "verification-07.png" 07
         pictures.append(Picture(f"images/{name}", f"trial {trial}"))
     return pictures
 
@@ -238,6 +239,7 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
         rows.append([name, clean, adversarial, _range_text(changed)])
         bars.append(_range_bar(changed))
     heads = ("parameter", "clean", "adversarial", "in its range")
+    # indices of the columns with any text
     columns = [
         column for column in range(len(heads)) if any(row[column] for row in rows)
     ]

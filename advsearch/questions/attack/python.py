@@ -124,6 +124,7 @@ def attack(
     _check_can_use_workers(scene, model, task, objective, session_controls, options)
     scene = _load_scene(scene, object, options)
 
+    # the settings as `run.yaml` states them
     config = _make_config(
         scene, model, task, controls, objective, policy, over, metrics, run, options
     )
@@ -135,6 +136,7 @@ def attack(
     config = config.with_python_only_parts(python_only)
     _check_single(config)
 
+    # The caller's objects are used, and what is only named is made.
     searched, random_controls = make_attack_controls(config, controls, over)
     if not isinstance(policy, Policy):
         policy = make_policy(config.policy_name, **config.policy_options)
@@ -250,8 +252,8 @@ def _find_python_only(
 
     Args:
         config: the settings.
-        scene: loaded.
-        model: as the caller passed it, and so on.
+        scene: the loaded scene.
+        model: model as the caller passed it; so are the others.
         task: task of the model.
         objective: objective of the search.
         policy: policy of the search.
@@ -286,7 +288,7 @@ def _load_scene(
     """Return a scene, loaded with the options that belong to it.
 
     Args:
-        scene: loaded, a file, a name, or a dictionary of Mitsuba.
+        scene: loaded scene, a file, a name, or a dictionary of Mitsuba.
         shape: its object, if it has several.
         options: options of the attack.
     """

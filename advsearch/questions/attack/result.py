@@ -83,6 +83,22 @@ def _resolve_scene(scene: Scene | str | Path | None, default: Scene) -> Scene:
     return scene if isinstance(scene, Scene) else load_scene(scene)
 
 
+def _split_camera(
+    camera: str | Mapping[str, float] | None, settings: SettingValues | None
+) -> tuple[str | None, SettingValues | None]:
+    """Return the name of a camera, if it is a name, and settings with its parameters.
+
+    Args:
+        camera: name of one of the scene's cameras, or parameters of the camera, which
+            become settings such as ``camera.azimuth``.
+        settings: other settings of the scene.
+    """
+    if not isinstance(camera, Mapping):
+        return camera, settings
+    camera_settings = {f"camera.{name}": value for name, value in camera.items()}
+    return None, {**(settings or {}), **camera_settings}
+
+
 def _change_view(
     scene: Scene, camera: str | None, settings: SettingValues | None
 ) -> Scene:
@@ -208,14 +224,7 @@ class AttackResult:
             )
         _check_render_keywords(options)
         parts = self.parts()
-        camera = to_python(camera)
-        settings = to_python(settings)
-        if isinstance(camera, Mapping):
-            camera_settings = {
-                f"camera.{name}": value for name, value in camera.items()
-            }
-            settings = {**(settings or {}), **camera_settings}
-            camera = None
+        camera_name, settings = _split_camera(to_python(camera), to_python(settings))
         clashes = set(settings or {}) & set(self.summary.configuration or {})
         if clashes:
             raise InputError(
@@ -224,7 +233,7 @@ class AttackResult:
             )
         attacked_model = parts.model_and_warnings[0]
         return render(
-            _change_view(_resolve_scene(scene, parts.scene), camera, settings),
+            _change_view(_resolve_scene(scene, parts.scene), camera_name, settings),
             attacked_model if model is None else model,
             task=make_ensemble_task(parts.task, attacked_model)
             if model is None
@@ -396,10 +405,10 @@ def save_images(
     and an animation of the search that ends with the adversarial scene.
 
     Args:
-        run: where they are saved.
+        run: run directory into which they are saved.
         problem: problem of the attack.
         findings: findings of the attack.
-        scene_images: those of the scenes, `clean` and `adversarial`.
+        scene_images: images of both scenes, by `clean` and `adversarial`.
     """
     for name, image in scene_images.items():
         _save_scene_image(run, problem, name, image)
@@ -459,7 +468,7 @@ def save_trial(
     """Save the image of a trial, and the same with marks.
 
     Args:
-        run: where it is saved.
+        run: run directory into which it is saved.
         problem: problem of the attack.
         findings: findings of the attack; an image that it does not have is rendered
             again.
@@ -467,7 +476,8 @@ def save_trial(
         name: name of the file.
         u: (d,) the configuration.
     """
-    seed = seeds.stream(problem.seed, "verification", trial[1])
+    _, number = trial
+    seed = seeds.stream(problem.seed, "verification", number)
     image = findings.trial_images.get(trial)
     if image is None:
         image = problem.picture(u, seed, findings.spp)
@@ -492,7 +502,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     are simplified, so that all together have `MAX_FACES` at most, which a note says.
 
     Args:
-        run: where it is written.
+        run: run directory into which it is written.
         problem: problem of the attack.
         u: (d,) the adversarial configuration.
     """
@@ -586,7 +596,7 @@ def evaluate_drive(
         problem: problem of the attack.
         u: (d,) the adversarial configuration; None evaluates the clean scene only.
         spp: samples per pixel.
-        run: where the images are saved; None saves none.
+        run: run directory for the images; None saves none.
 
     Returns:
         How many frames are right; None if no path varies.
@@ -598,11 +608,13 @@ def evaluate_drive(
     first_time = _read_time(problem, path, frames[0])
     last_time = _read_time(problem, path, frames[-1])
     seconds = last_time - first_time
+    # The animation has the paths one after another; a single path has no name.
     total_seconds = seconds * max(1, len(paths))
     right_counts: dict[str, int] = {}
     for name, configuration in (("drive-clean", problem.domain.start), ("drive", u)):
         if configuration is None:
             continue
+        # The searched coordinates come first, then those that conditions vary.
         frames[:, : len(configuration)] = configuration
         images, right_counts[name] = _render_frames(problem, frames, spp)
         if run is not None:
@@ -644,7 +656,7 @@ def _make_frames(
     Args:
         problem: problem of the attack.
         path: the control that travels.
-        time_column: time column of its time.
+        time_column: index of its time among the coordinates.
 
     Returns:
         Names, none of a single path; and (paths * FRAMES, d) of the full space.
@@ -699,7 +711,7 @@ def save_drive(
     """Save frames as an animation, NAME.webp, and some side by side, NAME.png.
 
     Args:
-        run: where they are saved.
+        run: run directory into which they are saved.
         name: name of the files.
         images: (h, w, 3) in sRGB.
         seconds: seconds from the first frame to the last.
@@ -730,7 +742,7 @@ def select_evenly(count: int, max_count: int) -> npt.NDArray[np.int64]:
 
     Args:
         count: count of all frames.
-        max_count: max count of the indices.
+        max_count: maximum number of indices.
     """
     indices = np.linspace(0, count - 1, min(count, max_count)).round()
     return np.unique(indices.astype(np.int64))

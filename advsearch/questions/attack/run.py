@@ -250,13 +250,14 @@ def search_and_verify(
         ladder: samples per pixel that a verification may take.
         specialise: whether what the search does not need may be left out, and images be
             predicted.
-        measure: which gradient estimators are measured.
+        measure: choice of the gradient estimators that are measured.
         deterministic: whether counts decide instead of times.
         chooses_spp: whether a full measurement may choose the samples per pixel of the
             search.
     """
     problem = journal.problem
     first_spp = problem.spp  # a preparation may choose another one for the search
+    # numbers of trials after which a verdict may be reached
     looks = TRIAL_LOOKS if problem.conditions is None else OVER_LOOKS
     findings = RunState()
     verifier = Verifier(
@@ -266,7 +267,7 @@ def search_and_verify(
         journal, stages, findings, printable=printable, close_looks=close_looks
     )
     if smallest:
-        # raises for what has no budget, before anything is rendered
+        # only a check: raises for what has no budget, before anything is rendered
         scale_domain(problem.domain, 1.0)
     try:
         with interruptible():
@@ -327,8 +328,9 @@ def search_with_baselines(
     findings.search = searches.search(
         "search", policy, steps, problem.seed, frames=findings.frames, seconds=seconds
     )
-    # renders of the search itself, without those of the ranking
     if seconds is not None:
+        # The other searches get the renders that fitted into the time, without those of
+        # the ranking at the end.
         history = findings.search.history
         steps = max(1, history[-1].renders) if history else 1
     if searches.printable:
@@ -360,13 +362,14 @@ def choose_policy(
 
     Args:
         policy: the requested one.
-        problem: is searched.
+        problem: problem that is searched.
         gradient_setting: the setting that concerns derivatives; None if none does.
 
     Raises:
         InputError: the policy needs the gradient of a model that has none, or does not
             use the derivatives that a setting concerns.
     """
+    # "box" is a range alone; blocks with another norm have a budget epsilon
     norms = {block.norm for block in problem.domain.blocks}
     if isinstance(problem.model.module, RemoteNetwork):
         if policy.name == "auto":

@@ -28,6 +28,7 @@ from advsearch.attacks.candidates import (
     MAX_CHECKS,
     MAX_CONFIRMATIONS,
     MAX_SEARCHES,
+    Bracket,
     confirm_bracket,
     find_smallest_change,
 )
@@ -91,11 +92,11 @@ def plan_renders(
     same.
 
     Args:
-        policy: what searches; only one that uses gradients has them measured.
+        policy: policy of the search; only for one with gradients they are measured.
         journal: journal of the run.
         stages: reports what is measured.
         specialise: whether what the search does not need may be left out.
-        measure: which gradient estimators are measured.
+        measure: choice of the gradient estimators that are measured.
         deterministic: whether counts decide instead of times.
         chooses_spp: whether a full measurement may choose the samples per pixel.
     """
@@ -166,7 +167,7 @@ def _measure_gradients(
     """
     renderer = problem.renderer
     progress = stages.progress
-    counts_renders = not full or deterministic
+    counts_renders = not full or deterministic  # a quick choice takes no times
     seed = seeds.stream(problem.seed, "measure")
     bench = Bench(
         renderer,
@@ -189,19 +190,36 @@ def _measure_gradients(
         bench, with_all=full, count_renders=counts_renders
     )
     if full:
-        samples = planning.count_cosine_samples(problem.plan)
-        hint = "counted in samples a pixel; `measure=quick` leaves it out"
-        stages.begin(
-            "setup",
-            "choosing step and samples of gradients",
-            samples,
-            hint=hint,
-            at_most=True,
-        )
-        table = list(planning.measure_cosines(replace(bench, tick=progress.advance)))
-        problem.plan, spp = planning.choose_steps(problem.plan, table)
+        spp = _choose_gradient_steps(problem, bench, stages)
         if chooses_spp and spp is not None:
             problem.spp = spp
+
+
+def _choose_gradient_steps(
+    problem: Problem, bench: Bench, stages: Stages
+) -> int | None:
+    """Choose the steps of finite differences by measurement, for the problem's plan.
+
+    Args:
+        problem: problem whose plan gets the steps.
+        bench: bench of the gradients.
+        stages: reports what is measured.
+
+    Returns:
+        The samples per pixel that suffice for gradients; None if that is not known.
+    """
+    samples = planning.count_cosine_samples(problem.plan)
+    stages.begin(
+        "setup",
+        "choosing step and samples of gradients",
+        samples,
+        hint="counted in samples a pixel; `measure=quick` leaves it out",
+        at_most=True,
+    )
+    measured = replace(bench, tick=stages.progress.advance)
+    table = list(planning.measure_cosines(measured))
+    problem.plan, spp = planning.choose_steps(problem.plan, table)
+    return spp
 
 
 def evaluate_clean_scene(
@@ -238,9 +256,8 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     if was_right_once and not in_any_case:
         return False
     verifier.choose_spp({"clean": problem.domain.start})
-    verifier.begin_stage(
-        "checking the clean scene with fresh renders", verifier.looks[0]
-    )
+    min_trials = verifier.looks[0]  # after which a verdict is first possible
+    verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
     verifier.try_clean()
     return problem.rule.is_already_wrong(
         count_right(findings.clean_trials, findings.spp)
@@ -264,7 +281,7 @@ def choose_predictor(
     stored in `findings` and reported.
 
     Args:
-        policy: what searches.
+        policy: policy of the search.
         journal: journal of the run.
         stages: reports the preparation.
         findings: findings of the attack.
@@ -280,6 +297,7 @@ def choose_predictor(
 
     candidates: list[Callable[[], PredictedSearch]] = []  # cheapest first
     if matrix_refusal is None and problem.conditions is None:
+        # a single matrix predicts all images, if no condition varies
         candidates.append(lambda: Transport(problem, steps, clean_matrix=clean))
     else:
         if surface_refusal is None:
@@ -300,14 +318,16 @@ def choose_predictor(
         instead = "rendered" if matrix_refusal else "predicted by matrices"
         stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
+    # No candidate is left, so each has been refused.
     assert matrix_refusal is not None and surface_refusal is not None
     # The user is told the reason that is easier to change: more steps, if matrices pay
     # then; or that of matrices where no camera moves.
-    is_too_short = (
+    pays_with_more_steps = (
         not findings.surface_light_refusal
         and find_matrix_refusal(problem, None, specialise) is None
     )
-    is_about_matrices = is_too_short or surface_refusal.cause is RefusalCause.NO_CAMERA
+    moves_no_camera = surface_refusal.cause is RefusalCause.NO_CAMERA
+    is_about_matrices = pays_with_more_steps or moves_no_camera
     refusal = matrix_refusal if is_about_matrices else surface_refusal
     if not specialise:
         _report_rendering(refusal, stages, findings)
@@ -361,7 +381,7 @@ class Searches:
     Attributes:
         journal: replays stored evaluations, and stores the others.
         stages: reports the progress.
-        findings: so far; their `predictor` predicts images.
+        findings: findings so far; their `predictor` predicts images.
         printable: whether objectives include print terms.
         close_looks: further renders of candidates that are close to the best, at most.
     """
@@ -383,7 +403,7 @@ class Searches:
             name: name of the stage.
             title: title for the progress.
             steps: steps of the search.
-            shorter: which settings shorten it.
+            shorter: sentence about the settings that shorten it.
         """
         n_renders = count_planned_renders(steps, max_extra_repeats=self.close_looks)
         samples = format_count(self.problem.spp, "sample")
@@ -393,6 +413,25 @@ class Searches:
             n_traced = n_renders - steps
             hint = f"{steps} pictures predicted and {n_traced} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
+
+    def _mark_domain(self, domain: Domain, policy: Policy[Any]) -> Domain:
+        """Return a domain that states what its evaluations are: predicted or rendered.
+
+        Predicted ones may be exact, that is without noise, and may draw conditions
+        themselves, for policies that use their gradients.
+
+        Args:
+            domain: domain to search.
+            policy: policy that searches it.
+        """
+        predictor = self.findings.predictor
+        if predictor is None:
+            return replace(domain, exact=False, draws_conditions=False)
+        return replace(
+            domain,
+            exact=predictor.is_exact,
+            draws_conditions=predictor.draws_conditions and policy.uses_gradient,
+        )
 
     def search(
         self,
@@ -452,18 +491,9 @@ class Searches:
             on_replay = ignore_replay if predictor is None else predictor.replay
             return self.journal.evaluate_all(queries, self._evaluate, on_replay)
 
-        domain = domain or self.problem.domain
-        if predictor is None:
-            domain = replace(domain, exact=False, draws_conditions=False)
-        else:
-            domain = replace(
-                domain,
-                exact=predictor.is_exact,
-                draws_conditions=predictor.draws_conditions and policy.uses_gradient,
-            )
         result = search(
             evaluate,
-            domain,
+            self._mark_domain(domain or self.problem.domain, policy),
             policy,
             steps=steps,
             seed=seed,
@@ -506,6 +536,24 @@ class Searches:
             )
 
 
+def _choose_verification_samples(
+    verifier: Verifier, results: Sequence[SearchResult], adversarial: Tensor
+) -> None:
+    """Choose the samples per pixel of a verification, and store them in its state.
+
+    Args:
+        verifier: verifier of the attack.
+        results: results of all searches; their cost limits what the choice may cost.
+        adversarial: (d,) the adversarial configuration.
+    """
+    problem = verifier.problem
+    n_images = sum(
+        (result.renders + result.gradients) * problem.n_draws for result in results
+    )
+    configurations = {"adversarial": adversarial, "clean": problem.domain.start}
+    verifier.choose_spp(configurations, search_samples=n_images * problem.spp)
+
+
 def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     """Verify with fresh seeds what the searches claim, paired with the clean scene.
 
@@ -520,23 +568,18 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         is_smallest: whether the smallest change was searched.
     """
     findings = verifier.state
-    problem = verifier.problem
     candidate = findings.search
     baseline = findings.baseline
     unprinted = findings.unprinted
     if candidate is None:
         raise RuntimeError("nothing was searched, so there is nothing to verify")
-    adversarial = problem.domain.project(candidate.best_u)
+    adversarial = verifier.problem.domain.project(candidate.best_u)
     results = [
         result for result in (candidate, baseline, unprinted) if result is not None
     ]
     if not is_smallest or findings.sample_count is None:
-        n_images = sum(
-            (result.renders + result.gradients) * problem.n_draws for result in results
-        )
-        configurations = {"adversarial": adversarial, "clean": problem.domain.start}
-        verifier.choose_spp(configurations, search_samples=n_images * problem.spp)
-    n_groups = len(results)
+        _choose_verification_samples(verifier, results, adversarial)
+    n_groups = len(results)  # groups of trials, one for each configuration
     if not verifier.has_clean_trials:
         n_groups += 1
     verifier.begin_stage(
@@ -685,6 +728,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         problem.domain,
         likely=None if transport is None else transport.is_likely_success,
     )
+    # `passes` makes `n_trials` trials: so many repeats make enough of them
     n_repeats = math.ceil(MIN_CONFIRMING_TRIALS / n_trials)
     if bracket.u is not None:
         verifier.begin_stage(
@@ -694,12 +738,25 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         )
     bracket = confirm_bracket(bracket, passes, problem.domain, times=n_repeats)
     findings.bracket = bracket
+    findings.search = _combine_results(results, bracket)
+
+
+def _combine_results(results: Sequence[SearchResult], bracket: Bracket) -> SearchResult:
+    """Return one result of several searches in smaller and smaller budgets.
+
+    It is that of the search that found the smallest change, or of the first if none
+    did, with the cost of all.
+
+    Args:
+        results: results of the searches.
+        bracket: the smallest change, with the number of the search that found it.
+    """
     winner = results[0]
     if bracket.u is not None:
         winner = replace(
             results[bracket.found_by], best_u=bracket.u, ending=Ending.FOUND
         )
-    findings.search = replace(
+    return replace(
         winner,
         renders=sum(result.renders for result in results),
         gradients=sum(result.gradients for result in results),
@@ -741,6 +798,7 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     rule = problem.rule
     if known is None or not known.examples or rule.is_conditional:
         return
+    # A model that is wrong about the clean scene fails without any change.
     if rule.is_already_wrong(count_right(findings.clean_trials, 1)):
         return
     failures = known.examples[:MAX_TRIED_FAILURES]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -74,7 +74,7 @@ class StudyAttack:
     """One attack of a study.
 
     Attributes:
-        config: its settings.
+        config: settings of the attack.
         name: name of its directory.
         subject: the object or the model that tells it from the others.
         epsilon: epsilon of a curve; None otherwise.
@@ -158,7 +158,7 @@ def attacks_of(settings: JsonObject) -> BatchFunction:
                 ending = attack_once(config, clean=clean).summary.ending
                 finished.append((study_attack.name, str(path), _read_files(path)))
                 if ending in SETTLED:
-                    break
+                    break  # no larger epsilon is needed
         return finished
 
     return make_chain
@@ -179,8 +179,8 @@ def distribute_attacks(
     """Have workers make the attacks of a study that have not begun, if requested.
 
     Args:
-        config: config of the study.
-        chains: all of its attacks.
+        config: settings of the study.
+        chains: all of its attacks, in chains of growing epsilon.
         run: its run directory, which gets the files.
         progress: reports it.
 
@@ -341,7 +341,7 @@ def _find_label_warnings(config: AttackConfig) -> list[str]:
     """Return the warnings about a label that several objects share."""
     if config.label is None or len(config.objects) <= 1:
         return []
-    bundled = list_objects()
+    bundled = list_objects()  # objects of files have no label of their own
     labels = {
         name: load_object(name).label if name in bundled else None
         for name in config.objects
@@ -360,6 +360,7 @@ def curve(context: RunContext[AttackConfig]) -> CurveResult:
     """
     study = StudyRun(context)
     rows = [_attack_object(study, chain) for chain in study.chains]
+    # None: each control has its own epsilon
     epsilons: list[float | None] = [*sorted(context.config.epsilons)] or [None]
     points = [_compute_accuracy(rows, epsilon) for epsilon in epsilons]
     return study.make_result(CurveResult, epsilons=epsilons, table=rows, curve=points)
@@ -489,12 +490,7 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     cells: dict[str, list[MatrixCell]] = {}
     configurations = _read_configurations(attacked)
     if configurations and not study.interrupted:
-        sample_counts = [
-            summary.sample_count.spp
-            for summary in attacked.values()
-            if summary.sample_count
-        ]
-        spp = config.verify_spp or max([MIN_TRIAL_SPP, *sample_counts])
+        spp = config.verify_spp or _choose_trial_spp(attacked.values())
         with context.until_interrupted():
             _try_on_models(study, names, spp, configurations, models, cells)
     rows = [
@@ -525,6 +521,17 @@ def _read_configurations(attacked: Mapping[str, AttackSummary]) -> dict[str, Ten
     }
 
 
+def _choose_trial_spp(summaries: Iterable[AttackSummary]) -> int:
+    """Return the samples per pixel that suffice for the trials of several attacks.
+
+    These are the most that any of them needed, at least `MIN_TRIAL_SPP`.
+    """
+    sample_counts = [
+        summary.sample_count.spp for summary in summaries if summary.sample_count
+    ]
+    return max([MIN_TRIAL_SPP, *sample_counts])
+
+
 def _try_on_models(
     study: StudyRun,
     names: Sequence[str],
@@ -540,9 +547,9 @@ def _try_on_models(
         names: names of the models.
         spp: samples per pixel of the trials.
         configurations: (d,) the adversarial ones, by the model that was attacked.
-        models: is filled: what each model predicts of the clean scene.
-        cells: is filled: what each model predicts of an adversarial scene, by the model
-            that was attacked. What is done before an interrupt stays.
+        models: list to fill with what each model predicts of the clean scene.
+        cells: mapping to fill with what each model predicts of an adversarial scene, by
+            the model that was attacked. What is done before an interrupt stays.
     """
     config = study.context.config
     study.progress.stage("loading the models to try the scenes on")

@@ -41,7 +41,6 @@ def attack_verdict(summary: AttackSummary) -> str:
     ending = summary.ending
     verified = summary.verified
     thing = _name_thing(summary)
-    after_steps = f"after {format_count(summary.steps, 'step')}"
     if ending == "already wrong":
         wrong = words.format_mistake(
             summary.task, thing, summary.clean.label, get_outcome(summary.clean.payload)
@@ -50,17 +49,8 @@ def attack_verdict(summary: AttackSummary) -> str:
             f"The model already {wrong}: nothing was changed and nothing counts as "
             "found."
         )
-    if verified is None and ending == "interrupted" and summary.adversarial:
-        outcome = get_outcome(summary.adversarial.payload)
-        predicts = words.format_mistake(
-            summary.task, thing, summary.adversarial.label, outcome
-        )
-        return (
-            f"Interrupted {after_steps}. What was found so far is not verified: the "
-            f"model {predicts}."
-        )
     if verified is None:
-        return f"{ending[:1].upper()}{ending[1:]} {after_steps}; nothing is verified."
+        return _unverified_verdict(summary, thing)
     has_paths = summary.drive is not None and len(summary.drive.paths) > 1
     rate = words.format_rate(verified) + condition_text(summary.over, has_paths)
     claim, goal = _clauses(summary, thing)
@@ -74,11 +64,33 @@ def attack_verdict(summary: AttackSummary) -> str:
             f"The search claims a wrong prediction that is not confirmed: {claim} "
             f"in {rate}."
         )
+    # the search has ended without finding anything
     reason = _REASONS.get(ending, f"The search ended: {ending}.")
     return (
         f"No change of {budget_text(summary)} was found that {goal}: {claim} in "
         f"{rate}. {reason}"
     )
+
+
+def _unverified_verdict(summary: AttackSummary, thing: str) -> str:
+    """Return what a run found that ended before anything was verified.
+
+    Args:
+        summary: summary of the attack.
+        thing: the object that is evaluated, as "this mug".
+    """
+    ending = summary.ending
+    after_steps = f"after {format_count(summary.steps, 'step')}"
+    if ending == "interrupted" and summary.adversarial:
+        outcome = get_outcome(summary.adversarial.payload)
+        predicts = words.format_mistake(
+            summary.task, thing, summary.adversarial.label, outcome
+        )
+        return (
+            f"Interrupted {after_steps}. What was found so far is not verified: the "
+            f"model {predicts}."
+        )
+    return f"{ending[:1].upper()}{ending[1:]} {after_steps}; nothing is verified."
 
 
 def _name_thing(summary: AttackSummary) -> str:
@@ -314,38 +326,56 @@ def _error_clause(
     Args:
         summary: summary of the attack.
         verified: the rate of the trials.
-        thing: what is evaluated.
-        claim: what a trial counts as.
+        thing: the object that is evaluated, as "this mug".
+        claim: clause for what a trial counts as, "the model is wrong about it" say.
     """
     labels = verified.labels
-    if summary.task == words.COMMAND and not summary.target and len(labels) == 1:
-        direction = next(iter(labels)).replace("action outside its envelope ", "")
-        if direction and not summary.minimises:
-            claim += f" {direction}"
     if summary.minimises or summary.task == words.COMMAND:
+        if not summary.minimises and not summary.target and len(labels) == 1:
+            # such as "(steering above it)"
+            direction = next(iter(labels)).replace("action outside its envelope ", "")
+            claim = f"{claim} {direction}" if direction else claim
         return claim[:1].upper() + claim[1:]
-    outcome = words.get_only_outcome(verified.outcomes)
     if len(labels) == 1:
+        outcome = words.get_only_outcome(verified.outcomes)
         predicts = words.format_mistake(
             summary.task, thing, next(iter(labels)), outcome
         )
         return f"The model {predicts}"
     if labels:
-        error = f"is wrong about {thing}"
-        if summary.target:
-            error = f"takes {thing} for one of the targets"
-        if outcome is None and verified.outcomes:
-            outcomes = words.format_outcomes(verified.outcomes, summary.task)
-            return f"The model {error} ({outcomes})"
-        most_frequent = max(labels, key=lambda label: labels[label])
-        calling = words.format_mistake_participle(summary.task, most_frequent, outcome)
-        return f"The model {error}, most often {calling},"
+        return _mixed_error_clause(summary, verified, thing)
     if summary.task != words.CLASSIFICATION:
         return f"The model is wrong about {thing}"
     name = "something else"
     if summary.adversarial:
         name = words.add_article(summary.adversarial.label)
     return f"The model takes {thing} for something else ({name})"
+
+
+def _mixed_error_clause(
+    summary: AttackSummary, verified: VerifiedRate, thing: str
+) -> str:
+    """Return what the model gets wrong if trials have several predictions.
+
+    That is the most frequent prediction, or the outcomes of a detector if there are
+    several.
+
+    Args:
+        summary: summary of the attack.
+        verified: the rate of the trials, with how often each label was predicted.
+        thing: the object that is evaluated, as "this mug".
+    """
+    error = f"is wrong about {thing}"
+    if summary.target:
+        error = f"takes {thing} for one of the targets"
+    outcome = words.get_only_outcome(verified.outcomes)
+    if outcome is None and verified.outcomes:
+        outcomes = words.format_outcomes(verified.outcomes, summary.task)
+        return f"The model {error} ({outcomes})"
+    labels = verified.labels
+    most_frequent = max(labels, key=lambda label: labels[label])
+    calling = words.format_mistake_participle(summary.task, most_frequent, outcome)
+    return f"The model {error}, most often {calling},"
 
 
 def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
@@ -357,7 +387,7 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
 
     Args:
         summary: summary of the attack.
-        thing: what is evaluated.
+        thing: the object that is evaluated, as "this mug".
     """
     target = summary.target or []
     target_names = " or ".join(target)

@@ -33,6 +33,8 @@ MIN_CALLS = 5
 COLD_CALLS = 2
 # fraction of the remaining time that one setting may need
 MAX_SETTING_FRACTION = 0.25
+# longest list of parameters in a name; of a longer one only the first is named
+MAX_NAME_LETTERS = 28
 # maximum number of independent parts of a reference
 MAX_REFERENCE_PARTS = 64
 Part = TypeVar("Part")
@@ -202,6 +204,7 @@ def choose_part_samples(
     """Return the largest sample count of which several calls fit into some seconds.
 
     The last of three calls tells how long one takes, since the first ones compile.
+    Time is taken to be proportional to the samples.
 
     Args:
         call: takes a part with a number of samples.
@@ -209,9 +212,10 @@ def choose_part_samples(
         parts: number of parts.
         counts: sample counts, ascending; the first is returned if none fits.
     """
-    for _ in range(3):
+    for _ in range(COLD_CALLS + 1):
         start = time.perf_counter()
         call(counts[0])
+    # of the last call
     seconds_per_sample = (time.perf_counter() - start) / counts[0]
     fitting = [
         count for count in counts if parts * count * seconds_per_sample <= seconds
@@ -329,12 +333,15 @@ class PictureBench:
         families = list(dict.fromkeys(map(get_denoiser, self._lines)))
         rows = []
         for index, family in enumerate(families):
+            # an even fraction of what is left, since a family may have left time over
             family_budget = budget.take_fraction(1.0 / (len(families) - index))
             line = REFERENCE_SAMPLER
             if family == "oidn":
                 line += OIDN
+            first_seed = 0
             spp = choose_part_samples(
-                partial(self._render_radiance, line, 0), family_budget.seconds_left
+                partial(self._render_radiance, line, first_seed),
+                family_budget.seconds_left,
             )
             radiances = take_reference_parts(
                 partial(self._render_radiance, line, spp=spp),
@@ -416,7 +423,7 @@ class GradientPart:
 
     Attributes:
         name: name of the control, with the parameters if a control has several parts.
-        groups: which have the coordinates.
+        groups: groups of the coordinates.
         estimators: estimators that are valid for all of them.
     """
 
@@ -465,7 +472,7 @@ def list_gradient_parts(
         name = members[0].control
         if controls.count(name) > 1:
             parameters = ",".join(group.parameter for group in members)
-            if len(parameters) > 28:
+            if len(parameters) > MAX_NAME_LETTERS:
                 parameters = f"{members[0].parameter},... ({len(members)})"
             name = f"{name}.{parameters}"
         estimators = tuple(
@@ -545,9 +552,11 @@ class GradientBench:
             parts = take_reference_parts(
                 partial(compute, spp=spp), budget, on_done, seed
             )
+            derivatives = [derivative for derivative, _ in parts]
+            # Extrapolation to a step of 0 removes most of what two steps disagree by: a
+            # quarter is taken as what is left.
             disagreements = [disagreement for _, disagreement in parts]
             bias = float(np.linalg.norm(np.mean(disagreements, axis=0))) / 4.0
-            derivatives = [derivative for derivative, _ in parts]
             self.reference = estimate_reference(derivatives, bias=bias)
         else:
             compute = partial(

@@ -237,7 +237,7 @@ class QuantityMeasurer:
         u = problem.add_conditions(problem.domain.start)
 
         def margin(image: torch.Tensor) -> float:
-            return -problem.judge(image, u).score
+            return -problem.judge(image, u).score  # a score is a negative margin
 
         bench = PictureBench(
             problem.renderer, u, margin, self._config.compared_samplers
@@ -257,7 +257,6 @@ class QuantityMeasurer:
         sitting = self._measure_settings(
             title, bench, budget.take_fraction(first_fraction)
         )
-        remark = None
         recommended = recommend_settings(
             sitting.points,
             confirmations=[],
@@ -265,6 +264,7 @@ class QuantityMeasurer:
             round_up=self.round_up,
             or_steeper=self.may_be_steeper,
         )[0]  # a gradient is one quantity
+        remark = None
         if budget.seconds_left > 0.0:
             remark = bench.check_bias(self._seed)
         again = self._confirm(title, bench, recommended, budget)
@@ -344,6 +344,7 @@ class QuantityMeasurer:
         )
         points = []
         for setting, samples in measured.results.items():
+            # A sample has numbers for each quantity, such as "picture" and "margin".
             for quantity in samples[0]:
                 numbers = [sample[quantity] for sample in samples]
                 points.append(
@@ -429,8 +430,8 @@ def recommend_settings(
         confirmations: gradient settings that were measured again.
         goal: the relative error.
         round_up: gives the next sample count that a setting takes.
-        or_steeper: or steeper of a point, whether the error may fall faster; see
-            `fit_line`.
+        or_steeper: function of a point, whether its error may fall faster than that of
+            independent samples; see `fit_line`.
     """
     candidates: dict[tuple[str, ...], list[Recommended]] = {}
     for (quantity, control, family, _), line in group_by_line(points).items():

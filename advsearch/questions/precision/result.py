@@ -338,16 +338,17 @@ def make_view(result: PrecisionResult) -> ShownResult:
 
 def make_headline(result: PrecisionResult) -> str:
     """Summarize a result in a sentence: the first setting that reaches the goal."""
-    found = next((row for row in result.recommendations if row.estimator), None)
-    if found is None:
+    # a recommendation without an estimator states that none reaches the goal
+    first = next((row for row in result.recommendations if row.estimator), None)
+    if first is None:
         return (
             "Nothing that was measured is known to reach the error: give it more "
             "`seconds` or a larger `error`."
         )
-    quantity = describe_quantity(found.quantity, found.control)
+    quantity = describe_quantity(first.quantity, first.control)
     return (
-        f"For {100 * result.goal:.3g} % error of {quantity}: {found.spp} samples "
-        f"({found.estimator}), {found.seconds:.2g} s of processor time, here."
+        f"For {100 * result.goal:.3g} % error of {quantity}: {first.spp} samples "
+        f"({first.estimator}), {first.seconds:.2g} s of processor time, here."
     )
 
 
@@ -361,11 +362,9 @@ def describe_recommendation(recommendation: Recommended, goal: float) -> str:
             f"{goal_text}: not reached by anything that was measured; give it more "
             "`seconds` or a larger `error`"
         )
-    basis = (
-        ""
-        if recommendation.basis in ("interpolated", "fitted")
-        else f" ({recommendation.basis})"
-    )
+    # Only the exceptions are named, such as "extrapolated".
+    is_usual = recommendation.basis in ("interpolated", "fitted")
+    basis = "" if is_usual else f" ({recommendation.basis})"
     return (
         f"{goal_text}: {recommendation.estimator}, {recommendation.spp} samples, "
         f"{recommendation.seconds:.2g} s{basis}"
@@ -379,11 +378,13 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     clock.
     """
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
+    # of each point with a time by the clock: whether it took twice the processor time
     waited = [
         point.wall_seconds > 2.0 * point.seconds
         for point in points
         if point.wall_seconds is not None
     ]
+    is_busy = 2 * sum(waited) > len(waited)  # more than half of them
     warnings = []
     if heavy:
         warnings.append(
@@ -391,7 +392,7 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
             "that repeats say too little and "
             "it has no interval; a denoiser or more `rounds` help"
         )
-    if 2 * sum(waited) > len(waited):
+    if is_busy:
         warnings.append(
             "the machine was busy with something else: by the clock, most pictures and "
             "gradients took over twice their "
@@ -427,11 +428,11 @@ def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> Result
 
 
 def _format_interval(interval: results.Interval | None) -> str:
-    return (
-        ""
-        if interval is None
-        else (f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}")
-    )
+    """Format an interval in percent: "1.2 to 3.4"; empty without one."""
+    if interval is None:
+        return ""
+    lower, upper = interval
+    return f"{100 * lower:.2g} to {100 * upper:.2g}"
 
 
 GREY = figures.GREY
@@ -541,18 +542,7 @@ def _draw_errors(
     _draw_theory(axes, points)
     _plain_axis(axes.xaxis)
     _plain_axis(axes.yaxis)
-    goal = result.goal * PERCENT
-    (lower, upper) = axes.get_ylim()
-    if lower < goal < upper:
-        axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
-        axes.annotate(
-            f"{goal:g} %",
-            (1.0, goal),
-            xycoords=("axes fraction", "data"),
-            ha="right",
-            va="bottom",
-            fontsize=8,
-        )
+    _draw_goal(axes, result.goal * PERCENT)
     axes.grid(True, which="major")
     axes.legend(
         loc="upper left",
@@ -570,7 +560,23 @@ def _make_label(name: str, slope: PrecisionSlope | None) -> str:
     if slope is None:
         return name
     theory = f" (not {slope.theory:.2f})" if slope.agrees is False else ""
-    return f"{name}  {slope.slope:.2f}{theory}".replace(" -", f" {MINUS}")
+    label = f"{name}  {slope.slope:.2f}{theory}"
+    return label.replace(" -", f" {MINUS}")  # the sign that figures have
+
+
+def _draw_goal(axes: Any, goal: float) -> None:
+    """Draw a dotted line at the error that is the goal, in percent, if it is in view."""
+    lower, upper = axes.get_ylim()
+    if lower < goal < upper:
+        axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
+        axes.annotate(
+            f"{goal:g} %",
+            (1.0, goal),
+            xycoords=("axes fraction", "data"),
+            ha="right",
+            va="bottom",
+            fontsize=8,
+        )
 
 
 def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
@@ -626,30 +632,7 @@ def _draw_line(
         alpha=0.55,
     )
     for point in line:
-        x = point.seconds
-        y = PERCENT * point.rms
-        lower, upper = (
-            PERCENT * bound for bound in point.interval or (math.nan, math.nan)
-        )
-        # Neither a missing interval (NaN) nor a very wide one is drawn.
-        if upper < 4.0 * y:
-            axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
-        axes.plot(
-            [x],
-            [y],
-            marker=marker,
-            markersize=5,
-            color=color,
-            markerfacecolor=color if point.is_known else "white",
-        )
-        if not point.is_known:
-            arrow = {
-                "arrowstyle": "-|>",
-                "color": color,
-                "linewidth": 0.8,
-                "shrinkA": 3,
-            }
-            axes.annotate("", (x, y * 0.72), (x, y), arrowprops=arrow)
+        _draw_point(axes, point, color, marker)
     axes.plot(
         # an empty line, whose entry in the legend has marker and line
         [],
@@ -660,6 +643,36 @@ def _draw_line(
         linewidth=1.0,
         label=label,
     )
+
+
+def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> None:
+    """Draw the relative error of one setting with its interval, in percent.
+
+    A known error is a filled marker. An open one with an arrow down is an upper limit.
+    """
+    x = point.seconds
+    y = PERCENT * point.rms
+    lower, upper = (PERCENT * bound for bound in point.interval or (math.nan, math.nan))
+    # Neither a missing interval (NaN) nor a very wide one is drawn.
+    if upper < 4.0 * y:
+        axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
+    axes.plot(
+        [x],
+        [y],
+        marker=marker,
+        markersize=5,
+        color=color,
+        markerfacecolor=color if point.is_known else "white",
+    )
+    if not point.is_known:
+        arrow = {
+            "arrowstyle": "-|>",
+            "color": color,
+            "linewidth": 0.8,
+            "shrinkA": 3,
+        }
+        arrow_tip = y * 0.72  # the axis is logarithmic: as long for every point
+        axes.annotate("", (x, arrow_tip), (x, y), arrowprops=arrow)
 
 
 def _plain_axis(axis: Any) -> None:
@@ -686,7 +699,7 @@ def _plain_axis(axis: Any) -> None:
             if low <= factor * 10.0**power <= high
         ]
         if len(ticks) >= 3:
-            break
+            break  # else the next factors give more ticks
     axis.set_major_locator(FixedLocator(ticks))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.set_minor_formatter(NullFormatter())

@@ -157,6 +157,7 @@ def estimate_reference(
         for jackknife_value in jackknife_values
     )
     scatter = math.sqrt((count - 1) / count * sum_of_squares)
+    # with the factor of Efron's formula; two parts are too few to tell a bias
     bias_estimate = 0.0
     if count > 2:
         bias_estimate = (count - 1) * float(np.linalg.norm(center - value))
@@ -183,7 +184,7 @@ def summarize_samples(
     measurement and heavy tails have none.
 
     Args:
-        setting: which was measured.
+        setting: the setting that was measured.
         samples: the measurements, each with its relative "error", and with "cosine" and
             times if they are known.
         reference_error: relative error of what they were compared with.
@@ -293,18 +294,6 @@ def fit_line(
     # two degrees of freedom are used up by slope and offset
     quantile = float(stdtrit(len(known) - 2, (1.0 + CONFIDENCE) / 2.0))
     half_width = quantile * float(line.stderr)
-    difference = slope - MONTE_CARLO_SLOPE
-    if not or_steeper:
-        difference = abs(difference)
-    agrees: bool | None = False
-    if difference <= SLOPE_TOLERANCE:
-        agrees = True
-    elif difference <= half_width:
-        agrees = None
-    theory: float | None = MONTE_CARLO_SLOPE
-    if or_steeper is None:
-        theory = None
-        agrees = None
     return PrecisionSlope(
         quantity=known[0].quantity,
         control=known[0].control,
@@ -313,10 +302,32 @@ def fit_line(
         interval=(slope - half_width, slope + half_width),
         offset=float(line.intercept),
         points=len(known),
-        theory=theory,
+        theory=None if or_steeper is None else MONTE_CARLO_SLOPE,
         or_steeper=bool(or_steeper),
-        agrees=agrees,
+        agrees=_agrees_with_theory(slope, half_width, or_steeper),
     )
+
+
+def _agrees_with_theory(
+    slope: float, half_width: float, or_steeper: bool | None
+) -> bool | None:
+    """Return whether a slope is that of theory; None if that is not known.
+
+    Args:
+        slope: slope of log error against log samples.
+        half_width: half the width of its interval.
+        or_steeper: whether a steeper slope agrees, too; None if theory says nothing.
+    """
+    if or_steeper is None:
+        return None
+    difference = slope - MONTE_CARLO_SLOPE  # negative if steeper
+    if not or_steeper:
+        difference = abs(difference)
+    if difference <= SLOPE_TOLERANCE:
+        return True
+    if difference <= half_width:  # noise may be the reason
+        return None
+    return False
 
 
 def describe_disagreement(
@@ -356,8 +367,11 @@ def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
         for a, b in pairwise(known)
         if b.spp > a.spp
     ]
+    if len(slopes) < 2:
+        return False
     # Slopes are negative: the steepest is the smallest.
-    return len(slopes) >= 2 and slopes[-1] > 0.5 * min(*slopes[:-1], 0.0)
+    steepest_before = min(*slopes[:-1], 0.0)
+    return slopes[-1] > 0.5 * steepest_before
 
 
 def round_up_exactly(point: PrecisionPoint, samples: float) -> int:
@@ -405,11 +419,7 @@ def recommend_count(
     if explaining_line:
         error = _error_on_line(explaining_line, spp)
     else:
-        slope = MONTE_CARLO_SLOPE
-        if line:
-            slope = max(line.slope, MIN_EXTRAPOLATED_SLOPE)
-        errors = [point.rms for point in ordered]
-        error = _interpolate_value(ordered, spp, errors, slope)
+        error = _interpolate_error(ordered, spp, line)
     seconds = [point.seconds for point in ordered]
     return Recommended(
         quantity=ordered[0].quantity,
@@ -466,6 +476,24 @@ def _solve_line(
     if samples <= MAX_EXTRAPOLATION * largest:
         return samples, "extrapolated"
     return None, "extrapolated"
+
+
+def _interpolate_error(
+    ordered: Sequence[PrecisionPoint], spp: int, line: PrecisionSlope | None
+) -> float:
+    """Return the error at a sample count, interpolated between points.
+
+    Args:
+        ordered: points by ascending samples.
+        spp: the sample count.
+        line: fitted line, whose slope the error follows beyond the last point; None
+            follows theory.
+    """
+    slope = MONTE_CARLO_SLOPE
+    if line:
+        slope = max(line.slope, MIN_EXTRAPOLATED_SLOPE)
+    errors = [point.rms for point in ordered]
+    return _interpolate_value(ordered, spp, errors, slope)
 
 
 def confirm_recommendation(

@@ -101,7 +101,8 @@ def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     recipe = _load_recipe(context)
     runs = plan_runs(recipe, config)
     description.check_powers(recipe, runs, config.recipe)
-    if _read_noted_recipe(context) is None:
+    is_new = _read_noted_recipe(context) is None
+    if is_new:  # a resumed run was checked when it began
         check_recipe(recipe, config)
         check_figures(recipe, check_runs(runs), config.recipe)
     context.run.store.write_note(
@@ -153,16 +154,7 @@ def _make_result(
 ) -> RecipeResult:
     """Make the result of a recipe; a resumed run adds the seconds it took before."""
     config = context.config
-    recipe_settings = description.apply_command_settings(recipe, config).settings
-    defaults = {
-        "object": "",
-        "environment": SceneConfig.default_environment,
-        "model": "reference",
-    }
-    names = {
-        setting: description.split_name_list(recipe_settings.get(setting) or default)
-        for setting, default in defaults.items()
-    }
+    names = _list_scene_names(recipe, config)
     controls = [name for run, _ in done for name in run.config.controls]
     parts = [
         RecipePart(
@@ -196,6 +188,23 @@ def _make_result(
     return result
 
 
+def _list_scene_names(recipe: Recipe, config: RecipeConfig) -> dict[str, list[str]]:
+    """Return the names of the objects, environments and models of a recipe.
+
+    These are by the name of the setting: "object", "environment" and "model".
+    """
+    recipe_settings = description.apply_command_settings(recipe, config).settings
+    defaults = {
+        "object": "",
+        "environment": SceneConfig.default_environment,
+        "model": "reference",
+    }
+    return {
+        setting: description.split_name_list(recipe_settings.get(setting) or default)
+        for setting, default in defaults.items()
+    }
+
+
 def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
     """Check the photographs and figures of a recipe before anything is rendered.
 
@@ -212,6 +221,7 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
         photographs = workbench.load_photographs()
         for run in photographed:
             directory = Path(config.photographs) / Path(run.config.object).stem
+            # only a check: raises if the task cannot evaluate a photograph
             photographs.list_files(directory, run.config.task)
     for figure in recipe.figures:
         kind, _ = read_figure_options(figure, config.recipe)
@@ -241,7 +251,7 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
             for name, value in run.config.to_json().items()
             if name not in ("seed", WORKERS_COLUMN)
         }
-        key = f"{distinct_settings} {run.around}"
+        key = f"{distinct_settings} {run.around}"  # settings have no hash, text has
         if key not in parameters_of_settings:
             # the search around whose distribution this run samples
             search = config_of_run[run.around] if run.around else None
@@ -261,7 +271,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
 
     Args:
         config: the settings of the run.
-        search: those of the search; None of a run that samples around none.
+        search: settings of the search; None of a run that samples around none.
     """
     if search is None and isinstance(config, SweepConfig):
         return workbench.row_parameters(config)
@@ -301,6 +311,7 @@ def check_figures(
     for index, described in enumerate(recipe.figures, start=1):
         kind, options = read_figure_options(described, where)
         location = f"It stands in {where}, figure {index} ({kind})"
+        # the part that all others are compared with; it needs none of the columns
         baseline = getattr(options, "beside", None)
         _check_option_parts(recipe, options, baseline, location)
         parts = options.of or tuple(columns)
@@ -312,7 +323,7 @@ def check_figures(
         if not columns_of_part:
             continue
         for option in COLUMN_OPTIONS:
-            value = getattr(options, option, None) or ()
+            value = getattr(options, option, None) or ()  # a name, or several
             names = [value] if isinstance(value, str) else value
             for name in names:
                 _check_column(
@@ -349,9 +360,9 @@ def _check_column(
     """Check that all parts of a figure have a column.
 
     Args:
-        recipe: recipe with groups, all parts have a column of the group.
+        recipe: the recipe; if it has groups, all parts have a column of the group.
         name: name of the column.
-        option: option of the figure, which names it.
+        option: option of the figure that names the column.
         columns_of_part: names of columns of each part of the figure.
         location: location of the figure, for messages.
 
@@ -369,6 +380,7 @@ def _check_column(
         if matching.isdisjoint(columns)
     ]
     if len(lacking) == len(columns_of_part):
+        # the message lists the columns that any part has
         for columns in columns_of_part.values():
             known |= {
                 column for column in columns if not column.endswith(ANY_PARAMETER)
@@ -491,7 +503,8 @@ def _range_around(
     lower, upper, center = (to_scale(value) for value in (*search_range, mean))
     # A uniform distribution of deviation s is 2 sqrt(3) s wide.
     half_width = math.sqrt(3.0) * deviation * (upper - lower)
-    if parameter.periodic and upper - lower >= FULL_TURN:
+    is_full_turn = parameter.periodic and upper - lower >= FULL_TURN
+    if is_full_turn:  # an angle beyond the bounds is one inside of them
         half_width = min(half_width, FULL_TURN / 2)
         bounds = [center - half_width, center + half_width]
     else:
@@ -507,7 +520,7 @@ def _add_photographs(
     """Add photographs to the runs that they are compared with.
 
     Args:
-        folder: has a directory of photographs for each object, of its name.
+        folder: folder with a directory of photographs for each object, of its name.
         runs: the runs to add them to.
         run: the run of the recipe.
 
@@ -570,6 +583,7 @@ def _read_frame(
     units = dict[str, str]()
     surfaces = dict[str, Any]()
     for run, result in done:
+        # kinds of stored rows by the part that they count for; an attack has trials
         row_kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIAL_NAMES)}
         if isinstance(run.config, SweepConfig):
             row_kinds = {

@@ -252,7 +252,7 @@ class PlannedRun:
     Attributes:
         name: name of its directory.
         part: part of the recipe.
-        config: its settings.
+        config: settings of the run.
         around: the directory of the run whose result it samples around; None of others.
     """
 
@@ -280,12 +280,14 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
         for index, values in enumerate(product(*axes.values())):
             value_of_axis = dict(zip(axes, values, strict=True))
             run_config = _make_run_config(recipe, name, index, value_of_axis, config)
+            # the object, and what else differs between the runs of the part
             words = [
                 value
                 for axis, value in value_of_axis.items()
                 if axis == "object" or len(axes[axis]) > 1
             ]
             suffix = f"{index:02d}-{make_directory_name(words)}"
+            # the run of the search has the same number and words
             around = f"{part.around}-{suffix}" if part.around else part.around
             runs.append(
                 PlannedRun(
@@ -351,7 +353,7 @@ def _make_run_config(
     except settings.SettingsError as error:
         raise settings.SettingsError(error.problems, where) from None
     except errors.UnknownNameError:
-        raise
+        raise  # an InputError too, which lists the known names
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
@@ -377,7 +379,9 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
     Raises:
         InputError: for the first such part.
     """
-    if is_file_name(name) or recipe != read_recipe(name):
+    # a bundled recipe that a run has noted may have been changed there
+    is_bundled = not is_file_name(name) and recipe == read_recipe(name)
+    if not is_bundled:
         for run in runs:
             run.config.check_powers(f"{name}: parts: {run.part}")
 

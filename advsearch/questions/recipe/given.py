@@ -47,9 +47,9 @@ def make_predictions_figure(rows: Rows, options: PredictionsOptions) -> FigureCo
         groups[value] = []
         ranking = rates.rank_predictions(group_rows[rates.PREDICTION_COLUMN])
         for label, _ in ranking[: options.most]:
-            flags = group_rows[rates.PREDICTION_COLUMN] == label
-            tally = ClusteredFraction.from_rows(label, group_rows, flags)
-            n_right = int(group_rows["correct"][flags].sum())
+            has_label = group_rows[rates.PREDICTION_COLUMN] == label
+            tally = ClusteredFraction.from_rows(label, group_rows, has_label)
+            n_right = int(group_rows["correct"][has_label].sum())
             groups[value].append((tally, n_right))
 
     def draw(figure: Any) -> None:
@@ -94,7 +94,8 @@ def _describe_predictions(
     sentences = list[str]()
     for value, counts in groups.items():
         tally, n_right = counts[0]
-        if 2 * n_right < tally.n_counted:
+        is_mostly_right = 2 * n_right >= tally.n_counted
+        if not is_mostly_right:
             sentences.append(
                 f"For {value} it is {tally.name}, {tally.describe('given')} and right "
                 "in "
@@ -118,7 +119,7 @@ def _draw_stacked_bar(
     Args:
         axes: axes of matplotlib.
         position: position of the bar on the vertical axis.
-        counts: counts of each prediction its tally, and how often it is right.
+        counts: tally of each prediction, and how often it is right.
     """
     left = 0.0
     for tally, n_right in counts:
@@ -143,9 +144,10 @@ def _draw_stacked_bar(
             fontsize=7,
         )
         left += share
+    other_share = max(1.0 - left, 0.0)  # not below 0 by rounding
     axes.barh(
         position,
-        max(1.0 - left, 0.0),
+        other_share,
         left=left,
         color=figures.GREY,
         alpha=0.15,
@@ -207,20 +209,7 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
             texture, texture_rows, names_texture[texture]
         )
 
-    text = [
-        "The prediction is the object, whatever its texture: "
-        f"{ClusteredFraction.from_rows('', rows).describe('so')}."
-    ]
-    with_classes = [name for name in names_texture if options.classes.get(name)]
-    if with_classes:
-        flags = pd.concat([names_texture[name] for name in with_classes])
-        total = ClusteredFraction.from_rows("", rows.loc[flags.index], flags)
-        text.append(
-            f"The prediction names the texture ({', '.join(with_classes)}): "
-            f"{total.describe('so')}."
-        )
-        if not total.fraction:
-            text.append("A model that has no class for a texture cannot name it.")
+    text = _describe_named(rows, names_texture, options)
     text.append(_compare_cues(count_predicted(rows, options)))
     text += rates.describe_extremes(
         list(by_shape.values()), "The hardest texture", "the easiest", "textures"
@@ -237,6 +226,35 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
         draw=lambda figure: _draw_cues(figure, by_shape, by_texture),
         size=(6.0, 1.7 + 0.27 * len(by_shape)),
     )
+
+
+def _describe_named(
+    rows: Rows, names_texture: Mapping[str, Any], options: CuesOptions
+) -> list[str]:
+    """Describe how often predictions name the object, and how often its texture.
+
+    Args:
+        rows: rows with object and texture.
+        names_texture: by texture, which of its rows (n,) have a prediction that names
+            the texture.
+        options: options of the figure; a texture without `classes` has no name that a
+            prediction could have.
+    """
+    text = [
+        "The prediction is the object, whatever its texture: "
+        f"{ClusteredFraction.from_rows('', rows).describe('so')}."
+    ]
+    with_classes = [name for name in names_texture if options.classes.get(name)]
+    if with_classes:
+        flags = pd.concat([names_texture[name] for name in with_classes])
+        total = ClusteredFraction.from_rows("", rows.loc[flags.index], flags)
+        text.append(
+            f"The prediction names the texture ({', '.join(with_classes)}): "
+            f"{total.describe('so')}."
+        )
+        if not total.fraction:
+            text.append("A model that has no class for a texture cannot name it.")
+    return text
 
 
 def _names_class(predictions: Any, classes: Sequence[str]) -> Any:
@@ -317,6 +335,7 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
     for (shape, texture), labels in labels_of_pair.items():
         same_shape, same_texture = _collect_labels(labels_of_pair, shape, texture)
         n_samples = min(len(same_shape), len(same_texture))
+        # none if there is no other texture, or no other object
         if n_samples:
             by_shape = _most_frequent_of_sample(same_shape, n_samples, generator)
             by_texture = _most_frequent_of_sample(same_texture, n_samples, generator)
@@ -335,8 +354,8 @@ def _collect_labels(
 
     Args:
         labels_of_pair: predictions by (shape, texture).
-        shape: which the first have, with other textures.
-        texture: which the second have, with other shapes.
+        shape: shape of the first predictions, with other textures.
+        texture: texture of the second predictions, with other shapes.
     """
     same_shape = list[str]()
     same_texture = list[str]()
@@ -439,7 +458,9 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
 
     ranking = rates.rank_predictions(rows[rates.PREDICTION_COLUMN])
     margins = _margins_by_ingredient(rows, names, main_ingredient)
-    by_margin = len(ranking) == 1 and min(map(len, margins.values())) >= 2
+    has_single_prediction = len(ranking) == 1
+    # a mean margin has an interval from two values on
+    by_margin = has_single_prediction and min(map(len, margins.values())) >= 2
     ranking = ranking[: options.most]
     if by_margin:
         text, heads, table = _describe_margins(ranking[0][0], margins)
@@ -469,10 +490,10 @@ def _split_by_triangle(
     corners: Mapping[Any, Any],
 ) -> list[npt.NDArray[np.bool_]]:
     """Return for each triangle of the diagram which mixtures (n,) lie in it."""
-    triangles = pd.Series(
+    triangle_of_mixture = pd.Series(
         [find_triangle(mixture, options.side) for mixture in mixtures]
     )
-    return [(triangles == triangle).to_numpy() for triangle in corners]
+    return [(triangle_of_mixture == triangle).to_numpy() for triangle in corners]
 
 
 def _make_panels(
@@ -526,6 +547,7 @@ def _read_mixtures(rows: Rows, options: TernaryOptions) -> Float64Array:
         [rates.get_numeric_column(rows, name) for name in options.shares], axis=1
     )
     total = amounts.sum(axis=1, keepdims=True)
+    # not divided by 0, where there is nothing of any
     return amounts / np.where(total == 0.0, 1.0, total)
 
 
@@ -609,7 +631,8 @@ def _describe_ingredients(
                 ClusteredFraction.from_rows(name, rows[is_main], is_label[is_main])
             )
         whose = f"{label}, {wording.percent(times / len(rows))} of all predictions, is"
-        if len({tally.fraction for tally in tallies if tally.total}) == 1:
+        known_fractions = {tally.fraction for tally in tallies if tally.total}
+        if len(known_fractions) == 1:
             text.append(
                 f"{whose} given as often whatever most of the mixture is: no "
                 "difference is shown."
@@ -649,6 +672,8 @@ def _draw_panels(
     for axes, (prediction, values) in zip(all_axes, panels.items(), strict=True):
         triangles = _draw_panel(axes, prediction, values, corners, names)
         known = [value for value in values if value is not None]
+        # The colors are from 0 to 1, or to negative margins. If normalised, they are
+        # from the smallest to the largest value; fractions still begin at 0.
         lower = min([*known, 0.0])
         upper = 1.0
         if options.normalised and by_margin:
@@ -710,6 +735,7 @@ def list_triangles(side: int) -> dict[Triangle, tuple[Mixture, Mixture, Mixture]
         for b in range(side - a):
             shared_edge = mixture_at(a + 1, b), mixture_at(a, b + 1)
             corners[a, b, False] = (mixture_at(a, b), *shared_edge)
+            # along one side of the diagram no triangle points down
             if a + b < side - 1:
                 corners[a, b, True] = (
                     mixture_at(a + 1, b + 1),
@@ -748,6 +774,7 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     lower_of_largest, _ = _mean_interval(margins[largest], len(margins))
     if upper_of_smallest < lower_of_largest:
         verdict = f"The difference is shown: {widened} do not overlap"
+    # "It" is the right label, of which the sentence before speaks.
     return (
         f"It leads least where most of the mixture is {descriptions[0]}; most where "
         f"most of it is {descriptions[1]}. {verdict}."
@@ -759,6 +786,7 @@ def _mean_interval(values: Float64Array, n_compared: int = 1) -> tuple[float, fl
 
     It is widened for a choice among `n_compared` means (Bonferroni).
     """
+    # the probability on each of the two sides
     alpha = (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * n_compared)
     half_width = NormalDist().inv_cdf(1.0 - alpha) * _standard_error(values)
     mean = values.mean()
@@ -808,12 +836,25 @@ def _draw_panel(
             linewidth=0,
         )
     )
+    _draw_outline(axes, names)
+    axes.set_title(label, fontsize=9, loc="center", pad=14)
+    # room for the names of the ingredients around the triangle
+    axes.set(xlim=(-0.12, 1.12), ylim=(-0.14, 1.0), aspect="equal")
+    axes.axis("off")
+    return triangles
+
+
+def _draw_outline(axes: Any, names: Sequence[str]) -> None:
+    """Draw the triangle of all mixtures, with the name of an ingredient at each corner.
+
+    A corner is the mixture that is that ingredient alone.
+    """
     pure = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     outline = [_to_plane(mixture) for mixture in pure]
     closed_outline = np.array([*outline, outline[0]])
     axes.plot(*closed_outline.T, color="#1c1d20", linewidth=0.8)
     for (x, y), name in zip(outline, names, strict=True):
-        is_base = y < 0.1
+        is_base = y < 0.1  # a lower corner has y = 0: its name stands below it
         axes.annotate(
             name,
             (x, y),
@@ -823,10 +864,6 @@ def _draw_panel(
             va="top" if is_base else "bottom",
             fontsize=8,
         )
-    axes.set_title(label, fontsize=9, loc="center", pad=14)
-    axes.set(xlim=(-0.12, 1.12), ylim=(-0.14, 1.0), aspect="equal")
-    axes.axis("off")
-    return triangles
 
 
 def _to_plane(mixture: Mixture) -> tuple[float, float]:

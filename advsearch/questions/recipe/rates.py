@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -77,7 +77,7 @@ def read_rows(
     """
     rows = list[dict[str, Any]]()
     units = dict[str, str]()
-    draws = None
+    draws = None  # how the rows of a sweep follow from draws
     with Store.open_to_read(folder) as store:
         if summary.command == "sweep":
             draws = workbench.read_units(store, is_sampled=summary.sampler is not None)
@@ -86,26 +86,38 @@ def read_rows(
                 continue
             if row.kind == "sweep" and row.is_out_of_view:
                 continue
-            values: dict[str, Any] = {
-                name: stored["value"] for name, stored in row.values.items()
-            }
             units |= {name: stored["unit"] for name, stored in row.values.items()}
-            unit = f"{folder.name} {row.kind} {row.id}"
+            unit = f"{folder.name} {row.kind} {row.id}"  # each row by itself
             if row.kind == "sweep" and draws is not None:
                 unit = f"{seed} {draws.find_unit(row.step)}"
             if summary.command == "attack":
-                values[TRIAL_COLUMN] = TRIAL_NAMES[row.kind]
                 unit = f"{seed} {row.step}"
-            for name in ("object", "environment", MODEL_COLUMN):
-                value = values.get(name, getattr(summary, name))
-                values[name] = wording.format_figure_value(str(value))
-            values[PREDICTION_COLUMN] = row.label or "none"
-            values["correct"] = bool(row.correct)
-            values["margin"] = row.margin
+            values = _read_row_values(row, summary)
             rows.append(
                 {**values, "time": row.time, PART_COLUMN: part, "unit": unit, **more}
             )
     return rows, units
+
+
+def _read_row_values(row: Any, summary: Any) -> dict[str, Any]:
+    """Return the columns of a stored row: parameters, names and the prediction.
+
+    Args:
+        row: row of a sweep, or trial of an attack.
+        summary: result of the run, with the names that the row does not state.
+    """
+    values: dict[str, Any] = {
+        name: stored["value"] for name, stored in row.values.items()
+    }
+    if summary.command == "attack":
+        values[TRIAL_COLUMN] = TRIAL_NAMES[row.kind]
+    for name in ("object", "environment", MODEL_COLUMN):
+        value = values.get(name, getattr(summary, name))
+        values[name] = wording.format_figure_value(str(value))
+    values[PREDICTION_COLUMN] = row.label or "none"
+    values["correct"] = bool(row.correct)
+    values["margin"] = row.margin
+    return values
 
 
 def make_frame(
@@ -139,6 +151,7 @@ def get_column(rows: Rows, name: str) -> Any:
         InputError: if the column does not exist or lacks values.
     """
     if name not in rows or rows[name].isna().any():
+        # results of a row are no columns to split by
         candidates = rows.columns.drop(["correct", "margin", "time", "unit"])
         known = ", ".join(other for other in candidates if rows[other].notna().all())
         raise InputError(f"figures: expected one of {known}, got {name[:60]!r}")
@@ -294,7 +307,7 @@ def describe_extremes(
         lowest_prefix: beginning of the sentence about the lowest, such as "Lowest".
         highest_prefix: beginning of the part about the highest.
         things: plural of what the tallies are of.
-        verb: what is counted.
+        verb: word for what is counted, "right" or "wrong" say.
     """
     known = [tally for tally in fractions if tally.total]
     if len(known) < 2:
@@ -310,11 +323,8 @@ def describe_extremes(
 
     descriptions = []
     for tally in (lowest, highest):
-        n_ties = shares.count(tally.fraction or 0.0) - 1
-        ties = ""
-        if n_ties:
-            plural_ending = "s" if n_ties > 1 else ""
-            ties = f" (as {n_ties} other{plural_ending})"
+        n_ties = shares.count(tally.fraction or 0.0) - 1  # without the tally itself
+        ties = _format_ties(n_ties)
         descriptions.append(f"is {tally.name}{ties}: {tally.describe(verb)}")
     widened = (
         f"the intervals of the two, widened for having been chosen among {len(known)},"
@@ -328,6 +338,14 @@ def describe_extremes(
     ]
 
 
+def _format_ties(n_ties: int) -> str:
+    """Return how many others have the same fraction: " (as 2 others)"; "" if none."""
+    if not n_ties:
+        return ""
+    plural_ending = "s" if n_ties > 1 else ""
+    return f" (as {n_ties} other{plural_ending})"
+
+
 def pluralize_column(name: str) -> str:
     """Return the plural that names the values of a column.
 
@@ -336,6 +354,7 @@ def pluralize_column(name: str) -> str:
     if name == TRIAL_COLUMN:
         return "kinds of trials"
     control, _, parameter = name.partition(".")
+    # the parameter "which" chooses among several environments, say
     if parameter in ("", "which"):
         return f"{control}s"
     return f"values of {name}"
@@ -432,7 +451,7 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     series = [options.names.get(value, value) for value in series_values]
     cells, bin_centers = _count_cells(rows, series_values, options)
     totals = _count_series("all", rows, series_values, options)
-    bars = dict(cells)
+    bars = dict(cells)  # the cells, and the baseline if there is one
 
     text = _describe_cells(cells, series, bin_centers is not None, options)
     text += _describe_series(cells, totals, series, options)
@@ -558,12 +577,13 @@ def _describe_cells(
 
     text = list[str]()
     where = f" where {options.axis_label}" if is_binned else ""
+    has_several_series = len(series) > 1
     for index, name in enumerate(series):
         tallies = [row[index].with_name(row_name) for row_name, row in cells.items()]
         n_known = sum(tally.total > 0 for tally in tallies)
-        if len(series) > 1 and n_known < 2:
+        if has_several_series and n_known < 2:
             continue  # a single row is described by `_describe_series`
-        lowest = f"For {name}, lowest" if len(series) > 1 else "Lowest"
+        lowest = f"For {name}, lowest" if has_several_series else "Lowest"
         text += describe_extremes(
             tallies,
             lowest_prefix=f"{lowest}{where}",
@@ -589,7 +609,7 @@ def _describe_series(
     Args:
         cells: for each row a tally for each series.
         totals: totals of each series over all rows.
-        series: their names.
+        series: names of the series.
         options: options of the figure.
     """
     if not options.series or len(series) < 2:
@@ -607,22 +627,32 @@ def _describe_series(
     )
     # one text, so that figures by other columns do not repeat it
     text = [" ".join(sentences)]
-    if not options.wrong or options.series != MODEL_COLUMN:
-        return text
-    for index, name in enumerate(series[1:], start=1):
-        # The mean over rows of the errors divided by those of the first model; rows
-        # in which that has none are left out.
+    if options.wrong and options.series == MODEL_COLUMN:
+        text += _describe_mean_errors(cells, series)
+    return text
+
+
+def _describe_mean_errors(cells: Cells, models: Sequence[str]) -> Iterator[str]:
+    """Yield the mean corruption error (mCE) of each model but the first, in a sentence.
+
+    That is the mean over rows of the model's error divided by the first model's. Rows
+    in which the first model has no errors are left out.
+
+    Args:
+        cells: for each row a tally of errors for each model.
+        models: names of the models.
+    """
+    for index, name in enumerate(models[1:], start=1):
         ratios = []
         for tallies in cells.values():
             if tallies[0].fraction:
                 ratios.append((tallies[index].fraction or 0.0) / tallies[0].fraction)
         if ratios:
             mean = 100.0 * sum(ratios) / len(ratios)
-            text.append(
-                f"Relative to {series[0]}, in AlexNet's place, the mCE of "
+            yield (
+                f"Relative to {models[0]}, in AlexNet's place, the mCE of "
                 f"{name} is {mean:.0f} %."
             )
-    return text
 
 
 def _compare_with_baseline(
@@ -640,8 +670,8 @@ def _compare_with_baseline(
         name: name of the part.
         tallies: tallies of the part, for each series.
         totals: totals of the others, for each series.
-        series: their names.
-        verb: what is counted.
+        series: names of the series.
+        verb: word for what is counted, "right" or "wrong" say.
     """
     text = []
     for series_name, tally, total in zip(series, tallies, totals, strict=True):
@@ -834,7 +864,7 @@ def _draw_lines(
         axes: axes of matplotlib.
         cells: for each bin a tally for each series.
         series: names for the legend.
-        bin_positions: bin positions of the bins along the horizontal axis.
+        bin_positions: positions of the bins along the horizontal axis.
     """
     for index, name in enumerate(series):
         positions = list[float]()
@@ -900,6 +930,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
     Raises:
         InputError: if a part has no rows or other configurations.
     """
+    # without the columns that only other parts have
     renderings = _select_part(rows, options.of[0]).dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(
@@ -966,8 +997,8 @@ def _add_agreement(
     Args:
         bars: tallies by object, or `ALL_OBJECTS`; each gets one more.
         pairs: pairs of renderings and other images.
-        table: which gets a row for each object.
-        series_name: what the other images are.
+        table: rows of the table, to which one for each object is added.
+        series_name: name of the other images.
     """
     for name, tallies in bars.items():
         object_pairs = pairs
@@ -1063,7 +1094,8 @@ def _describe_photographs(n_pairs: int, n_unpaired: int) -> list[str]:
 def _describe_where(right: bool, pairs: Rows) -> str:
     """Describe how often both predictions are right, or wrong, if the first one is.
 
-    The first is about the rendering, the second about the other image of a pair.
+    The first is about the rendering, the second about the other image of a pair. "It"
+    in the sentence is the model, of which the sentence before speaks.
 
     Args:
         right: whether the first is right.
@@ -1149,6 +1181,7 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
         )
         gains = _compute_gains(run_rates, rates_by_count)
         if workers > fewest and len(gains):
+            # 100 % if twice the workers give twice the throughput
             efficiency = 100 * gains.median() * fewest / workers
             sentence += (
                 f", {_format_spread(gains)} times as many as "
@@ -1158,8 +1191,8 @@ def _describe_scaling(rates_by_count: Mapping[int, Any]) -> list[str]:
     min_runs = min(map(len, rates_by_count.values()))
     if min_runs > 1:
         # The median of the population lies outside the range of n runs only if all n
-        # are on one side of it.
-        # The chance of that is 0.5^n for either side.
+        # are on one side of it. The chance of that is 0.5^n for either side, together
+        # 0.5^(n - 1).
         confidence = 100 * (1 - 0.5 ** (min_runs - 1))
         text.append(
             f"Medians of {min_runs} runs, one of each object, with the lowest and the "
@@ -1236,6 +1269,19 @@ def _format_spread(values: Any) -> str:
     return f"{median} ({values.min():.3g} to {values.max():.3g})"
 
 
+def _list_surface_cells(surface_table: Any) -> list[Cell]:
+    """Return the cells of a row: the counts of one object, model and kind of part."""
+    return [
+        surface_table.object,
+        wording.shorten_name(surface_table.model),
+        surface_table.part,
+        surface_table.seen,
+        surface_table.compared,
+        surface_table.worse,
+        surface_table.better,
+    ]
+
+
 def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     """Make a figure of the surface parts that are visible when predictions are wrong.
 
@@ -1263,18 +1309,7 @@ def make_surface_figure(rows: Rows, options: Options) -> FigureContent:
     text = list[str]()
     for run_surface in surfaces.values():
         text += workbench.surface_sentences(run_surface)
-        for part in run_surface.tables:
-            table.append(
-                [
-                    part.object,
-                    wording.shorten_name(part.model),
-                    part.part,
-                    part.seen,
-                    part.compared,
-                    part.worse,
-                    part.better,
-                ]
-            )
+        table += map(_list_surface_cells, run_surface.tables)
     heads = [
         "object",
         "model",

@@ -155,7 +155,10 @@ class RecipeConfig(Config):
         return str(self.task["name"])
 
     def find_label(self, name: str) -> str | None:
-        """Return the right label that the settings give an object, None for its own."""
+        """Return the right label that the settings give an object, None for its own.
+
+        They name the object as it is, or by the stem of its file, or all objects.
+        """
         return (
             self.label.get(name)
             or self.label.get(Path(name).stem)

@@ -64,7 +64,7 @@ class Axis:
     Attributes:
         control: kind of the control.
         instance: name of the control; that of its kind unless it has another.
-        parameter: what varies.
+        parameter: the parameter that varies.
         values: numbers or names.
     """
 
@@ -127,11 +127,11 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
 
     Args:
         name: name of the parameter, as the user wrote it.
-        values: values of it.
+        values: values of the parameter.
         instances: the sampled controls by name.
     """
     where = f"`grid` {name}"
-    control_name, dot, rest = name.partition(".")
+    control_name, _, rest = name.partition(".")
     # An instance may stand on either side: KIND:INSTANCE.PARAMETER, or
     # KIND.PARAMETER:INSTANCE.
     parameter_name, last_colon, last_instance = rest.partition(":")
@@ -140,13 +140,13 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         instance = control_name
     else:
         instance = families.make_instance_name(kind, last_instance or first_instance)
-    if control_name in _LISTED_SETTINGS and not dot:
+    if name in _LISTED_SETTINGS:  # such as "model", which is no control
         raise InputError(
-            f"{where}: several of them are given as a list: "
-            f"{_LISTED_SETTINGS[control_name]}"
+            f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
         )
     control = _find_control(instances, kind, instance, where)
     if kind == MITSUBA_CONTROL:
+        # mitsuba:KEY, and a key may itself contain dots and colons
         return _parse_key_axis(name, values, control)
 
     parameters = _find_parameters(values, instances, control, parameter_name, instance)
@@ -263,7 +263,7 @@ def parse_axis_values(
 
     Args:
         where: how messages name the axis.
-        parameter: what varies.
+        parameter: the parameter that varies.
         raw_values: a string, a value, or a list.
 
     Raises:
@@ -273,7 +273,8 @@ def parse_axis_values(
     values: Sequence[Any] = (
         raw_values if isinstance(raw_values, (list, tuple)) else [raw_values]
     )
-    if isinstance(raw_values, str) and ":" in raw_values and not parameter.options:
+    takes_range = not parameter.options  # the name of an option may have a colon
+    if isinstance(raw_values, str) and ":" in raw_values and takes_range:
         values = _parse_range(where, raw_values, is_angle)
     if not values:
         raise InputError(
@@ -281,9 +282,10 @@ def parse_axis_values(
             "FIRST:LAST:COUNT or a list"
         )
     _check_count(where, len(values))
+    # NumPy's scalars become Python's
     choices = [value.item() if hasattr(value, "item") else value for value in values]
     spec = parse_spec(where, parameter, {"choices": choices})
-    assert isinstance(spec, OneOf)
+    assert isinstance(spec, OneOf)  # as choices always are
     _check_different(where, spec.values, is_angle)
     has_names = any(isinstance(value, str) for value in spec.values)
     if not parameter.options and not has_names:
@@ -354,6 +356,29 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
             f"{where}: expected a COUNT of at least 1, got {count} in {text!r}"
         )
     _check_count(where, count)
+    _check_bounds(where, text, first, last, count, is_angle=is_angle)
+    # After a full turn the last value would be the first one again: it is left out.
+    is_full_turn = is_angle and last - first == FULL_TURN
+    values = np.linspace(first, last, count, endpoint=not is_full_turn)
+    return [float(value) for value in values]
+
+
+def _check_bounds(
+    where: str, text: str, first: float, last: float, count: int, *, is_angle: bool
+) -> None:
+    """Check that a range FIRST:LAST:COUNT has different values in ascending order.
+
+    Args:
+        where: name of the axis in messages.
+        text: the range as the user wrote it.
+        first: first value.
+        last: last value.
+        count: count of values.
+        is_angle: whether the values are angles, which repeat after a full turn.
+
+    Raises:
+        InputError: it has not; the message has the range to write instead.
+    """
     if last < first:
         raise InputError(
             f"{where}: the range {text!r} is reversed; write {last:g}:{first:g}:{count}"
@@ -369,10 +394,6 @@ def _parse_range(where: str, text: str, is_angle: bool) -> list[float]:
             "repeat; write "
             f"{first:g}:{first + FULL_TURN:g}:{count}"
         )
-    # After a full turn the last value would be the first one again: it is left out.
-    is_full_turn = is_angle and last - first == FULL_TURN
-    values = np.linspace(first, last, count, endpoint=not is_full_turn)
-    return [float(value) for value in values]
 
 
 def _check_count(where: str, count: int) -> None:
@@ -394,9 +415,9 @@ def add_grid_axes(
     only in the grid stay as the scene has them.
 
     Args:
-        controls: the sampled ones.
+        controls: controls that are sampled.
         axes: axes of the grid.
-        scene: which decides the default ranges of a control.
+        scene: the scene, which decides the default ranges of a control.
     """
     control_by_name = {control.name: control for control in controls}
     for instance in dict.fromkeys(axis.instance for axis in axes):
@@ -416,9 +437,11 @@ def add_grid_axes(
 
 def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, object]:
     """Return the settings of a sampled control, with its default ranges spelled out."""
-    settings = control.to_settings()
+    # Kind and name are no parameters: the class and the instance state them.
     settings = {
-        name: value for name, value in settings.items() if name not in ("kind", "name")
+        name: value
+        for name, value in control.to_settings().items()
+        if name not in ("kind", "name")
     }
     if control.has_requested_search:
         # Ranges were set, so that its other parameters have no default range.
@@ -559,7 +582,7 @@ class Points:
     ) -> None:
         self.grid = ProductIndex(tuple(len(axis.values) for axis in axes))
         self.samples = samples
-        self.count = self.grid.count * samples
+        self.count = self.grid.count * samples  # images of the scene
         self.n_parts = choose_n_parts(self.count * n_scenes)
         self.space = space
         self._start = domain.start.numpy().astype(np.float64)
@@ -573,8 +596,8 @@ class Points:
         self._large_blocks: list[_SampledBlock] = []
         self.sampled_numbers = tuple(self._assign_blocks(domain))
         self._columns = [number.column for number in self.sampled_numbers]
-        # Each number cuts [0, 1] into equal shares, one or several for each of its
-        # parts.
+        # Tables divide the range of a sampled number into parts, which cut [0, 1] into
+        # equal shares: one for each part, or several for an option with more weight.
         n_shares = [
             len(number.part_of_share or number.parts) for number in self.sampled_numbers
         ]
@@ -587,27 +610,45 @@ class Points:
             large_dimensions, "random", seed, "large draws"
         )
         self.is_sampled = small_dimensions + large_dimensions > 0
-        # If nothing is sampled, the samples of a grid point are repeats of one draw,
-        # each with its own noise.
-        n_draws = samples if self.is_sampled else 1
-        time_axis = next(
-            (index for index, axis in enumerate(axes) if axis.is_time), None
+        self.units = self._make_units(
+            axes,
+            images_until_repeat=repeat_after_scenes * self.count,
+            n_photographs=n_photographs,
         )
-        self.units = Units(
-            self.grid.sizes,
-            frames=time_axis,
-            samples=n_draws,
-            again=repeat_after_scenes * self.count,
-            noise=samples // n_draws,
-            photographs=n_photographs,
-            scene=self.count if n_photographs > 1 else 1,
-        )
+        # Scenes with the same layout get the same meaning from a draw.
         numbers = tuple(
             (number.name, number.column, len(number.parts))
             for number in self.sampled_numbers
         )
         self.sampled_layout = (small_dimensions, numbers)
         self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
+
+    def _make_units(
+        self, axes: Sequence[Axis], *, images_until_repeat: int, n_photographs: int
+    ) -> Units:
+        """Return which images belong to one independent unit, such as a drive.
+
+        Args:
+            axes: axes of the grid; images along an axis of time are frames of a drive.
+            images_until_repeat: images after which the draws repeat; 0 for never.
+            n_photographs: photographs of a folder, in which the scenes are in turn; 1
+                without a folder.
+        """
+        # If nothing is sampled, the samples of a grid point are repeats of one draw,
+        # each with its own noise.
+        n_draws = self.samples if self.is_sampled else 1
+        time_axis = next(
+            (index for index, axis in enumerate(axes) if axis.is_time), None
+        )
+        return Units(
+            self.grid.sizes,
+            frames=time_axis,
+            samples=n_draws,
+            again=images_until_repeat,
+            noise=self.samples // n_draws,
+            photographs=n_photographs,
+            scene=self.count if n_photographs > 1 else 1,
+        )
 
     def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
         """Fill the lists of grid coordinates and sampled blocks from the blocks.
@@ -632,7 +673,7 @@ class Points:
                 continue
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
-            begin = _count_columns(blocks)
+            begin = _count_columns(blocks)  # the first column that is free
             is_ball = block.norm == "l2"
             n_columns = block.size
             if is_ball:
@@ -640,8 +681,9 @@ class Points:
             columns = slice(begin, begin + n_columns)
             blocks.append(_SampledBlock(block, coordinates, columns))
             control = controls[group.control]
-            is_short = block.size <= MAX_TABLE_COMPONENTS and not is_ball
-            if is_short and control.slots:
+            # In a ball a component has no range of its own.
+            is_in_tables = block.size <= MAX_TABLE_COMPONENTS and not is_ball
+            if is_in_tables and control.slots:  # a control without slots has no ranges
                 yield from self._describe_sampled(
                     control, group.parameter, coordinates, begin
                 )
@@ -669,20 +711,34 @@ class Points:
             )
             return
         for component, column in enumerate(range(coordinates.start, coordinates.stop)):
-            edges = torch.linspace(
-                float(self._lower[column]),
-                float(self._upper[column]),
-                self.n_parts + 1,
-                dtype=torch.float64,
-            )
-            edge_values = spec.interpolate(edges, log=parameter.log).tolist()
-            suffix = f".{component}" if parameter.shape else ""
+            suffix = f".{component}" if parameter.shape else ""  # of a vector
             yield SampledNumber(
                 full_name + suffix,
                 parameter.unit,
                 begin + component,
-                tuple(map(list, pairwise(edge_values))),
+                self._cut_range(column, spec, log=parameter.log),
             )
+
+    def _cut_range(
+        self, column: int, spec: Any, *, log: bool
+    ) -> tuple[list[float], ...]:
+        """Cut the range of a coordinate into parts, and return the bounds of each.
+
+        The parts are equal in the coordinate; the bounds are values of the parameter.
+
+        Args:
+            column: index of the coordinate in a configuration.
+            spec: range of the parameter.
+            log: whether the parameter is logarithmic.
+        """
+        edges = torch.linspace(
+            float(self._lower[column]),
+            float(self._upper[column]),
+            self.n_parts + 1,
+            dtype=torch.float64,
+        )
+        edge_values: list[float] = spec.interpolate(edges, log=log).tolist()
+        return tuple(map(list, pairwise(edge_values)))
 
     def find_parts(self, first: int, count: int) -> NDArray[np.int64]:
         """Return the part of each of k sampled numbers that images lie in.
@@ -743,7 +799,7 @@ class Points:
         Args:
             first: number of the first image in the scene.
             count: count of images.
-            before: images of the scenes before this one.
+            before: images of the scenes before this one, which used up as many draws.
         """
         u = np.repeat(self._start[None], count, axis=0)
         indices = self._axis_indices(first, count)
@@ -780,6 +836,7 @@ class Points:
         """
         block = sampled.block
         if block.options:
+            # a uniform number of exactly 1 belongs to the last option
             option = np.minimum(np.floor(uniform * block.options), block.options - 1)
             return np.asarray((option + 0.5) / block.options)
         if block.norm != "l2" or block.epsilon is None:
@@ -818,7 +875,7 @@ class Points:
         indices = self._axis_indices(first_image, len(u))
         coordinates = u.split(self.space.sizes, dim=1)
         for control, control_u in zip(self.space.controls, coordinates, strict=True):
-            if _is_described_by_base(control):
+            if _is_described_by_base(control):  # then all images at once, which is fast
                 columns = self._describe_columns(control, control_u, indices)
                 for name, unit, values in columns:
                     for row, value in zip(rows, values, strict=True):
@@ -862,7 +919,7 @@ class Points:
         cached = self._description_cache.get(key)
         if cached is not None:
             return cached
-        if control.refines:
+        if control.refines:  # takes inputs of other controls, and so needs all of u
             description = dict(self.space.describe(u, (control,)))
         else:
             description = dict(control.describe(control_u))

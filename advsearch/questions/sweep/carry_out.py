@@ -158,6 +158,7 @@ def sweep(
             "grid: expected a mapping from parameters to values, got "
             f"{type(grid).__name__}"
         )
+    # What is not passed is as in the attack, if there is one.
     attack_run = _find_attack_run(adversarial_of)
     defaults = _load_defaults(attack_run, scene, grid, controls)
     scenes = _as_list(defaults["object"] if scene is None else scene)
@@ -170,6 +171,7 @@ def sweep(
         task = make_task(task)
     loaded = _name_loaded(scenes)
     set_options = _drop_unset(settings)
+    # The settings as `run.yaml` states them, with names in place of objects.
     described: dict[str, object] = {
         "model": ",".join(get_model_name(network) for network in networks),
         "task": to_setting(task) if isinstance(task, Task) else task,
@@ -183,6 +185,7 @@ def sweep(
         naming.check_no_scene_settings(set_options)
     described |= _describe_scenes(scenes, loaded)
     run_setting = {"run": None if run is None else str(run)}
+    # later ones replace earlier ones
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
     config = config.with_python_only_parts(
         _find_python_only(config, networks, loaded, task, tracker, controls)
@@ -292,8 +295,8 @@ def _describe_scenes(
     """Return the settings that describe the scenes.
 
     Args:
-        scenes: as they were passed.
-        loaded: those that are loaded: all of them or none.
+        scenes: scenes as the caller passed them.
+        loaded: the loaded ones: all of them or none.
     """
     if not loaded:
         names = [
@@ -306,6 +309,7 @@ def _describe_scenes(
         values = dict.fromkeys(getattr(scene, name) for scene in loaded)
         settings[name] = ",".join(values)
     if len(loaded) > 1:
+        # These differ between scenes, and no setting states several of them.
         settings |= {"size": None, "set": {}}
     return settings
 
@@ -381,13 +385,13 @@ def _run_config(
 
     Args:
         config: the settings.
-        scenes: those that are loaded; empty to load the ones that the settings name.
-        models: as the caller passed them; so are all others.
+        scenes: loaded scenes; empty to load the ones that the settings name.
+        models: models as the caller passed them; so are all others.
     """
     resumed = _find_resumable(config)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    context: Any = nullcontext(resumed)
+    context: Any = nullcontext(resumed)  # None without a run directory
     if config.run is not None and resumed is None:
         context = create_before_work(config)
     if config.twins is not None:
@@ -421,7 +425,8 @@ def _find_resumable(config: SweepConfig) -> Path | None:
     if config.overwrite or not is_run(path) or not config_file.is_file():
         return None
     stored = SweepConfig.from_yaml(config_file, config.session_settings)
-    if stored.to_json() != config.make_repeatable().to_json() or is_finished(path):
+    has_same_settings = stored.to_json() == config.make_repeatable().to_json()
+    if not has_same_settings or is_finished(path):
         return None
     return path
 
@@ -480,16 +485,7 @@ def _add_adversarial_arm(
             "to sweep"
         )
     fixed_controls = make_configured_controls(attack_config, attack_config.controls)
-    varied_names = {control.name for control in sampled}
-    varied_names |= {axis.instance for axis in axes}
-    fixed_names = {control.name for control in fixed_controls}
-    clashes = sorted(varied_names & fixed_names)
-    if clashes:
-        raise InputError(
-            f"adversarial_of: the adversarial configuration of {directory} sets "
-            f"{clashes[0]}, so it can't vary; leave it "
-            "out of `grid` and `controls`"
-        )
+    _check_not_varied(fixed_controls, sampled, axes, directory)
     u = torch.from_numpy(read_configuration(directory))
     arm = directory.resolve().name
     if arm == CLEAN:
@@ -535,6 +531,35 @@ def row_parameters(config: SweepConfig) -> set[str]:
     return {*space.describe(space.start), *space.describe(center)}
 
 
+def _check_not_varied(
+    fixed_controls: Sequence[Control],
+    sampled: Sequence[Control],
+    axes: Sequence[Axis],
+    attack_run: Path,
+) -> None:
+    """Check that a sweep does not vary what an adversarial configuration sets.
+
+    Args:
+        fixed_controls: controls of the attack.
+        sampled: controls that are sampled.
+        axes: axes of the grid.
+        attack_run: run directory of the attack, for the message.
+
+    Raises:
+        InputError: a control is both fixed and varied.
+    """
+    varied_names = {control.name for control in sampled}
+    varied_names |= {axis.instance for axis in axes}
+    fixed_names = {control.name for control in fixed_controls}
+    clashes = sorted(varied_names & fixed_names)
+    if clashes:
+        raise InputError(
+            f"adversarial_of: the adversarial configuration of {attack_run} sets "
+            f"{clashes[0]}, so it can't vary; leave it "
+            "out of `grid` and `controls`"
+        )
+
+
 def _make_job(
     config: SweepConfig,
     named_scenes: Sequence[NamedScene],
@@ -552,31 +577,23 @@ def _make_job(
         named_scenes: the clean scenes.
         models: names, files or modules.
         task: task of all models.
-        controls: which are sampled.
+        controls: controls that are sampled.
 
     Raises:
         InputError: something in the settings does not fit together.
     """
-    # A control that travels along the path is added where none does.
-    travel_settings = ("path", "shutter", "rolling") if config.path is not None else ()
-    naming.check_run_settings(config.model_copy(update=dict.fromkeys(travel_settings)))
+    # These settings need a control that travels along the path. With a `path` they are
+    # left out of the check, since `add_frames` adds such a control where none does.
+    unchecked = ("path", "shutter", "rolling") if config.path is not None else ()
+    naming.check_run_settings(config.model_copy(update=dict.fromkeys(unchecked)))
     sampled = make_configured_controls(config, controls)
     grid = config.grid
     if config.path is not None:
         sampled, grid = add_frames(config, sampled)
     axes = parse_axes(grid, sampled)
-    if config.samples is not None and not sampled:
-        raise InputError(
-            "samples: expected `controls` beside it, which says what is drawn by "
-            "chance; add `controls=pose`, say, or "
-            "leave `samples` out"
-        )
-    if not axes and not sampled and len(named_scenes) * len(models) == 1:
-        raise InputError(
-            "grid: expected something that varies, got nothing; add an axis such as "
-            "`grid` pose.yaw=0:360:24, or "
-            "`controls=pose` `samples=100`"
-        )
+    _check_something_varies(
+        config, axes, sampled, n_combinations=len(named_scenes) * len(models)
+    )
     named_scenes = _add_adversarial_arm(config, named_scenes, sampled, axes)
     check_scenes(named_scenes, sampled, axes)
     axes = _with_camera_units(axes, named_scenes)
@@ -597,7 +614,39 @@ def _make_job(
         warnings += job.bind_controls(named_scene, job.image_sizes[0]).list_notes(
             named_scene.scene.description
         )
-    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
+    unique_warnings = tuple(dict.fromkeys(warnings))  # scenes may share one
+    return replace(job, warnings=unique_warnings)
+
+
+def _check_something_varies(
+    config: SweepConfig,
+    axes: Sequence[Axis],
+    sampled: Sequence[Control],
+    n_combinations: int,
+) -> None:
+    """Check that a sweep has more than one image to evaluate.
+
+    Args:
+        config: the settings.
+        axes: axes of the grid.
+        sampled: controls that are sampled.
+        n_combinations: scenes times models.
+
+    Raises:
+        InputError: `samples` asks for draws of nothing, or nothing varies at all.
+    """
+    if config.samples is not None and not sampled:
+        raise InputError(
+            "samples: expected `controls` beside it, which says what is drawn by "
+            "chance; add `controls=pose`, say, or "
+            "leave `samples` out"
+        )
+    if not axes and not sampled and n_combinations == 1:
+        raise InputError(
+            "grid: expected something that varies, got nothing; add an axis such as "
+            "`grid` pose.yaw=0:360:24, or "
+            "`controls=pose` `samples=100`"
+        )
 
 
 def _with_camera_units(
@@ -681,12 +730,18 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
     Args:
         config: settings of the sweep.
     """
-    passed: Scene | None = config.python_object(naming.SCENE, config.object)
-    if passed is not None:
-        environment = passed.description.environment_name
-        return expand_photographs(
-            config, [NamedScene(config.object, environment, passed)]
-        )
+    return expand_photographs(config, _load_named_scenes(config))
+
+
+def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
+    """Load the scenes of a configuration, each in its first photograph, if any.
+
+    See `load_scenes` for which these are.
+    """
+    session_scene: Scene | None = config.python_object(naming.SCENE, config.object)
+    if session_scene is not None:  # passed by a Python caller
+        environment = session_scene.description.environment_name
+        return [NamedScene(config.object, environment, session_scene)]
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
     first_environment = environments[0] if config.environment else None
@@ -695,29 +750,21 @@ def load_scenes(config: SweepConfig) -> tuple[NamedScene, ...]:
         for name in objects
     }
     if first_environment is None:
-        return expand_photographs(
-            config,
-            [
-                NamedScene(name, scene.description.environment_name, scene)
-                for name, scene in scenes.items()
-            ],
-        )
+        return [
+            NamedScene(name, scene.description.environment_name, scene)
+            for name, scene in scenes.items()
+        ]
     first_scene = scenes[objects[0]].description
     # Environments are loaded once, with the first object, and given to all others.
     maps = {first_environment: first_scene.environment}
     for name in environments[1:]:
         scene = load_scene(first_scene.object, name)
         maps[name] = scene.description.environment
-    return expand_photographs(
-        config,
-        [
-            NamedScene(
-                name, environment, scenes[name].with_environment(maps[environment])
-            )
-            for name in objects
-            for environment in maps
-        ],
-    )
+    return [
+        NamedScene(name, environment, scenes[name].with_environment(maps[environment]))
+        for name in objects
+        for environment in maps
+    ]
 
 
 def expand_photographs(
@@ -727,8 +774,16 @@ def expand_photographs(
 
     They stay as they are if a control draws the photograph, or the grid names it.
     """
-    names = [*config.controls, *(name.partition(".")[0] for name in config.grid)]
-    if any(getattr(config.find_control_type(n), "kind", "") == BACKDROP for n in names):
+    control_names = [
+        *config.controls,
+        *(axis_name.partition(".")[0] for axis_name in config.grid),
+    ]
+    kinds = [
+        # a name that is no control has no kind
+        getattr(config.find_control_type(name), "kind", "")
+        for name in control_names
+    ]
+    if BACKDROP in kinds:
         return tuple(scenes)
     expanded = list[NamedScene]()
     for named_scene in scenes:

@@ -126,6 +126,7 @@ def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
     There are none if it has more axes, or too many values. Axes with listed values go
     before those with parts of a range.
     """
+    # a part of a range is its two bounds
     rows = [row for row in summary.axes if not isinstance(row.value, (list, tuple))]
     rows = rows or summary.axes
     names = {row.axis for row in rows}
@@ -135,8 +136,10 @@ def _only_axis(summary: SweepSummary) -> Sequence[AxisRow]:
 def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
     """Draw the map of a sweep on matplotlib axes."""
     x_axis, y_axis = cells.axes
+    # Cells are 1 wide and high, and their centers are whole numbers.
     extent = (-0.5, len(x_axis.values) - 0.5, -0.5, len(y_axis.values) - 0.5)
     counts = np.array(cells.configurations, dtype=float)
+    # The accuracy of a single prediction is only 0 or 1: its margin says more.
     if counts.max() > 1:
         measure = ACCURACY
         no_values = np.full(counts.shape, np.nan)
@@ -293,6 +296,7 @@ def make_sweep_view(summary: SweepSummary) -> ShownResult:
     if summary.configurations > 0:
         ended_early = summary.looked_at < summary.planned
     else:
+        # Without a count, either all images lack the object, or none was evaluated.
         ended_early = not summary.out_of_view
     return ShownResult(_verdict(summary), sections, facts, says_interrupted=ended_early)
 
@@ -312,7 +316,7 @@ def _text_sections(
 
     Args:
         summary: summary of the sweep.
-        axes: axes from `_group_axes`.
+        axes: rows of each axis by its name, from `_group_axes`.
     """
     if summary.beside is not None and summary.ending != INTERRUPTED:
         for pair in summary.beside.pairs:
@@ -325,6 +329,7 @@ def _text_sections(
     yield ResultPart.make_table(
         summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
     )
+    # The axis "answer" is the two scenes, clean and adversarial: `_arms_table` has it.
     if axes.keys() - {"answer"}:
         introduction = READING
         if summary.beside:
@@ -347,8 +352,8 @@ def _arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
 
     Args:
         answer: name of the adversarial run.
-        pair: pair of the model.
-        task: its name.
+        pair: counts of the model in both arms.
+        task: name of the task.
     """
     arms = (("clean", pair.clean), (answer, pair.answer))
     has_outcomes = any(counts.outcomes for _, counts in arms)
@@ -367,6 +372,7 @@ def _worst_configuration(summary: SweepSummary) -> str:
     if summary.worst is None:
         return ""
     values = summary.worst.values
+    # These explain themselves, as "mug, studio", and stand without their names.
     names = ("object", "environment", "backdrop", "model")
     outside = [name for name in names if name in values]
     texts = [shorten_name(values[name].value) for name in outside]
@@ -399,7 +405,7 @@ def _page_parts(
 
     Args:
         summary: summary of the sweep.
-        axes: axes from `_group_axes`.
+        axes: rows of each axis by its name, from `_group_axes`.
     """
     distance = find_detection_distance(summary)
     if distance:
@@ -520,6 +526,7 @@ def _axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     has_outcomes = any(row.outcomes for row in rows)
     lines = []
     for row in listed:
+        # no bar where the accuracy is not known, or 0
         bar = "#" * round((row.accuracy or 0.0) * BAR_LENGTH)
         accuracy, interval = _accuracy_cells(row)
         cells = [
@@ -548,7 +555,7 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
         for pair in result.beside.pairs:
             yield from _arm_claims(result.beside.answer, pair, population, note)
         if result.beside.pairs:
-            return
+            return  # the other claims are about both scenes together
     yield from _accuracy_claims(result, population, note)
     distance = find_detection_distance(result)
     if distance:
@@ -568,7 +575,11 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
 
 
 def _describe_population(result: SweepSummary) -> tuple[str, str]:
-    """Return what the rates of a sweep are over, and a caution about the interval."""
+    """Return what the rates of a sweep are over, and a caution about the interval.
+
+    A sweep has a grid, samples (then it has a `sampler`), or both; imported rows have
+    neither. Only independent random draws need no caution.
+    """
     configurations = "configurations"
     if result.drives:
         configurations = f"frames of {result.drives[0].drives} drives"
@@ -611,8 +622,8 @@ def _arm_claims(
 
     Args:
         answer: name of the adversarial run.
-        pair: pair of one model.
-        population: what the rates are over.
+        pair: counts of one model in both arms.
+        population: description of what the rates are over, "points of the grid" say.
         note: a caution about the interval.
     """
     arms = {
@@ -639,7 +650,7 @@ def _accuracy_claims(
 
     Args:
         result: result of the sweep.
-        population: what the rates are over.
+        population: description of what the rates are over, "points of the grid" say.
         note: a caution about the interval.
     """
     # Objects and environments are not sampled.
@@ -734,20 +745,32 @@ def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
             ("identity switches", tracks.switches, "", ""),
             ("longest gap of its track", tracks.longest_gap, " s", ""),
         ]
-    rows = []
-    for name, value, unit, remark in rates:
-        if value is None:
-            continue
-        # fractions are shown in percent
-        factor = 100.0 if unit == " %" else 1.0
-        interval = "-"
-        if value.interval:
-            low, high = value.interval
-            interval = f"{low * factor:.3g} to {high * factor:.3g}{unit}"
-        mean = f"{value.mean * factor:.3g}{unit}{remark}"
-        worst = f"{value.worst * factor:.3g}{unit}"
-        rows.append((name, mean, interval, worst))
-    return rows
+    return [
+        _format_drive_row(name, value, unit, remark)
+        for name, value, unit, remark in rates
+        if value is not None
+    ]
+
+
+def _format_drive_row(
+    name: str, value: OverDrives, unit: str, remark: str
+) -> tuple[str, str, str, str]:
+    """Return the texts of a rate over drives: name, mean, interval and worst drive.
+
+    Args:
+        name: name of the rate.
+        value: the rate; a dash stands for an interval that it lacks.
+        unit: unit with a space before it; fractions of the unit " %" become percent.
+        remark: remark on the mean, after it.
+    """
+    factor = 100.0 if unit == " %" else 1.0
+    interval = "-"
+    if value.interval:
+        low, high = value.interval
+        interval = f"{low * factor:.3g} to {high * factor:.3g}{unit}"
+    mean = f"{value.mean * factor:.3g}{unit}{remark}"
+    worst = f"{value.worst * factor:.3g}{unit}"
+    return name, mean, interval, worst
 
 
 def surface_sentences(surface: SurfaceMap) -> list[str]:
@@ -875,7 +898,8 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     distances = tuple(_center_distance(row) for row in rows)
     k = np.array([row.correct for row in rows])
     n = np.array([row.configurations for row in rows])
-    # of a binomial test on each side, at one of the distances
+    # Of a binomial test at one of the distances: 2.5 % on each side, divided by the
+    # number of tests (Bonferroni).
     significance = 0.025 / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
@@ -930,7 +954,7 @@ def _bound_distance(
     is_above_half = p_at_least < significance
     is_below_half = p_at_most < significance
     low = max(distance[is_above_half], default=None)
-    is_beyond_low = distance > (low or 0.0)
+    is_beyond_low = distance > (low or 0.0)  # all are, without a lower bound
     high = min(distance[is_below_half & is_beyond_low], default=None)
     return None if low is None else float(low), None if high is None else float(high)
 
@@ -944,7 +968,8 @@ def _find_crossing(
         distance: (m,) ascending; the line is linear in its logarithm.
         falling: (m,) the line, the fraction of right images at each distance.
     """
-    if not falling[0] >= HALF > falling[-1]:
+    crosses_half = falling[0] >= HALF > falling[-1]
+    if not crosses_half:
         return None
     # negated, since interp needs ascending abscissae
     return float(np.exp(np.interp(-HALF, -falling, np.log(distance))))
@@ -977,15 +1002,8 @@ def distance_sentence(estimate: DetectionDistance) -> str:
     loose = _loose_sentence(estimate, unit)
     farthest = f"{estimate.distances[-1]:.3g} {unit}"
     if not estimate.is_monotone:
-        if distance is not None:
-            beyond = f"Beyond that the share falls below a half at {distance} {unit}"
-        elif estimate.is_above_half:
-            beyond = (
-                "Beyond that it is right in at least half of the pictures, up to "
-                f"{farthest}"
-            )
-        else:
-            beyond = "Beyond that it is right in less than half of the pictures"
+        # The dips come first: the estimate is only about what is beyond them.
+        beyond = _clause_beyond_dips(estimate, distance, farthest, unit)
         return " ".join(filter(None, [*dips, f"{beyond}; {interval}.", loose]))
     if distance is not None:
         sentence = f"Seen from {distance} {unit} in half of the pictures, {interval}."
@@ -1000,6 +1018,27 @@ def distance_sentence(estimate: DetectionDistance) -> str:
             f"{unit}; {interval}."
         )
     return " ".join(filter(None, [sentence, *dips, loose]))
+
+
+def _clause_beyond_dips(
+    estimate: DetectionDistance, distance: str | None, farthest: str, unit: str
+) -> str:
+    """Return how often the model is right beyond the last dip of its detections.
+
+    Args:
+        estimate: estimate of the detection distance.
+        distance: the estimated distance; None if it is not among the measured ones.
+        farthest: the farthest distance that was measured, with its unit.
+        unit: unit of the distance.
+    """
+    if distance is not None:
+        return f"Beyond that the share falls below a half at {distance} {unit}"
+    if estimate.is_above_half:
+        return (
+            "Beyond that it is right in at least half of the pictures, up to "
+            f"{farthest}"
+        )
+    return "Beyond that it is right in less than half of the pictures"
 
 
 def _interval_clause(estimate: DetectionDistance, unit: str) -> str:
@@ -1040,6 +1079,7 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     if significant:
         clauses = "; ".join(_dip_clause(dip, unit) for dip in significant)
         return [f"No one distance from which on it is seen: right in {clauses}."]
+    # the farthest distance at which the estimate has at least half of the images right
     detected_until = estimate.distance or 0.0
     if estimate.is_above_half:
         detected_until = estimate.distances[-1]
@@ -1091,6 +1131,22 @@ def _loose_sentence(estimate: DetectionDistance, unit: str) -> str:
     )
 
 
+def _add_loose_fractions(estimate: DetectionDistance) -> list[float]:
+    """Return at each distance the fraction of images with any box on the object.
+
+    That is the fraction of right images, and that with a loose box only.
+    """
+    return [
+        fraction + n_loose / n_images
+        for fraction, n_loose, n_images in zip(
+            estimate.right_fractions,
+            estimate.loose_counts,
+            estimate.image_counts,
+            strict=True,
+        )
+    ]
+
+
 def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
     """Draw the fraction of detections over the distance on matplotlib axes."""
     low, high = zip(*estimate.intervals, strict=True)
@@ -1111,18 +1167,9 @@ def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:
         label="seen in",
     )
     if any(estimate.loose_counts):
-        with_loose = [
-            fraction + n_loose / n_images
-            for fraction, n_loose, n_images in zip(
-                estimate.right_fractions,
-                estimate.loose_counts,
-                estimate.image_counts,
-                strict=True,
-            )
-        ]
         axes.plot(
             estimate.distances,
-            with_loose,
+            _add_loose_fractions(estimate),
             color=GREY,
             marker=".",
             linestyle=":",

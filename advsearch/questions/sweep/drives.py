@@ -63,7 +63,7 @@ def add_frames(
     chooses among them and nothing is sampled, then all are swept.
 
     Args:
-        config: config with a `path`.
+        config: settings with a `path`.
         sampled: the controls that are sampled.
 
     Returns:
@@ -78,6 +78,7 @@ def add_frames(
     seconds = travelling.seconds
     grid = config.grid
     if time_name not in grid:
+        # both ends have a frame
         n_frames = max(2, round(seconds * config.fps) + 1)
         grid = {**grid, time_name: f"0:{seconds:g}:{n_frames}"}
     paths = next(
@@ -189,8 +190,9 @@ class Drives:
             job.samples,
             len(job.models),
         )
+        # of each row: 1 right, 0 wrong, HIDDEN without the object, UNKNOWN if missing
         flags: Flags = np.full(shape, UNKNOWN, np.int8)
-        # The models of an image have the same distance.
+        # The models of an image have the same distance: no axis is of models.
         distance = np.full(shape[:-1], np.nan)
         self._path_of_step: dict[int, str] = {}
         self._frame_of_step: dict[int, DetectedFrame] = {}
@@ -238,7 +240,9 @@ class Drives:
             if distance_name in row.values:
                 distance.flat[image] = float(str(row.values[distance_name]["value"]))
                 self._distance_unit = row.values[distance_name]["unit"]
-            names = right_names.get((image // job.images_per_scene, model))
+            scene = image // job.images_per_scene
+            names = right_names.get((scene, model))
+            # only models that detect have names, and a row may have lost its boxes
             if names is not None and isinstance(row.payload, dict):
                 self._frame_of_step[row.step] = read_frame(row.payload, names)
             if path_name in row.values:
@@ -295,9 +299,9 @@ class Drives:
         """Compute the rates of one model over drives.
 
         Args:
-            drives: those with all their frames.
-            model: its index.
-            answer: which scene they have, clean or adversarial, by its name; empty if
+            drives: drives with all their frames.
+            model: index of the model.
+            answer: name of the scene that they have, clean or adversarial; empty if
                 the sweep has no adversarial one.
         """
         n_frames = len(self.times)
@@ -305,13 +309,13 @@ class Drives:
         drive_records = self._describe_drives(drives, first_distance)
         has_right = np.asarray((drives.flags == 1).any(axis=1))
 
-        # Rows of one draw differ in noise alone: they are one drive.
+        # Rows of one draw differ in noise alone: they are repeats of one drive.
         first_images = drives.steps[:, 0] // len(self._job.models)
-        drive = np.asarray(self._units.find_draw(first_images))
+        drive = np.asarray(self._units.find_draw(first_images))  # (n,) its draw
         n_drives = len(np.unique(drive))
         n_right_drives = len(np.unique(drive[has_right]))
-        # bounds of the values, from the plan: every frame wrong, a change at every
-        # frame
+        # The largest values that are possible: every frame is wrong, and the prediction
+        # changes from each frame to the next.
         max_gap = n_frames * self._frame_interval
         max_flicker = (n_frames - 1) / self.seconds
         return DriveRates(
@@ -406,7 +410,7 @@ class Drives:
         loose if a track would be on it with less overlap.
 
         Args:
-            model: its index.
+            model: index of the model.
             steps: (n, frames) numbers of the rows.
             drive: (n,) the draw of each drive; drives of one draw differ in noise
                 alone.
@@ -449,16 +453,18 @@ class Drives:
 
         Args:
             scenes: scenes of the sweep.
-            run: where they are written.
+            run: run directory into which they are written.
         """
-        drives = self._select_complete([*range(len(self._job.scenes))], 0)
+        all_scenes = [*range(len(self._job.scenes))]
+        drives = self._select_complete(all_scenes, 0)
         if not len(drives.flags):
             return
         worst = _right_fraction(drives.flags).argmin()
-        numbers = drives.steps[worst] // len(self._job.models)
+        # rows are numbered by image, then model
+        image_numbers = drives.steps[worst] // len(self._job.models)
         frames = []
-        selected = select_evenly(len(numbers), MAX_ANIMATED_FRAMES)
-        for number in numbers[selected].tolist():
+        selected = select_evenly(len(image_numbers), MAX_ANIMATED_FRAMES)
+        for number in image_numbers[selected].tolist():
             scene, queries = scenes.make_queries(number)
             query = queries[0]  # of the first model
             image = scene.render_image(query)
@@ -535,9 +541,8 @@ def summarize_drives(
     """
     means = values
     if drive_of_value is not None:
-        means = sum_per_unit(values, drive_of_value) / sum_per_unit(
-            np.ones(len(values)), drive_of_value
-        )
+        n_values = sum_per_unit(np.ones(len(values)), drive_of_value)
+        means = sum_per_unit(values, drive_of_value) / n_values
     interval = None
     if bounds is not None and len(means) > 1:
         interval = mean_interval(means, *bounds)

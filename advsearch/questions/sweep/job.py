@@ -51,11 +51,11 @@ class NamedScene:
     """One of the scenes of a sweep.
 
     Attributes:
-        object: its name.
-        environment: its name.
-        scene: as it was loaded.
+        object: name of the object.
+        environment: name of the environment.
+        scene: the loaded scene.
         fixed_controls: controls that do not vary.
-        u: (d,) their configuration; None leaves the scene as it is.
+        u: (d,) the configuration of these; None leaves the scene as it is.
         arm: name of the arm of a comparison without and with the adversarial
             configuration of a run; empty if nothing is compared.
         photograph: name of the photograph of a folder that it is in; empty if it is in
@@ -91,7 +91,7 @@ class Job:
     Attributes:
         config: the settings.
         scenes: the scenes.
-        models: all of which get the same images.
+        models: the models, all of which get the same images.
         tasks: one for each model.
         controls: the sampled ones.
         axes: axes of the grid.
@@ -185,6 +185,7 @@ class Job:
         images_before = scene * self.images_per_scene
         first_in_scene = numbers.start - images_before
         queries = list[Query]()
+        # Controls may depend on the size of the images: each size has its own points.
         for size, points in self.load_points(scene).items():
             configurations = points.make_configurations(
                 first_in_scene, len(numbers), images_before
@@ -213,7 +214,7 @@ class Job:
 
         Args:
             number: number of the image in the sweep.
-            model: its index.
+            model: index of the model.
             points: points of the scene.
             u: (d,) the configuration.
             values: values of the controls.
@@ -244,9 +245,9 @@ class Job:
         Parameters of the controls that the scene itself fixes are left out.
 
         Args:
-            scene: its index.
-            model: its index.
-            environment: what lights the scene instead of its own environment.
+            scene: index of the scene.
+            model: index of the model.
+            environment: name of the environment that replaces that of the scene.
             values: values of the controls.
         """
         named_scene = self.scenes[scene]
@@ -287,22 +288,11 @@ class Job:
             return Space((), None)
         space = make_space(controls, description)
         if named_scene.fixed_controls:
-            held_controls = space.controls[: len(named_scene.fixed_controls)]
-            start = torch.cat([control.start for control in held_controls])
-            if named_scene.u is not None and len(named_scene.u) != len(start):
-                raise InputError(
-                    "adversarial_of: the adversarial configuration of "
-                    f"{named_scene.arm} has {len(named_scene.u)} "
-                    f"numbers, and {named_scene.object} takes {len(start)}: it is "
-                    "another "
-                    "object, or it has changed since; "
-                    "do the run again"
-                )
-            space = space.fix_first_controls(
-                start if named_scene.u is None else named_scene.u
-            )
+            space = _fix_controls(named_scene, space)
+        # `check_scenes` has checked the environment
+        set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
         for group in space.groups:
-            if group.setting in named_scene.scene.description.requested - {ENVIRONMENT}:
+            if group.setting in set_by_user:
                 raise InputError(
                     f"`controls` {group.control}: draws {group.parameter} by chance, "
                     f"and `set` {group.setting} fixes "
@@ -340,6 +330,33 @@ class Job:
             describe=lambda: values,
             judge=self.config.judge,
         )
+
+
+def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
+    """Fix the first controls of a space to the configuration of a scene.
+
+    Args:
+        named_scene: scene with fixed controls; without a configuration `u`, these are
+            fixed to their start, as in the clean arm.
+        space: space of all controls, with the fixed ones first.
+
+    Raises:
+        InputError: the adversarial configuration does not fit the scene.
+    """
+    fixed_controls = space.controls[: len(named_scene.fixed_controls)]
+    start = torch.cat([control.start for control in fixed_controls])
+    if named_scene.u is None:
+        return space.fix_first_controls(start)
+    if len(named_scene.u) != len(start):
+        raise InputError(
+            "adversarial_of: the adversarial configuration of "
+            f"{named_scene.arm} has {len(named_scene.u)} "
+            f"numbers, and {named_scene.object} takes {len(start)}: it is "
+            "another "
+            "object, or it has changed since; "
+            "do the run again"
+        )
+    return space.fix_first_controls(named_scene.u)
 
 
 def check_scenes(
@@ -390,6 +407,7 @@ def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
         (control for control in controls if control.name == axis.instance), None
     )
     if control is None:
+        # any value will do, since the name of the setting does not depend on it
         settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
         control = make_control(axis.instance, settings)
     return control.setting_name(axis.parameter)
@@ -439,7 +457,7 @@ def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledN
 
     Args:
         versions: the number in each scene.
-        n_parts: into which its range is cut.
+        n_parts: number of equal parts of its range.
     """
     number = versions[0]
     if all(version.parts == number.parts for version in versions):
@@ -469,7 +487,7 @@ class SweptScene:
         config = job.config
         self.number = number
         self.job = job
-        self.points = job.load_points(number)
+        self.points = job.load_points(number)  # by image size
         # renderers of the scene without its object, by size, made on demand
         self._empty_renderers: dict[ImageSize, Renderer] = {}
         self.renderers = {size: self._make_renderer(size) for size in self.points}
@@ -545,6 +563,7 @@ class SweptScene:
         evaluations = self._make_evaluations(
             queries, images, judgements, seconds, wrong_images
         )
+        # what concerns the batch
         evaluations[-1] = replace(
             evaluations[-1],
             light=[predictor.summarize() for predictor in self.predictors.values()],
@@ -569,7 +588,7 @@ class SweptScene:
             queries: queries of this scene.
             images: images by size, then by the number of the image.
             judgements: judgements by the number of the query.
-            seconds: that each query took.
+            seconds: seconds that each query took.
             wrong_images: numbers of the images in which any model is wrong.
         """
         evaluations = list[Evaluation]()
@@ -634,8 +653,8 @@ class SweptScene:
         """Return an evaluation of the first model with the images that are stored.
 
         Args:
-            evaluation: without them.
-            query: what is evaluated.
+            evaluation: the evaluation without images.
+            query: the query that was evaluated.
             image: image of the query.
             is_wrong: whether the prediction of any model is wrong.
         """
@@ -681,12 +700,7 @@ class SweptScene:
             if change == WITHOUT_OBJECT:
                 changed_images = self._render_empty(size, queries)
             else:
-                changed_images = torch.stack(
-                    [
-                        change_image(image, change, problem.model.cameras)
-                        for image in images
-                    ]
-                )
+                changed_images = _change_images(images, change, problem.model.cameras)
             changed_judgements = problem.judge_images(
                 changed_images, configurations, values
             )
@@ -807,6 +821,17 @@ class SceneLoader:
         return features_of(self.job.models[0])
 
 
+def _change_images(images: Tensor, change: str, n_cameras: int) -> Tensor:
+    """Apply a change, such as "black", to each of several images (n, H, W, 3).
+
+    Args:
+        images: the images, each of all cameras side by side.
+        change: name of the change.
+        n_cameras: number of cameras; the image of each is changed by itself.
+    """
+    return torch.stack([change_image(image, change, n_cameras) for image in images])
+
+
 def verify_worst(
     problem: Problem,
     config: SweepConfig,
@@ -822,7 +847,7 @@ def verify_worst(
 
     Args:
         problem: problem of its scene and model.
-        config: config of the sweep.
+        config: settings of the sweep.
         u: (d,) the configuration.
         run: None stores nothing.
         stages: stages of the sweep.
@@ -836,7 +861,7 @@ def verify_worst(
     verifier = Verifier(
         Journal(run, ParallelEvaluator(problem)), ladder, stages, has_success=False
     )
-    verifier.choose_spp({"worst": u})
+    verifier.choose_spp({"worst": u})  # sets `spp` and `sample_count` of its state
     verifier.begin_stage(
         "checking the worst configuration with fresh renders", config.trials
     )
@@ -845,7 +870,7 @@ def verify_worst(
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
-    wrong_trials = [trial for trial in trials if trial.success]
+    wrong_trials = [trial for trial in trials if trial.success]  # of an attack
     counts = Trials(len(wrong_trials), len(trials), spp)
     verified_rate = make_rate(counts, trials, wrong_trials)
     has_converged = sample_count is not None and sample_count.converged

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from advsearch.attacks import Evaluation, Query
 from advsearch.attacks.domain import split_into_batches
-from advsearch.cluster import InProcess, Workers
+from advsearch.cluster import BatchResult, InProcess, Workers
 from advsearch.engine.journal import (
     Journal,
     ParallelEvaluator,
@@ -178,6 +178,7 @@ class Sweep:
                 else:
                     missing = self._find_missing()
                 first_row = missing[0].start if missing else self.n_rows - 1
+                # loaded here, so that its time counts for the stage "setup"
                 self._scenes.load(self._scene_of(first_row))
                 self._evaluate_rows(missing, predictions)
                 worst = self._find_worst(predictions, verify=True)
@@ -225,24 +226,15 @@ class Sweep:
 
         Args:
             missing: numbers of the rows that are not stored yet.
-            predictions: which gets the judgement of each.
+            predictions: predictions so far, to which the judgement of each is added.
         """
         title = "rendering and classifying"
         self.stages.begin("sweep", title, self.n_rows, hint=self._sweep_hint())
         self.stages.progress.advance(self.n_rows - sum(map(len, missing)))
         self._sweep_begin = time.monotonic()
         for done in self._executor.compute(self._make_batches(missing)):
-            queries = [query for *_, query in done.items]
-            if done.lost:
-                evaluations = [
-                    make_lost_evaluation(query, done.lost) for query in queries
-                ]
-            else:
-                evaluations = done.value
-            evaluations = [
-                replace(evaluation, machine=done.machine) for evaluation in evaluations
-            ]
-            evaluated = list(zip(queries, evaluations, strict=True))
+            evaluated = _pair_evaluations(done)
+            queries = [query for query, _ in evaluated]
             self._save_images(evaluated)
             self._add_costs(self.journal.store(evaluated, id_is_number=True))
             # Models of one size share an image, which counts for the first of them.
@@ -252,8 +244,9 @@ class Sweep:
             )
             scene = self._scene_of(queries[0].index)
             # What concerns a batch stands in its last evaluation.
-            self._transport[done.worker, scene] = evaluations[-1].light or []
-            if any(evaluation.non_finite for evaluation in evaluations):
+            _, last_evaluation = evaluated[-1]
+            self._transport[done.worker, scene] = last_evaluation.light or []
+            if any(evaluation.non_finite for _, evaluation in evaluated):
                 self._note_non_finite()
             for query, evaluation in evaluated:
                 predictions.add(query.index, evaluation.required_judgement)
@@ -490,6 +483,7 @@ class Sweep:
             rows = [self.run.store.read_row(KIND, row_number)]
         row = next(row for row in rows if row is not None and row.step == row_number)
         image, model = divmod(row_number, self.n_models)
+        # the queries of all models about this one image
         _, _, query = self.job.make_queries(range(image, image + 1))[model]
         scene = self._scene_of(row_number)
         worst = WorstConfiguration(
@@ -510,7 +504,7 @@ class Sweep:
     def _find_right_labels(self, scene: int, model: int, query: Query) -> list[str]:
         """Return the names that count as right in the image of a query."""
         task = self.job.tasks[model]
-        if task.varies:
+        if task.varies:  # the truth depends on the configuration, as a box does
             problem = self._scenes.load(scene).problems[model]
             truth = problem.find_truth(query.u, query.values)
         else:
@@ -525,7 +519,7 @@ class Sweep:
         """Render the worst configuration again, and save its image.
 
         Args:
-            worst: as the sweep had it.
+            worst: the configuration, as the sweep evaluated it.
             problem: problem of its scene and model.
             u: (d,) the configuration.
         """
@@ -573,7 +567,8 @@ class Sweep:
         seconds = self.stages.seconds
         verified = worst.verified if worst else None
         formation, gains = self._describe_formation()
-        # Rates are of these rows, and their intervals of the units that they belong to.
+        # Rates are of these rows, and their intervals of the units that they belong to:
+        # of drives, say, since the frames of one are not independent.
         rows = np.flatnonzero(predictions.is_counted)
         right = predictions.is_right[rows]
         units = self.units.find_unit(rows)
@@ -646,6 +641,7 @@ class Sweep:
                     named_scene.scene.description, self.job.image_sizes[0]
                 )
                 names = dict(named_scene.names)
+                # The adversarial scene has the gain of its clean scene.
                 names.pop("answer", None)
                 gains[", ".join(names.values())] = description.gain
         if len(set(gains.values())) != 1:
@@ -674,6 +670,7 @@ class Sweep:
         transport = [
             summary for summaries in self._transport.values() for summary in summaries
         ]
+        # without a batch in this session, what the loaded scene has
         if not self._transport and self._scenes.scene is not None:
             predictors = self._scenes.scene.predictors.values()
             transport = [predictor.summarize() for predictor in predictors]
@@ -744,11 +741,13 @@ class Sweep:
                 "that a check takes: noise may take part in it."
             )
         for rates in changes:
-            if (
+            # surely less than half of the predictions change, and all should
+            is_blind = (
                 rates.claim == "must_change"
                 and rates.interval is not None
                 and rates.interval[1] < 0.5
-            ):
+            )
+            if is_blind:
                 n_same = rates.configurations - rates.correct
                 yield (
                     f"{rates.model} says the same in {n_same} of "
@@ -758,10 +757,13 @@ class Sweep:
 
     def _drive_remarks(self) -> Iterator[str]:
         """Yield what few drives can show at best."""
+        # of the model with the fewest; enough if no drives are swept
         n_drives = min(
             (rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES
         )
-        if n_drives == 1 and self.units.noise == 1:
+        # repeats of one drive have a remark of their own, from `explain_repeats`
+        is_repeated = self.units.noise > 1
+        if n_drives == 1 and not is_repeated:
             yield "One drive says nothing of others: there is no interval over drives."
         elif 1 < n_drives < ENOUGH_DRIVES:
             lower_bound = max_lower_bound(n_drives)
@@ -797,6 +799,22 @@ class Sweep:
 def _get_names(items: Iterable[Any]) -> list[str]:
     """Return the names of models or controls."""
     return [item.name for item in items]
+
+
+def _pair_evaluations(done: BatchResult) -> list[tuple[Query, Evaluation]]:
+    """Return the queries of a batch with their evaluations.
+
+    Evaluations state the machine that made them. If the worker of the batch died, they
+    state that the evaluation is lost.
+    """
+    queries = [query for *_, query in done.items]
+    evaluations = done.value
+    if done.lost:
+        evaluations = [make_lost_evaluation(query, done.lost) for query in queries]
+    return [
+        (query, replace(evaluation, machine=done.machine))
+        for query, evaluation in zip(queries, evaluations, strict=True)
+    ]
 
 
 def _make_axis_rows(

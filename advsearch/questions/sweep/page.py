@@ -130,7 +130,7 @@ def make_sweep_page(
 
     Args:
         runs: directory and summary of each; None without a summary yet.
-        sources: what the explorer reads of each.
+        sources: rows and thumbnails of each, which the explorer reads.
     """
     explored = [
         (source, *run)
@@ -409,7 +409,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
 
     Args:
         runs: run directories.
-        folder: which is written.
+        folder: directory that is written.
 
     Returns:
         The page's path.
@@ -426,10 +426,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     with name_setting_in_errors("bundle"):
         if len(results) == 1 and not sweeps:
             run, result = results[0]
-            # Pages are made anew: what lies in the run may be anybody's.
-            for file in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
-                html = make_run_page(file.parent, read_result(file.parent))
-                write_text(folder / file.relative_to(run), html)
+            _write_part_pages(run, folder)
             return write_text(folder / INDEX, make_run_page(run, result))
         if len(sweeps) < len(results):
             raise InputError(
@@ -439,6 +436,20 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
             _write_source(run, index, folder) for index, (run, _) in enumerate(sweeps)
         ]
         return write_text(folder / INDEX, make_sweep_page(sweeps, sources))
+
+
+def _write_part_pages(run: Path, folder: Path) -> None:
+    """Write the pages of the parts of a run, which its own page links to.
+
+    Pages are made anew: what lies in the run may be anybody's.
+
+    Args:
+        run: run directory, whose parts are runs with results of their own.
+        folder: folder of the bundle.
+    """
+    for file in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
+        html = make_run_page(file.parent, read_result(file.parent))
+        write_text(folder / file.relative_to(run), html)
 
 
 def _write_source(run: Path, index: int, folder: Path) -> SweepSource:

@@ -197,7 +197,9 @@ class BasisPictures:
             return NOISE
         inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
         n_lights = len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
-        prediction_samples = n_lights * COLLECTED_SPP + N_VIEWS * (2 * CHECK_SPP + spp)
+        # a basis image for each light, and `N_VIEWS` comparisons with traced images
+        basis_samples = n_lights * COLLECTED_SPP
+        prediction_samples = basis_samples + N_VIEWS * (2 * CHECK_SPP + spp)
         min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
         if groups.group_size < min_images:
             return Refusal(
@@ -205,6 +207,7 @@ class BasisPictures:
                 f"light alone; here {groups.group_size} do"
             )
         height, width = renderer.formation.resolution
+        # 8 bytes for each pixel of a basis image
         n_bytes = groups.n_cached_groups * n_lights * 8 * height * width
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
@@ -248,6 +251,7 @@ def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> 
     """
     height, width = renderer.formation.resolution
     light_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
+    # a view is traced in two halves to tell its noise, and once as images are
     check_spp = N_VIEWS * (2 * CHECK_SPP + spp)
     fixed_spp = light_samples / (height * width) + check_spp
     return math.ceil(MIN_SAVING_FACTOR * fixed_spp / (spp - PREDICTION_SPP))
@@ -476,7 +480,7 @@ class SweepPredictor:
         images: dict[int, SweptImage] = {}
         numbers_by_predictor: dict[Predictor, list[int]] = {}
         for number, query in query_of_image.items():
-            predictor = None
+            predictor = None  # renders the image
             if self.refusal is None:
                 group = self._groups.find_group(number)
                 predictor = self._load_predictor(group, number)
@@ -513,13 +517,14 @@ class SweepPredictor:
         too many are cached, the oldest is released.
 
         Args:
-            group: its index.
+            group: index of the group.
             number: number of an image of the group, in the scene.
         """
         if group in self._predictors:
             return self._predictors[group]
         if len(self._predictors) >= self._groups.n_cached_groups:
-            self._predictors.pop(next(iter(self._predictors)))
+            oldest = next(iter(self._predictors))
+            self._predictors.pop(oldest)
         begin = time.perf_counter()
         seed = seeds.stream(self.seed, "light", self.images_before + group)
         predictor = self.method.make_predictor(self._configuration(number, 0), seed)
@@ -660,7 +665,10 @@ def prepare_surface_light(
         if not varying.isdisjoint(range(group.begin, group.begin + group.size))
     ]
     changed_inputs = find_changed_inputs(problem.renderer, groups)
-    if not changed_inputs & CAMERA_INPUTS or not changed_inputs <= FREE_INPUTS:
+    moves_camera = bool(changed_inputs & CAMERA_INPUTS)
+    # light on surfaces cannot follow a change of any other input
+    can_follow = changed_inputs <= FREE_INPUTS
+    if not moves_camera or not can_follow:
         return
     findings = verifier.state
     findings.predictor_refusal = find_scene_refusal(problem.renderer)

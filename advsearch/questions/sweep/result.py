@@ -79,6 +79,7 @@ def count_by_unit(
     right_in_unit = sum_per_unit(right, units)
     unit_size = sum_per_unit(np.ones(len(right)), units)
     interval = None
+    # several predictions of one unit don't tell how much units differ
     if len(unit_size) > 1 or len(right) == 1:
         interval = rate_interval(right_in_unit, unit_size)
     outcome_counts = None
@@ -116,7 +117,7 @@ def count_independent(
     Args:
         correct: right predictions.
         n_predictions: predictions.
-        interval: by default that of Clopper and Pearson.
+        interval: interval of the accuracy; by default that of Clopper and Pearson.
     """
     if not n_predictions:
         return CountedPredictions(
@@ -212,7 +213,7 @@ class Predictions:
         configuration. Pairs are counted only if both predictions are.
 
         Args:
-            models: their names.
+            models: names of the models.
             units: how rows follow from draws.
 
         Returns:
@@ -247,13 +248,14 @@ def _compare_pairs(
     """Compare the predictions of a model without and with an adversarial scene.
 
     Args:
-        model: its name.
+        model: name of the model.
         right: (2, n) whether each is right, first without.
         outcome: (2, n) indices among `OUTCOMES`.
         draws: (n,) the draw of each pair.
     """
     clean, adversarial = right
     clean_outcome, adversarial_outcome = outcome
+    # without the p-value
     difference, interval, _ = compare_paired(clean, adversarial, draws)
     return PairedRates(
         model=model,
@@ -459,7 +461,7 @@ def import_threedb(
 
     Args:
         folder: folder of 3DB.
-        run: by default ``runs/NAME-3db-NNN``.
+        run: run directory; by default ``runs/NAME-3db-NNN``.
         overwrite: whether another run may be there.
 
     Raises:
@@ -498,6 +500,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     tables = list[AxisRow]()
     for name in rows.attrs["units"]:
         values, indices = np.unique(rows[name].astype(object), return_inverse=True)
+        # A single value varies nothing; very many make no table.
         if 1 < len(values) <= MAX_LISTED_VALUES:
             axis = TableAxis(name, "", values.tolist(), indices)
             tables += axis.make_rows(right, rows["unit"])
@@ -505,6 +508,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
         column: _join_names(rows, column)
         for column in ("object", "environment", "model")
     }
+    # fields that the log of 3DB says nothing about: None
     unknown = dict.fromkeys(
         ("image_formation", "cells", "worst", "sampler", "renders_per_second")
     )

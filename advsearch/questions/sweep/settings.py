@@ -312,6 +312,7 @@ class SweepConfig(SceneConfig):
                 them, what the attack was over varies.
         """
         attack_config = AttackConfig.from_yaml(file)
+        # Both commands have these settings, but a sweep has its own values of them.
         excluded = (
             "controls",
             "texture_resolution",
@@ -366,10 +367,11 @@ def _parse_axis(axis: Any) -> str | list[Any]:
         axis = axis["choices"]
     if isinstance(axis, str):
         text = axis.strip().removeprefix("[").removesuffix("]")
-        if ":" in text and "," not in text:
+        is_range = ":" in text and "," not in text
+        if is_range:
             return text
         axis = [part.strip() for part in text.split(",") if part.strip()]
-    if hasattr(axis, "tolist"):
+    if hasattr(axis, "tolist"):  # an array of NumPy or PyTorch
         axis = axis.tolist()
     if not isinstance(axis, (range, tuple, list)):
         axis = [axis]

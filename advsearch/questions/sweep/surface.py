@@ -204,9 +204,10 @@ def _permutation_p_value(
     )
     statistic = _likelihood_ratio(k, n, failures, images)
     n_permutations = len(max_statistics)
-    # 1e-9: equal statistics may differ by rounding.
-    # permutations whose largest statistic is at least that of the part
-    n_above = n_permutations - np.searchsorted(max_statistics, statistic - 1e-9)
+    # permutations whose largest statistic is at least that of the part, except for
+    # rounding
+    tolerance = 1e-9
+    n_above = n_permutations - np.searchsorted(max_statistics, statistic - tolerance)
     return np.asarray((1 + n_above) / (1 + n_permutations))
 
 
@@ -298,7 +299,7 @@ class SurfaceCounts:
         indices follow those of the cells.
 
         Args:
-            surfaces: what the image shows.
+            surfaces: the surface that each pixel of the image shows.
             wrong_by_model: whether the prediction is wrong, by the index of the model.
         """
         is_object = surfaces.visible_mask(OBJECT)
@@ -325,11 +326,11 @@ class SurfaceCounts:
         go with wrong predictions, and then with right ones.
 
         Args:
-            object_name: its name.
-            model: its name.
+            object_name: name of the object.
+            model: name of the model.
             counts: counts of the model.
             kind: kind of the parts, a key of `SurfaceParts.kinds`.
-            compared: compared from `compare_parts`.
+            compared: comparison of the parts, from `compare_parts`.
         """
         strongest = list[SurfacePart]()
         for has_sign in (compared.difference > 0.0, compared.difference < 0.0):
@@ -376,9 +377,9 @@ class SurfaceCounts:
         """Return the counts and the comparison of one part, as the summary has them.
 
         Args:
-            part: its index.
+            part: index of the part.
             counts: counts of a model.
-            compared: compared from `compare_parts`.
+            compared: comparison of the parts, from `compare_parts`.
         """
         n_visible = int(counts.visible_counts[part])
         n_visible_wrong = int(counts.wrong_counts[part])
@@ -408,14 +409,14 @@ def map_surface(
     Args:
         scenes: scenes of the sweep.
         rows: all of its rows.
-        run: where the files are written.
+        run: run directory into which the files are written.
         progress: advances by the number of predictions.
 
     Returns:
         What the summary says.
     """
     job = scenes.job
-    wrong = _read_wrong(scenes, rows)
+    wrong = _read_wrong(scenes, rows)  # (scenes, images, models)
     assets = {
         named_scene.object: named_scene.scene.description.object
         for named_scene in job.scenes
@@ -449,7 +450,7 @@ def _make_counts(
     Args:
         scenes: scenes of the sweep.
         assets: the objects by name.
-        wrong: wrong from `_read_wrong`.
+        wrong: (scenes, images, models) 1, 0 or UNKNOWN, from `_read_wrong`.
     """
     job = scenes.job
     draws = _draw_of_images(scenes, wrong, job)
@@ -494,7 +495,7 @@ def _make_part_counts(
         seed: seed of the permutations.
     """
     permuted = permute_draws(wrong.ravel(), draws.ravel(), seed)
-    n_known = int((wrong >= 0).sum())
+    n_known = int((wrong >= 0).sum())  # UNKNOWN is below 0
     n_failures = int((wrong >= 1).sum())
     return PartCounts(parts.count, n_known, n_failures, seed, permuted)
 
@@ -589,8 +590,8 @@ def _write_map(
     Args:
         counts: counts by the name of the object.
         assets: the objects by name.
-        models: their names.
-        run: where the files are written.
+        models: names of the models.
+        run: run directory into which the files are written.
     """
     tables = list[SurfaceTable]()
     panels = list[Panel]()
@@ -621,10 +622,10 @@ def _make_tables(
     """Return the tables of an object: one for each model and kind of part.
 
     Args:
-        models: their names.
-        object_counts: object counts of the object.
-        comparisons: comparisons from `_compare_kinds`, for each model.
-        object_name: its name.
+        models: names of the models.
+        object_counts: counts of the object.
+        comparisons: for each model, the comparison of its parts by kind.
+        object_name: name of the object.
     """
     tables = list[SurfaceTable]()
     for model, model_counts, compared_by_kind in zip(
@@ -666,9 +667,9 @@ def _make_panels(
     Args:
         asset: the object.
         counts: counts of it.
-        comparisons: comparisons from `_compare_kinds`, for each model.
-        object_name: its name.
-        models: their names.
+        comparisons: for each model, the comparison of its parts by kind.
+        object_name: name of the object.
+        models: names of the models.
     """
     views = tuple(_render_views(asset, counts.parts))
     for model, model_counts, compared_by_kind in zip(
@@ -732,7 +733,7 @@ def _grey_colors(
     Args:
         parts: parts of the object.
         counts: counts of one model.
-        cells: cells from `compare_parts`, of the cells.
+        cells: comparison of the cells, from `compare_parts`.
     """
     was_visible = counts.visible_counts[parts.part_slices["cell"]] > 0
     has_surface = parts.is_covered.ravel() | was_visible
@@ -765,7 +766,7 @@ class MapView(NamedTuple):
     """What a camera sees of an object.
 
     Attributes:
-        title: where the camera stands.
+        title: position of the camera, as text.
         cells: (H, W) index of the cell in each pixel, row by row of the map; -1 where
             the object is not.
         shade: (H, W) brightness in [0, 1].

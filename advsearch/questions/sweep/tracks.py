@@ -61,7 +61,7 @@ class _Track:
     """A track.
 
     Attributes:
-        number: which stays the same.
+        number: number of the track, which stays the same.
         box: (4,) in the last frame: a detected one, or, where the track was missed, the
             last detected one moved by `missed` times its speed.
         speed: (4,) change of the box per frame.
@@ -117,6 +117,7 @@ class ConstantVelocity:
             for track in self._tracks
         ]
         sure_tracks, waiting, new_boxes = self._assign(waiting, boxes[is_sure])
+        # Unsure boxes continue tracks, but begin none (ByteTrack).
         unsure_tracks, waiting, _ = self._assign(waiting, boxes[~is_sure])
         new_tracks = [
             _Track(next(self._numbers), box, np.zeros(4)) for box in new_boxes
@@ -223,6 +224,7 @@ def track_drive(
         if last_number is not None:
             n_switches += 1
         last_number = number
+    # lengths of the runs of lost frames
     gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
     n_visible = sum(frame.true is not None for frame in frames)
     return DriveTracking(
