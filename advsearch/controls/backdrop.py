@@ -14,7 +14,7 @@ takes the shadow where it is.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -61,18 +61,14 @@ class BackdropControl(Control):
         setting = settings.get("which") if isinstance(settings, Mapping) else None
         if isinstance(setting, Mapping):
             setting = setting.get("choices")
-        names = [setting] if isinstance(setting, str) else setting or []
-        options = [name for name in names if isinstance(name, str)]
+        names: Sequence[object] = [setting]
+        if isinstance(setting, Sequence) and not isinstance(setting, str):
+            names = setting
+        options = tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
         if not options:
             return (which,)
-        return (
-            replace(
-                which,
-                options=tuple(dict.fromkeys(options)),
-                default=options[0],
-                high=len(options) - 1.0,
-            ),
-        )
+        high = len(options) - 1.0
+        return (replace(which, options=options, default=options[0], high=high),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Check the photographs, and begin with the first one that is allowed.

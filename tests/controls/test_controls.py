@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import tempfile
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+import samples
 from advsearch import load_scene
 from advsearch.controls import CONTROLS, Control, TextureControl, make_control, make_space
+from advsearch.engine.loading import fit_camera
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import load_description
+from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.gradients import ESTIMATORS
 from advsearch.scene.settings import SETTINGS
 from conftest import ROOT
@@ -27,11 +32,20 @@ BESIDE = "bottle@0.4,0.1; vase@-0.3,0.3"
 """What `things` moves."""
 
 
+@cache
+def describe_scene(kind: str, object: str = "mug") -> SceneDescription:
+    """Return a scene that suits a control."""
+    if kind != "backdrop":
+        return load_description(SUITS.get(kind, object), things=BESIDE)
+    with tempfile.TemporaryDirectory() as parent:
+        folder = samples.write_photograph_folder(Path(parent) / "desk")
+        box = samples.PHOTOGRAPHS / "models" / "obj_000002.ply"
+        return fit_camera(load_scene(box, backdrop=folder, unit="mm").description, 24)
+
+
 def bound(kind: str, object: str = "mug") -> Control:
     """A control with its defaults in a scene, alone."""
-    return make_space(
-        [make_control(kind, NEEDED.get(kind))], load_description(SUITS.get(kind, object), things=BESIDE)
-    ).controls[0]
+    return make_space([make_control(kind, NEEDED.get(kind))], describe_scene(kind, object)).controls[0]
 
 
 @every_control
@@ -40,7 +54,8 @@ def test_a_control_declares_itself(kind: str) -> None:
     parameters = control.declare_parameters(NEEDED.get(kind, {}))
     assert control.kind == kind and control.summary.endswith(".") and parameters
     for parameter in parameters:
-        assert parameter.low < parameter.high and parameter.unit and parameter.description.endswith(".")
+        assert parameter.low < parameter.high or len(parameter.options) == 1
+        assert parameter.unit and parameter.description.endswith(".")
         assert set(parameter.estimators) <= set(ESTIMATORS)
         if parameter.search is not None and not parameter.options:
             assert parameter.low <= parameter.search[0] < parameter.search[1] <= parameter.high or parameter.log
@@ -54,7 +69,9 @@ def test_a_control_declares_itself(kind: str) -> None:
 
 
 def test_a_setting_of_the_scene_and_the_parameter_of_that_name_are_one_declaration() -> None:
-    fixed = {"camera.ev", "camera.lamps", "camera.drops", "camera.drop_size", "camera.drop_seed"}  # searched by nobody
+    # searched by nobody
+    cameras = {"camera.ev", "camera.lamps", "camera.drops", "camera.drop_size", "camera.drop_seed"}
+    fixed = {*cameras, "backdrop.noise", "backdrop.blur"}
     for name, declared in SETTINGS.items():
         kind, _, parameter = name.partition(".")
         if kind in CONTROLS and name not in fixed:
@@ -123,7 +140,7 @@ def test_a_bound_control_says_its_configuration_in_values_with_units(kind: str) 
 def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
     control = make_control(kind, NEEDED.get(kind))
     again = make_control(kind, control.to_settings())
-    scene = load_description(SUITS.get(kind, "mug"), things=BESIDE)
+    scene = describe_scene(kind)
     first, second = (make_space([one], scene).controls[0] for one in (control, again))
     assert torch.equal(first.start, second.start) and first.groups == second.groups
 
