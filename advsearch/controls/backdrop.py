@@ -61,21 +61,14 @@ class BackdropControl(Control):
         setting = settings.get("which") if isinstance(settings, Mapping) else None
         if isinstance(setting, Mapping):
             setting = setting.get("choices")
-        if isinstance(setting, str):
-            setting = [setting]
-        if not isinstance(setting, Sequence):
-            return (which,)  # not set, or nothing that could be a name
-        options = [name for name in setting if isinstance(name, str)]
+        names: Sequence[object] = [setting]
+        if isinstance(setting, Sequence) and not isinstance(setting, str):
+            names = setting
+        options = tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
         if not options:
             return (which,)
-        return (
-            replace(
-                which,
-                options=tuple(dict.fromkeys(options)),
-                default=options[0],
-                high=len(options) - 1.0,
-            ),
-        )
+        high = len(options) - 1.0
+        return (replace(which, options=options, default=options[0], high=high),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Check the photographs, and begin with the first one that is allowed.
