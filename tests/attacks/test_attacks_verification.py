@@ -156,11 +156,8 @@ def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
     choice = choose_spp({"clean": drifting(-3.0, 0.0, 0.1), "adversarial": drifting(2.0, 0.0, 0.1)}, seed=0)
     assert (choice.spp, choice.converged, choice.renders) == (16, True, 16), "the first look is enough"
     assert [(r.name, r.spp) for r in choice.table] == [
-        ("clean", 4),
-        ("clean", 16),
-        ("adversarial", 4),
-        ("adversarial", 16),
-    ]
+        ("clean", 4), ("clean", 16), ("adversarial", 4), ("adversarial", 16),
+    ]  # fmt: skip
     assert math.isnan(choice.table[0].drift)
 
 
@@ -350,20 +347,14 @@ def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_di
 @pytest.mark.parametrize(
     ("search_ending", "clean", "adversarial", "expected"),
     [
-        (Ending.FOUND, 20, 20, Ending.FOUND),
-        (Ending.FOUND, 19, 19, Ending.FOUND),
-        (Ending.FOUND, 20, 18, Ending.NOT_VERIFIED),
-        (Ending.FOUND, 18, 18, Ending.NOT_VERIFIED),
-        (Ending.FOUND, 18, 20, Ending.NOT_VERIFIED),
-        (Ending.BUDGET_SPENT, 20, 19, Ending.FOUND),
-        (Ending.BUDGET_SPENT, 20, 18, Ending.BUDGET_SPENT),
-        (Ending.STALLED, 20, 0, Ending.STALLED),
-        (Ending.NON_FINITE, 20, 0, Ending.NON_FINITE),
-        (Ending.FOUND, 9, 9, Ending.ALREADY_WRONG),
-        (Ending.BUDGET_SPENT, 0, 0, Ending.ALREADY_WRONG),
-        (Ending.INTERRUPTED, 20, 20, Ending.INTERRUPTED),
+        (Ending.FOUND, 20, 20, Ending.FOUND), (Ending.FOUND, 19, 19, Ending.FOUND),
+        (Ending.FOUND, 20, 18, Ending.NOT_VERIFIED), (Ending.FOUND, 18, 18, Ending.NOT_VERIFIED),
+        (Ending.FOUND, 18, 20, Ending.NOT_VERIFIED), (Ending.BUDGET_SPENT, 20, 19, Ending.FOUND),
+        (Ending.BUDGET_SPENT, 20, 18, Ending.BUDGET_SPENT), (Ending.STALLED, 20, 0, Ending.STALLED),
+        (Ending.NON_FINITE, 20, 0, Ending.NON_FINITE), (Ending.FOUND, 9, 9, Ending.ALREADY_WRONG),
+        (Ending.BUDGET_SPENT, 0, 0, Ending.ALREADY_WRONG), (Ending.INTERRUPTED, 20, 20, Ending.INTERRUPTED),
     ],
-)
+)  # fmt: skip
 def test_the_verdict(search_ending: Ending, clean: int, adversarial: int, expected: Ending) -> None:
     assert WORST_CASE.decide_ending(search_ending, Trials(clean, 20, 64), Trials(adversarial, 20, 64)) is expected
 
@@ -474,15 +465,12 @@ def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
 @pytest.mark.parametrize(
     ("told", "made", "ending"),
     [
-        ("1" * 23, (14, 14), Ending.FOUND),
-        ("0" + "1" * 22, (22, 23), Ending.FOUND),
-        ("1" * 20 + "011", (14, 14), Ending.FOUND),
-        ("0" + "1" * 20 + "01", (20, 22), Ending.NOT_VERIFIED),
-        ("00" + "1" * 21, (4, 6), Ending.NOT_VERIFIED),
-        ("-" + "1" * 22, (22, 23), Ending.FOUND),
+        ("1" * 23, (14, 14), Ending.FOUND), ("0" + "1" * 22, (22, 23), Ending.FOUND),
+        ("1" * 20 + "011", (14, 14), Ending.FOUND), ("0" + "1" * 20 + "01", (20, 22), Ending.NOT_VERIFIED),
+        ("00" + "1" * 21, (4, 6), Ending.NOT_VERIFIED), ("-" + "1" * 22, (22, 23), Ending.FOUND),
         ("--" + "1" * 21, (4, 6), Ending.NOT_VERIFIED),
     ],
-)
+)  # fmt: skip
 def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[int, int], ending: Ending) -> None:
     """Told are trials of the answer: successes, failures, and "-" where the clean scene is wrong."""
     found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=TRIAL_LOOKS)
@@ -595,13 +583,7 @@ def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> 
 def test_every_ending_has_a_value_for_json_and_a_sentence() -> None:
     values = {ending.value for ending in Ending}
     assert values >= {
-        "found",
-        "budget spent",
-        "not verified",
-        "stalled",
-        "non-finite objective",
-        "interrupted",
-        "already wrong",
-    }
+        "found", "budget spent", "not verified", "stalled", "non-finite objective", "interrupted", "already wrong",
+    }  # fmt: skip
     for ending in Ending:
         assert ending.explanation.endswith(".")

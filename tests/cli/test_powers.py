@@ -24,17 +24,9 @@ from stored_sweeps import make_sweep
 
 MANY = 100_000
 POWERS: dict[str, Any] = {
-    "cluster": "tcp://127.0.0.1:1",
-    "workers": MANY,
-    "log": "wandb",
-    "run": "/tmp/elsewhere",
-    "overwrite": True,
-    "junit": "precious",
-    "sarif": "precious",
-    "markdown": "precious",
-    "add": "theirs",
-    "update": True,
-}
+    "cluster": "tcp://127.0.0.1:1", "workers": MANY, "log": "wandb", "run": "/tmp/elsewhere", "overwrite": True,
+    "junit": "precious", "sarif": "precious", "markdown": "precious", "add": "theirs", "update": True,
+}  # fmt: skip
 """A value of each setting that has such power."""
 
 HARMLESS: dict[str, Any] = {

@@ -150,12 +150,10 @@ def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("roughness", 0.3),
-        pytest.param("metallic", 0.4, marks=pytest.mark.slow),
-        pytest.param("specular", 0.5, marks=pytest.mark.slow),
-        ("green", 0.6),
+        ("roughness", 0.3), pytest.param("metallic", 0.4, marks=pytest.mark.slow),
+        pytest.param("specular", 0.5, marks=pytest.mark.slow), ("green", 0.6),
     ],
-)
+)  # fmt: skip
 def test_the_adjoint_agrees_with_differences(name: str, value: float) -> None:
     material = searched(name)
     render = advsearch.load_scene("mug").renderer([material], resolution=32, denoise="none")

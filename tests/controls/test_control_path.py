@@ -191,13 +191,10 @@ def test_a_path_through_what_the_camera_looks_at_is_refused(
 @pytest.mark.parametrize(
     ("headings", "middles", "told"),
     [
-        ([350, 10], [0.0], True),
-        ([-170, 170], [180.0], True),
-        ([0, 360], [180.0], False),
-        ([350, 10, 40], [0.0, 25.0], True),
-        ([700, 20], [0.0], False),
+        ([350, 10], [0.0], True), ([-170, 170], [180.0], True), ([0, 360], [180.0], False),
+        ([350, 10, 40], [0.0, 25.0], True), ([700, 20], [0.0], False),
     ],
-)
+)  # fmt: skip
 def test_headings_go_the_shorter_way_round(
     scene: SceneDescription, headings: list[int], middles: list[float], told: bool, tmp_path: Path
 ) -> None:
@@ -220,18 +217,12 @@ def _turned(scene: SceneDescription, control: Control, share: float) -> tuple[Te
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n",
-        "time,x,y,z\n0,1,1," + 200_000 * "1" + "\n",
-        "time,x,y,z\n0,1,1,1\n",
-        "time,x,y,z\n0,1,1,1\n1,a,1,1\n",
-        "time,x,y,z\n0,1,1,1\n0,1,1,1\n",
-        "time,x,y,z\nnan,1,1,1\n1,1,1,1\n",
-        "time,x,y,z\n0,1,1,1\n1e300,1,1,1\n",
-        "time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n",
+        "", "time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n", "time,x,y,z\n0,1,1," + 200_000 * "1" + "\n",
+        "time,x,y,z\n0,1,1,1\n", "time,x,y,z\n0,1,1,1\n1,a,1,1\n", "time,x,y,z\n0,1,1,1\n0,1,1,1\n",
+        "time,x,y,z\nnan,1,1,1\n1,1,1,1\n", "time,x,y,z\n0,1,1,1\n1e300,1,1,1\n", "time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n",
         "time,x,y,z\n0,1,1,1\n1,1e300,1,1\n",
     ],
-)
+)  # fmt: skip
 def test_a_file_that_is_no_way_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "way.csv"
     file.write_text(text)
@@ -302,16 +293,12 @@ def trajectory(form: str, axes: str = "optical", up: str = "z", at: tuple[float,
 @pytest.mark.parametrize(
     ("form", "axes", "up", "at"),
     [
-        ("tum", "optical", "z", (0.0, 0.0, 0.0)),
-        ("tum, real part first", "optical", "z", (0.0, 0.0, 0.0)),
-        ("tum in nanoseconds", "opengl", "y", (0.0, 0.0, 0.0)),
-        ("tum", "optical", "-y", (1.0, 2.0, 3.0)),
-        ("euroc", "euroc", "z", (4e5, 5e6, 100.0)),
-        ("euroc, all columns", "flu", "z", (0.0, 0.0, 0.0)),
-        ("euroc", "frd", "-z", (0.0, 0.0, 0.0)),
-        ("kitti", "optical", "-y", (20.0, 0.0, 0.0)),
+        ("tum", "optical", "z", (0.0, 0.0, 0.0)), ("tum, real part first", "optical", "z", (0.0, 0.0, 0.0)),
+        ("tum in nanoseconds", "opengl", "y", (0.0, 0.0, 0.0)), ("tum", "optical", "-y", (1.0, 2.0, 3.0)),
+        ("euroc", "euroc", "z", (4e5, 5e6, 100.0)), ("euroc, all columns", "flu", "z", (0.0, 0.0, 0.0)),
+        ("euroc", "frd", "-z", (0.0, 0.0, 0.0)), ("kitti", "optical", "-y", (20.0, 0.0, 0.0)),
     ],
-)
+)  # fmt: skip
 def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
     scene: SceneDescription, tmp_path: Path, form: str, axes: str, up: str, at: tuple[float, ...]
 ) -> None:

@@ -119,20 +119,9 @@ def rows_of(run: Path) -> list[tuple[Any, ...]]:
 
 
 COMPARED = (
-    "kind",
-    "step",
-    "seed",
-    "spp",
-    "objective",
-    "score",
-    "success",
-    "correct",
-    "margin",
-    "label",
-    "label_index",
-    "probability",
-    "renders",
-)
+    "kind", "step", "seed", "spp", "objective", "score", "success", "correct", "margin", "label", "label_index",
+    "probability", "renders",
+)  # fmt: skip
 TIMES = ("seconds", "renders_per_second", "run", "command_line")
 
 
@@ -339,13 +328,9 @@ def test_the_worst_is_the_smallest_margin_and_is_rendered_again(tmp_path: Path) 
 def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
     models = [model(0.5, "strict"), model(0.9, "easy")]
     result = advsearch.sweep(
-        ["mug", "bowl"],
-        models,
-        {"pose.yaw": [0, 90, 180]},
-        environment="studio,noon",
-        label="mug",
+        ["mug", "bowl"], models, {"pose.yaw": [0, 90, 180]}, environment="studio,noon", label="mug",
         run=tmp_path / "run",
-    )
+    )  # fmt: skip
     rows = list(result.rows())
     places = [
         (row.values["object"]["value"], row.values["environment"]["value"], row.values["model"]["value"])

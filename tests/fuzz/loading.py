@@ -104,11 +104,9 @@ def load_run(path: Path) -> None:
 
 
 QUESTIONS = (
-    ("show", "{run}"),
-    ("show", "{run}", "--json"),
-    ("report", "{run}", "--evidence", "--out", "made/report"),
+    ("show", "{run}"), ("show", "{run}", "--json"), ("report", "{run}", "--evidence", "--out", "made/report"),
     ("view", "{run}", "--bundle", "made/site"),
-)
+)  # fmt: skip
 EXPORTS = (
     ("export", "{run}", "--out", "made/rows.csv"),
     ("export", "{run}", "--out", "made/rows.json"),
@@ -119,11 +117,9 @@ OF_SWEEPS = (
     ("explain", "{run}", "--confirm", "0", "--pairs", "0", "--clusters", "0", "--run", "made/explain"),
 )
 ASKED = {
-    "study": QUESTIONS,
-    "attack": (*QUESTIONS, *EXPORTS),
-    "detection": (*QUESTIONS, *EXPORTS),
+    "study": QUESTIONS, "attack": (*QUESTIONS, *EXPORTS), "detection": (*QUESTIONS, *EXPORTS),
     "sweep": (*QUESTIONS, *EXPORTS, *OF_SWEEPS),
-}
+}  # fmt: skip
 """What is asked of a whole run, by its kind in `fuzz.run_folders`."""
 
 PAGES = (

@@ -155,11 +155,9 @@ class _Worker:
         home.mkdir(exist_ok=True)
         here = Path(__file__).resolve().parents[1]
         environment = {
-            **os.environ,
-            "HOME": str(home),
-            "PYTHONPATH": f"{here}{os.pathsep}{here.parent}",
+            **os.environ, "HOME": str(home), "PYTHONPATH": f"{here}{os.pathsep}{here.parent}",
             "PYTHONDONTWRITEBYTECODE": "1",
-        }
+        }  # fmt: skip
         self._process = subprocess.Popen(
             [sys.executable, "-m", "fuzz.worker", str(self._folder), self._loaders],
             stdin=subprocess.PIPE,

@@ -176,12 +176,10 @@ class Answering(nn.Module):
 @pytest.mark.parametrize(
     "answer",
     [
-        lambda z: (z, "features"),
-        lambda z: [z],
-        lambda z: {"loss": None, "logits": z},
+        lambda z: (z, "features"), lambda z: [z], lambda z: {"loss": None, "logits": z},
         lambda z: types.SimpleNamespace(logits=z),
     ],
-)
+)  # fmt: skip
 def test_usual_containers_of_logits_are_opened(answer: Any) -> None:
     model = load_model(Answering(answer), input_size=8)
     torch.testing.assert_close(model(images()), tiny()(images()))
@@ -213,15 +211,11 @@ def test_probabilities_become_log_odds_with_one_warning() -> None:
 @pytest.mark.parametrize(
     "answer",
     [
-        torch.sigmoid,
-        lambda z: -z.log_softmax(1),
-        lambda z: z + torch.rand_like(z),
-        lambda z: z - 0.5 * z.mean(0),
-        lambda z: torch.from_numpy(z.detach().numpy()),
-        lambda z: 0.0 * z + torch.arange(3.0),
+        torch.sigmoid, lambda z: -z.log_softmax(1), lambda z: z + torch.rand_like(z), lambda z: z - 0.5 * z.mean(0),
+        lambda z: torch.from_numpy(z.detach().numpy()), lambda z: 0.0 * z + torch.arange(3.0),
     ],
     ids=["sigmoid", "costs", "random", "mixes its batch", "no gradient", "zero gradient"],
-)
+)  # fmt: skip
 def test_outputs_that_are_doubtful_logits_are_warned_of(answer: Callable[[Tensor], Tensor]) -> None:
     with pytest.warns(ModelWarning, match="Answering"):
         model = load_model(Answering(answer), input_size=8)
@@ -247,14 +241,9 @@ LABELS = ("tench, Tinca tinca", "Coffee Mug", "cup", "crane", "teapot", "crane",
 @pytest.mark.parametrize(
     "text, indices",
     [
-        ("coffee mug,cup", (1, 2)),
-        ("tinca TINCA", (0,)),
-        ("#3", (3,)),
-        ("4", (4,)),
-        ("7", (6,)),
-        (["cup", 4], (2, 4)),
+        ("coffee mug,cup", (1, 2)), ("tinca TINCA", (0,)), ("#3", (3,)), ("4", (4,)), ("7", (6,)), (["cup", 4], (2, 4)),
     ],
-)
+)  # fmt: skip
 def test_label_sets(text: Any, indices: tuple[int, ...]) -> None:
     assert find_label_set(text, LABELS) == LabelSet(tuple(LABELS[i] for i in indices), indices)
 
@@ -289,12 +278,10 @@ def test_label_files(tmp_path: Path, name: str, text: str) -> None:
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("a.json", b'["mug", '),
-        ("a.json", b'{"1": "mug", "2": "bowl"}'),
-        ("a.txt", b"\xff\xfe"),
+        ("a.json", b'["mug", '), ("a.json", b'{"1": "mug", "2": "bowl"}'), ("a.txt", b"\xff\xfe"),
         ("a.txt", b"mug\nbowl\n"),
     ],
-)
+)  # fmt: skip
 def test_label_files_that_are_errors(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(FileFormatError, match=name):
@@ -460,12 +447,10 @@ def test_callables_from_the_current_directory(nets: Path) -> None:
 @pytest.mark.parametrize(
     ("spec", "named"),
     [
-        ("no_such_nets:Net", "no_such_nets"),
-        ("needy_nets:Net", "not_there_at_all"),
-        ("wrong_nets:Net", "ZeroDivisionError"),
-        ("my_nets:nothing", "NoneType"),
+        ("no_such_nets:Net", "no_such_nets"), ("needy_nets:Net", "not_there_at_all"),
+        ("wrong_nets:Net", "ZeroDivisionError"), ("my_nets:nothing", "NoneType"),
     ],
-)
+)  # fmt: skip
 def test_callables_that_are_errors(nets: Path, spec: str, named: str) -> None:
     with pytest.raises(ModelError, match=named):
         load_model(spec)

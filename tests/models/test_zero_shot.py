@@ -21,14 +21,11 @@ SPECIAL = ["[PAD]", "[UNK]", "[CLS]", "[SEP]"]
 PICTURES = torch.rand((2, SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
 SIZES = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 8}
 READS = {
-    "vocab_size": 40,
-    "max_position_embeddings": 12,
-    "pad_token_id": 0,
-    "bos_token_id": 2,
-    "eos_token_id": 3,
+    "vocab_size": 40, "max_position_embeddings": 12, "pad_token_id": 0, "bos_token_id": 2, "eos_token_id": 3,
     "attention_dropout": 0.5,
-}
+}  # fmt: skip
 SIGLIP = pytest.mark.filterwarnings("ignore:.*judges each name by itself")
+pytestmark = SIGLIP
 
 
 def tokenizer() -> Any:
@@ -82,7 +79,6 @@ def theirs(folder: Path, texts: list[str]) -> Tensor:
     return logits
 
 
-@SIGLIP
 @pytest.mark.parametrize("family", ["CLIP", "Siglip"])
 def test_logits_are_the_librarys(tmp_path: Path, family: str) -> None:
     model = load_model(published(tmp_path, family), labels="mug, cup,bowl,vase")
@@ -95,7 +91,6 @@ def test_logits_are_the_librarys(tmp_path: Path, family: str) -> None:
 
 
 @pytest.mark.medium
-@SIGLIP
 @pytest.mark.parametrize("family", ["CLIP", "Siglip"])
 def test_prompts_are_averaged(tmp_path: Path, family: str) -> None:
     spec, prompts = published(tmp_path, family), ["a photo of a {}", "the bad {}.", "{}"]
@@ -121,7 +116,6 @@ def test_prompts_are_averaged(tmp_path: Path, family: str) -> None:
     assert float((alone - asked).abs().max()) > 1e-3, "one prompt says something else"
 
 
-@SIGLIP
 @pytest.mark.parametrize("family", ["CLIP", "Siglip"])
 def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> None:
     model = load_model(published(tmp_path, family), labels=NAMES)

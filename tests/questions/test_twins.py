@@ -47,12 +47,9 @@ class RedOrBlue(nn.Module):
 def compared(tmp_path_factory: pytest.TempPathFactory) -> TwinsResult:
     model = advsearch.load_model(RedOrBlue(), labels=["cup", "box"], input_size=32)
     result: TwinsResult = advsearch.twins(
-        PHOTOGRAPHS / "photographs.csv",
-        network=model,
-        environment="studio",
-        spp=4,
+        PHOTOGRAPHS / "photographs.csv", network=model, environment="studio", spp=4,
         run=str(tmp_path_factory.mktemp("twins") / "run"),
-    )
+    )  # fmt: skip
     return result
 
 

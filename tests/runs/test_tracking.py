@@ -66,14 +66,10 @@ def run_of(path: Path, log: str) -> None:
 def test_tensorboard_is_told(tmp_path: Path, told: Told) -> None:
     run_of(tmp_path / "run", "tensorboard")
     assert told == [
-        ("open", str(tmp_path / "run/artifacts/tensorboard")),
-        ("scalar", "search/objective", 1.0, 0),
-        ("scalar", "search/success", 0.0, 0),
-        ("scalar", "search/objective", 2.0, 1),
-        ("scalar", "search/success", 1.0, 1),
-        ("scalar", "baseline/objective", -1.0, 0),
-        ("close",),
-    ]
+        ("open", str(tmp_path / "run/artifacts/tensorboard")), ("scalar", "search/objective", 1.0, 0),
+        ("scalar", "search/success", 0.0, 0), ("scalar", "search/objective", 2.0, 1),
+        ("scalar", "search/success", 1.0, 1), ("scalar", "baseline/objective", -1.0, 0), ("close",),
+    ]  # fmt: skip
 
 
 def test_mlflow_is_told(tmp_path: Path, told: Told) -> None:

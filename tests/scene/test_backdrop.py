@@ -381,18 +381,12 @@ def test_hostile_depths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.npy").write_text("no array")
     write_photograph(tmp_path / "coloured.png", (12, 16))
     messages = {
-        "deep.png": "metres of a level behind its name",
-        "deep.png#1000": "depths of 0 to 100000 metres, got 700000",
-        "negative.npy": "depths of 0 to",
-        "objects.npy": "an array .height, width. of numbers",
-        "minus.npy": "an array .height, width. of numbers",
-        "small.npy": "depths of 16 x 12 pixels",
-        "huge.npy": "at most",
-        "cut.npy": "another length",
-        "text.npy": "corrupt or of another version",
-        "coloured.png#0.001": "one depth for each pixel",
-        "missing.npy": "expected a picture of depth",
-    }
+        "deep.png": "metres of a level behind its name", "deep.png#1000": "depths of 0 to 100000 metres, got 700000",
+        "negative.npy": "depths of 0 to", "objects.npy": "an array .height, width. of numbers",
+        "minus.npy": "an array .height, width. of numbers", "small.npy": "depths of 16 x 12 pixels",
+        "huge.npy": "at most", "cut.npy": "another length", "text.npy": "corrupt or of another version",
+        "coloured.png#0.001": "one depth for each pixel", "missing.npy": "expected a picture of depth",
+    }  # fmt: skip
     for name, message in messages.items():
         with pytest.raises(InputError, match=message):
             load_description("mug").with_backdrop(tmp_path / "a.png", tmp_path / name)

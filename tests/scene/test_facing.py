@@ -61,16 +61,12 @@ AHEAD_LEFT = (1, 1)
 @pytest.mark.parametrize(
     ("name", "front", "up", "extension", "settings"),
     [
-        ("car.glb", "+z", "+y", None, {}),
-        ("car.vrm", "-z", "+y", "VRM", {}),
-        ("car.vrm", "+z", "+y", "VRMC_vrm", {}),
-        ("car.glb", "+x", "+y", None, {"facing": "+x"}),
-        ("car.glb", "+y", "+z", None, {"facing": "+y", "up": "z"}),
-        ("car.glb", "+x", "+z", None, {"up": "z"}),
-        ("car.obj", "+x", "+y", None, {"up": "y"}),
+        ("car.glb", "+z", "+y", None, {}), ("car.vrm", "-z", "+y", "VRM", {}), ("car.vrm", "+z", "+y", "VRMC_vrm", {}),
+        ("car.glb", "+x", "+y", None, {"facing": "+x"}), ("car.glb", "+y", "+z", None, {"facing": "+y", "up": "z"}),
+        ("car.glb", "+x", "+z", None, {"up": "z"}), ("car.obj", "+x", "+y", None, {"up": "y"}),
         ("car.stl", "-y", "+z", None, {"facing": "-y"}),
     ],
-)
+)  # fmt: skip
 def test_what_is_the_front_of_a_file_faces_x(
     name: str, front: str, up: str, extension: str | None, settings: dict[str, Any], tmp_path: Path
 ) -> None:

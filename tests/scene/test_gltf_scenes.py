@@ -66,12 +66,10 @@ def _at(scene: SceneDescription, aspect: float) -> SceneDescription:
 @pytest.mark.parametrize(
     ("scale", "above", "words"),
     [
-        ([-1.0, 1.0, 1.0], {}, "mirrored"),
-        ([1.0, 1.0, 1.0], {"scale": [1.0, 1.0, -1.0]}, "mirrored"),
-        ([1.0, 1.0, 1.0], {"scale": [1.0, 3.0, 1.0]}, "sheared"),
-        ([1.0, 1.0, 1.0], {"scale": [3.0, 3.0, 3.0]}, None),
+        ([-1.0, 1.0, 1.0], {}, "mirrored"), ([1.0, 1.0, 1.0], {"scale": [1.0, 1.0, -1.0]}, "mirrored"),
+        ([1.0, 1.0, 1.0], {"scale": [1.0, 3.0, 1.0]}, "sheared"), ([1.0, 1.0, 1.0], {"scale": [3.0, 3.0, 3.0]}, None),
     ],
-)
+)  # fmt: skip
 def test_a_camera_under_a_mirror_or_a_shear_is_refused(
     scale: list[float], above: dict[str, Any], words: str | None, tmp_path: Path
 ) -> None:

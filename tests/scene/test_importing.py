@@ -134,14 +134,10 @@ def test_cube_without_anything(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("suffix", "up", "turned"),
     [
-        ("obj", None, False),
-        ("stl", None, False),
-        ("glb", None, True),
-        ("gltf", None, True),
-        ("obj", "y", True),
+        ("obj", None, False), ("stl", None, False), ("glb", None, True), ("gltf", None, True), ("obj", "y", True),
         ("glb", "z", False),
     ],
-)
+)  # fmt: skip
 def test_up_axis(tmp_path: Path, suffix: str, up: Any, turned: bool) -> None:
     points = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0], [0, 0, 1]])
     mesh = trimesh.Trimesh(points, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], process=False)
@@ -521,16 +517,10 @@ def test_bad_files(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str])
 
 
 REFERENCES = {
-    "above": "../secret.png",
-    "absolute": "{outside}/secret.png",
-    "through a link": "link.png",
-    "through a linked folder": "folder/secret.png",
-    "a device": "/dev/zero",
-    "a pipe": "pipe.png",
-    "a directory": "inside",
-    "a long name": "n" * 5000 + ".png",
-    "an escape sequence": "\x1b[31m.png",
-}
+    "above": "../secret.png", "absolute": "{outside}/secret.png", "through a link": "link.png",
+    "through a linked folder": "folder/secret.png", "a device": "/dev/zero", "a pipe": "pipe.png",
+    "a directory": "inside", "a long name": "n" * 5000 + ".png", "an escape sequence": "\x1b[31m.png",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFERENCES)

@@ -242,12 +242,10 @@ def test_an_opacity_of_any_channel_of_another_picture(tmp_path: Path, output: st
 @pytest.mark.parametrize(
     ("wrap", "expected"),
     [
-        ("repeat", (0.5, 0.0, 0.5)),
-        ("clamp", (0.5, 0.0, 0.5)),
-        ("black", (0.5 / 9, 0.0, 0.5 / 9)),
+        ("repeat", (0.5, 0.0, 0.5)), ("clamp", (0.5, 0.0, 0.5)), ("black", (0.5 / 9, 0.0, 0.5 / 9)),
         ("useMetadata", (0.5 / 9, 0.0, 0.5 / 9)),
     ],
-)
+)  # fmt: skip
 def test_how_pictures_go_on(tmp_path: Path, wrap: str, expected: tuple[float, ...]) -> None:
     """Texture coordinates reach one picture beyond each edge: with black, a ninth is the picture."""
     halves(tmp_path / "halves.png")
@@ -368,13 +366,10 @@ def test_packages_are_layers_also_in_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "entries",
     [
-        {"a.usda": referring("../../outside.usda").encode()},
-        {"a.usda": referring("/tmp/x.usda").encode()},
-        {"a.usda": referring("gone.usda").encode()},
-        {"a.usda": b"#usda 1.0\ndef Mesh {"},
-        {"a.png": b"x"},
+        {"a.usda": referring("../../outside.usda").encode()}, {"a.usda": referring("/tmp/x.usda").encode()},
+        {"a.usda": referring("gone.usda").encode()}, {"a.usda": b"#usda 1.0\ndef Mesh {"}, {"a.png": b"x"},
     ],
-)
+)  # fmt: skip
 def test_what_packages_may_not_name(tmp_path: Path, entries: dict[str, bytes]) -> None:
     folder = tmp_path / "inside"
     folder.mkdir()

@@ -22,20 +22,11 @@ from advsearch.tasks.command import Command
 
 SIDE = 24
 ASKED: dict[str, Any] = {
-    "name": "command",
-    "state": {"speed": 2},
-    "envelope": 0.4,
-    "names": "yaw rate",
-    "units": "rad/s",
-}
+    "name": "command", "state": {"speed": 2}, "envelope": 0.4, "names": "yaw rate", "units": "rad/s",
+}  # fmt: skip
 QUICK: dict[str, Any] = {
-    "resolution": SIDE,
-    "spp": 4,
-    "verify_spp": 4,
-    "trials": 12,
-    "measure": "no",
-    "denoise": "none",
-}
+    "resolution": SIDE, "spp": 4, "verify_spp": 4, "trials": 12, "measure": "no", "denoise": "none",
+}  # fmt: skip
 
 
 class TowardsBlue(nn.Module):

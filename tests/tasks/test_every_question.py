@@ -22,6 +22,8 @@ from advsearch.runs.store import Store
 from advsearch.tasks import Detection
 from small_models import SIDE, Finder, Painter, Slider
 
+pytestmark = pytest.mark.medium
+
 ALSO_SLOWLY = pytest.mark.parametrize(
     "asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True
 )
@@ -80,7 +82,6 @@ figures:
 """
 
 
-@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_recipe_is_carried_out(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(RECIPE)
@@ -95,7 +96,6 @@ def test_a_recipe_is_carried_out(asked: list[str], capsys: pytest.CaptureFixture
 SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none"]
 
 
-@pytest.mark.medium
 def test_a_search_predicts_verifies_and_draws(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -122,7 +122,6 @@ def test_a_search_predicts_verifies_and_draws(
     assert photographed(taker, run, "clean", SIDE // 2) == [True, False]
 
 
-@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_stopped_search_goes_on_with_the_same_words(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -135,7 +134,6 @@ def test_a_stopped_search_goes_on_with_the_same_words(
         assert again[name] == first[name]
 
 
-@pytest.mark.medium
 def test_a_sweep_counts_and_keeps_the_worst(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -152,7 +150,6 @@ def test_a_sweep_counts_and_keeps_the_worst(
     assert photographed(taker, tmp_path / "run", "0", SIDE // 2) == [True, False]
 
 
-@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_configuration_that_holds_for_many_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -165,7 +162,6 @@ def test_a_configuration_that_holds_for_many_conditions(
     assert found["verified"]["trials"] == 8 and found["over"] == ["camera"]
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     ("objective", "network", "controls", "said"),
     [

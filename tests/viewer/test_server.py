@@ -214,20 +214,16 @@ def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     ("path", "kind", "own"),
     [
-        ("/", "text/html; charset=utf-8", True),
-        ("/compare/?run=first", "text/html; charset=utf-8", True),
-        ("/runs/first/", "text/html; charset=utf-8", True),
-        ("/runs/first/align/", "text/html; charset=utf-8", True),
-        ("/runs/attack/", "text/html; charset=utf-8", False),
-        ("/runs/attack/cover", "image/jpeg", False),
+        ("/", "text/html; charset=utf-8", True), ("/compare/?run=first", "text/html; charset=utf-8", True),
+        ("/runs/first/", "text/html; charset=utf-8", True), ("/runs/first/align/", "text/html; charset=utf-8", True),
+        ("/runs/attack/", "text/html; charset=utf-8", False), ("/runs/attack/cover", "image/jpeg", False),
         ("/runs/attack/progress", "application/json", False),
         ("/runs/attack/align/renderings/clean", "image/png", False),
         ("/runs/first/rows", "application/octet-stream", False),
         ("/runs/first/pictures/0000/3.jpg", "image/jpeg", False),
-        ("/runs/first/align/renderings/3", "image/jpeg", False),
-        ("/runs/none/", "text/plain; charset=utf-8", False),
+        ("/runs/first/align/renderings/3", "image/jpeg", False), ("/runs/none/", "text/plain; charset=utf-8", False),
     ],
-)
+)  # fmt: skip
 def test_every_result_has_a_kind_and_a_policy(run: Path, attack_run: Path, path: str, kind: str, own: bool) -> None:
     """A page of the server's own may ask it for more; all else has an origin of its own. Neither runs foreign code."""
     with serving(run, attack_run, photographs=NoPhotographs()) as server:

@@ -258,15 +258,10 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
 @pytest.mark.parametrize(
     ("right", "wrong", "over", "verdict"),
     [
-        (6, 0, False, "held"),
-        (0, 6, False, "failed"),
-        (1, 5, False, "undecided"),
-        (5, 15, True, "failed"),
-        (0, 5, True, "undecided"),
-        (18, 2, True, "held"),
-        (17, 3, True, "undecided"),
+        (6, 0, False, "held"), (0, 6, False, "failed"), (1, 5, False, "undecided"), (5, 15, True, "failed"),
+        (0, 5, True, "undecided"), (18, 2, True, "held"), (17, 3, True, "undecided"),
     ],
-)
+)  # fmt: skip
 def test_what_trials_say_of_a_counterexample(right: int, wrong: int, over: bool, verdict: str) -> None:
     assert decide_trials(right, wrong, over=over) == verdict
 
