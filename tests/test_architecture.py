@@ -294,8 +294,6 @@ def _imports(statement: ast.stmt, package: str) -> bool:
     return any(_imports(one, package) for one in inner)  # type: ignore[arg-type]
 
 
-# -- what is heavy ---------------------------------------------------------------------------------------------------
-
 LATE = ("torch", "mitsuba", "drjit", "scipy", "matplotlib", "pandas", "pyarrow")
 SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
 
@@ -334,9 +332,6 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
     assert done.stdout == "[]\n"
 
 
-# -- what is shipped -------------------------------------------------------------------------------------------------
-
-
 @cache
 def setup_cfg() -> configparser.ConfigParser:
     parser = configparser.ConfigParser()
@@ -364,9 +359,6 @@ def test_every_data_file_is_listed_as_package_data() -> None:
             name = path.relative_to(folder).as_posix()
             shipped = any(fnmatch.fnmatch(name, pattern.replace("**/", "*")) for pattern in patterns[package])
             assert shipped or path.is_dir(), f"{name} matches none of {package}'s patterns"
-
-
-# -- what is pinned --------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -406,9 +398,6 @@ def test_what_the_dependencies_need_is_pinned_too() -> None:
                 wanted.add(canonicalize_name(one.name))
     cuda = {name for name in seen if name.startswith(("nvidia-", "cuda-")) or name == "triton"}
     assert seen - cuda - set(pins()) == set()
-
-
-# -- what must not be in the repository ------------------------------------------------------------------------------
 
 
 def repository_files() -> list[Path]:

@@ -66,9 +66,6 @@ def test_an_entry_that_does_not_fit_is_named_with_its_package(
     assert numbers.get_help("two").endswith("repair or uninstall the package that declares it.")
 
 
-# ---- a package from the pages ---------------------------------------------------------------------------------------
-
-
 def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text("utf-8"), re.S)
 

@@ -80,9 +80,6 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"
 
 
-# ---- several models as one ------------------------------------------------------------------------------------------
-
-
 def test_an_ensemble_answers_as_its_models_do() -> None:
     models = easy(), hard()
     pictures = torch.rand((3, 32, 32, 3), generator=torch.Generator().manual_seed(0))

@@ -61,9 +61,6 @@ def noisy(clean: float, adversarial: float, noise: float) -> Evaluate:
     return partial(map, render)
 
 
-# ---- intervals
-
-
 @pytest.mark.parametrize(
     ("successes", "trials", "low", "high"),
     [  # tables of exact binomial limits
@@ -115,9 +112,6 @@ def test_impossible_counts_are_refused(arguments: tuple[float, ...], message: st
 def test_trials_have_a_rate_and_its_interval() -> None:
     trials = Trials(20, 20, 64)
     assert trials.rate == 1.0 and trials.interval == pytest.approx((0.8316, 1.0), abs=1e-4)
-
-
-# ---- sample counts
 
 
 @pytest.mark.parametrize(
@@ -276,9 +270,6 @@ def test_a_single_rung_is_taken_unmeasured() -> None:
 def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match="verify_spp: expected rising sample counts"):
         choose_spp({}, seed=0, ladder=ladder)
-
-
-# ---- verdicts
 
 
 def test_nineteen_of_twenty_are_needed() -> None:

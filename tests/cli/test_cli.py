@@ -59,9 +59,6 @@ def python(code: str, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
 
 
-# ---- the program ----
-
-
 def test_help_is_quick_and_imports_nothing_heavy() -> None:
     code = (
         "import sys; from advsearch.cli.main import main; status = main(['--help']);"
@@ -152,9 +149,6 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert process.returncode == 0
 
 
-# ---- attack and run ----
-
-
 def test_attack_builds_its_configuration_from_flags(asked: list[AttackConfig]) -> None:
     argv = (
         "attack --object mug.obj --up y --environment room.hdr --model net.pt2 --labels l.json --label cup --norm l2"
@@ -213,9 +207,6 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
     assert asked == [
         AttackConfig(object="mug", steps=80, seed=4, set_={"camera.azimuth": 130}, run="again", overwrite=True)
     ]
-
-
-# ---- resume, runs, export ----
 
 
 @pytest.fixture

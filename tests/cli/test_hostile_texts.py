@@ -97,10 +97,6 @@ def test_label_files_have_limits(content: bytes, message: str, tmp_path: Path) -
     assert len(str(caught.value)) < 300 + len(str(path))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# the terminal
-
-
 def test_what_steers_a_terminal_becomes_readable() -> None:
     assert escape_text(f"a{ESCAPES}b") == r"a\x1b]0;title\x07\x9b31m\x7f\u202e\x0db"
     assert escape_text("mug \u2014 coffee\u00a0cup\n\t\u00e9") == "mug \u2014 coffee\u00a0cup\n\t\u00e9"

@@ -47,9 +47,6 @@ def cup(outer: float = 0.5, inner: float = 0.4, floor: float = 0.1, bottom: bool
     return ObjectAsset("cup", mesh, np.full((4, 4, 3), 0.5, dtype=np.float32))
 
 
-# ---- the inside of a vessel -----------------------------------------------------------------------------------------
-
-
 def test_the_inside_of_a_turned_cup_is_that_of_its_profile() -> None:
     found = find_interior(cup())
     assert found is not None
@@ -100,9 +97,6 @@ def test_the_vertices_are_differentiable_in_the_level(scene: SceneDescription) -
     assert u.grad is not None and float(u.grad) == pytest.approx(float(step), rel=1e-3)
 
 
-# ---- proportions ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "settings",
     [
@@ -123,9 +117,6 @@ def test_proportions_add_up_to_one_within_their_ranges(scene: SceneDescription, 
         assert sum(shares.values()) == pytest.approx(1.0, abs=1e-6)
         for name, (low, high) in filled.proportion_bounds.items():
             assert low - 1e-6 <= shares[name] <= high + 1e-6
-
-
-# ---- rendered -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium

@@ -38,9 +38,6 @@ def scene() -> SceneDescription:
     return load_description("mug")
 
 
-# ---- patterns -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("name", PATTERNS)
 def test_a_tile_continues_across_its_edges(name: str) -> None:
@@ -72,9 +69,6 @@ def searched(*names: str) -> MaterialControl:
     """A control over whole ranges."""
     ranges: dict[str, Any] = {name: [0, 1] for name in names}
     return MaterialControl(**ranges)
-
-
-# ---- from values to inputs ------------------------------------------------------------------------------------------
 
 
 def test_the_start_is_the_objects_own_surface(scene: SceneDescription) -> None:
@@ -141,9 +135,6 @@ def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:
     made = translate_mesh(replace(scene.meshes["object"], material=Material()), IDLE_LOBES).plugins["object"]
     keys = mi.traverse(made).keys()
     assert [one for one in ("clearcoat", "sheen") if not any(key.endswith(f".{one}.value") for key in keys)] == []
-
-
-# ---- rendered -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium

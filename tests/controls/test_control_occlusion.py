@@ -40,9 +40,6 @@ def hidden(scene: SceneDescription, **settings: Any) -> Placement:
     return bound.find_placement(bound.values(torch.ones_like(bound.start)), {})
 
 
-# ---- silhouettes ----------------------------------------------------------------------------------------------------
-
-
 def test_a_square_is_rasterised_without_gaps_or_excess() -> None:
     corners = np.array([[(-0.5, -0.5), (9.5, -0.5), (9.5, 9.5)], [(-0.5, -0.5), (9.5, 9.5), (-0.5, 9.5)]])
     _, row, column, weights = rasterize_triangles(corners, (12, 14))
@@ -80,9 +77,6 @@ def test_a_card_across_a_card_hides_what_geometry_says() -> None:
     np.testing.assert_allclose(sweep.compute_coverage(angles), [0.0, 0.25, 0.5, 0.75, 1.0], atol=ACCURACY)
     assert sweep.find_angle(0.3, 0.5) == pytest.approx(math.atan(0.12), abs=0.002)
     assert sweep.find_angle(1.0, 0.5) < math.atan(0.06)
-
-
-# ---- the control ----------------------------------------------------------------------------------------------------
 
 
 FOLDING = make_pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11]))

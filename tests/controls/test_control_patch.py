@@ -52,9 +52,6 @@ def covered(control: PatchControl, side: int = 32) -> np.ndarray:
     return (white - black).mean(dim=-1).numpy()
 
 
-# ---- the map of the surface ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", only(["mug", "book", "hammer"], list_objects()))
 def test_texels_know_their_place_on_every_object(name: str) -> None:
     mesh = load_object(name).mesh
@@ -66,9 +63,6 @@ def test_texels_know_their_place_on_every_object(name: str) -> None:
     corners = mesh.vertices[mesh.faces].astype(float)
     total = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     assert float(charts.compute_areas().sum()) == pytest.approx(total, rel=0.02)
-
-
-# ---- where it lies ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -115,9 +109,6 @@ def test_its_top_is_up_and_its_left_is_left(
         inside = covered(control) > 0.9
         trend = np.corrcoef(lit.mean(dim=-1).numpy()[inside], positions[inside][:, axis])[0, 1]
         assert sign * trend > 0.9  # rows run downwards; seen from +x, y runs to the right
-
-
-# ---- how it is painted -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -170,9 +161,6 @@ def test_derivatives_are_those_of_differences(scene: SceneDescription) -> None:
     for direction, step in ((pixels, 1e-2), (torch.eye(50)[48], 2e-3), (torch.eye(50)[49], 5e-4)):
         rise = float(total(u + step * direction) - total(u - step * direction)) / (2.0 * step)
         assert float(slope @ direction) == pytest.approx(rise, rel=0.03)
-
-
-# ---- what may be asked for -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium

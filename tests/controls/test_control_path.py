@@ -247,8 +247,6 @@ def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: Scene
     assert bound(scene, path=["approach", "orbit"]).to_settings() == {"path": ["approach", "orbit"]}
 
 
-# ---- trajectories of other tools ------------------------------------------------------------------------------------
-
 OPTICAL_TO_WORLD = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """A camera (x right, y down, z ahead) that looks level along -x, in a world whose z is up."""
 STEP_SECONDS, SPEED = 0.5, 2.0

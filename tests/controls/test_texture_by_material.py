@@ -96,9 +96,6 @@ def seen(mesh: Mesh, faces: np.ndarray, texture: np.ndarray, count: int = 40) ->
     return look_up_texture(texture, uvs[:, 0] * width - 0.5, (1.0 - uvs[:, 1]) * height - 0.5)
 
 
-# ---- what is known of a file ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("write", [car, car_as_gltf])
 def test_the_materials_of_a_file_keep_their_faces_and_their_texels(
     write: Callable[[Path], Path], tmp_path: Path
@@ -140,8 +137,6 @@ def test_the_texels_that_lookups_read_are_all_there(seed: int) -> None:
             wanted[(top[counts] + row) % 13, (left[counts] + column) % 17] = True
     assert read[wanted].all() and read.sum() <= wanted.sum() + 12
 
-
-# ---- the control ----------------------------------------------------------------------------------------------------
 
 FORMS: list[dict[str, object]] = [{}, {"form": "palette"}, {"form": "waves", "epsilon": 0.3}]
 

@@ -37,9 +37,6 @@ def test_an_epsilon_for_one_control_leaves_the_others_their_own() -> None:
     assert [one.get("epsilon") for one in found.values()] == [None, 0.02, 0.3]
 
 
-# ---- what nobody takes ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("controls", "options", "message"),
     [

@@ -132,9 +132,6 @@ def timeless(summary: SweepSummary) -> dict[str, Any]:
 GRID = {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]}
 
 
-# ---- the product ----------------------------------------------------------------------------------------------------
-
-
 @examples(max_examples=200, deadline=None)
 @given(sizes=st.lists(st.integers(1, 10**6), max_size=6).map(tuple), data=st.data())
 def test_digits_and_numbers_are_inverse(sizes: tuple[int, ...], data: st.DataObject) -> None:
@@ -161,9 +158,6 @@ def test_a_draw_is_the_same_from_wherever_it_is_asked(sampler: str) -> None:
     np.testing.assert_array_equal(SampleSequence(3, sampler, 7).points(NET - 5, 10), whole[NET - 5 : NET + 5])
 
 
-# ---- axes -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("parameter", "given", "values"),
     [
@@ -188,9 +182,6 @@ def test_values_of_an_axis(parameter: Parameter, given: Any, values: list[float]
 def test_a_wrong_axis_is_named(name: str, values: Any) -> None:
     with pytest.raises(InputError, match=name):
         parse_axes({name: values}, ())
-
-
-# ---- from numbers to configurations ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -265,9 +256,6 @@ def test_a_million_million_points_start_at_once(scene: advsearch.Scene) -> None:
     said = points.describe_images(points.make_configurations(10**12 - 8, 8), 10**12 - 8)
     assert time.process_time() - began < 10.0
     assert [round(float(said[-1][name]["value"]), 6) for name in grid] == [359.964, 60.0, 0.1]
-
-
-# ---- what a sweep says ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -365,8 +353,6 @@ def test_outputs_that_are_not_finite_are_counted_and_not_right() -> None:
     assert result.summary.worst is not None and math.isfinite(result.summary.worst.claimed.margin)
 
 
-# ---- what survives --------------------------------------------------------------------------------------------------
-
 SURVIVES: dict[str, Any] = {
     "grid": {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]},
     "controls": {"camera": {"azimuth": [0, 90]}},
@@ -416,9 +402,6 @@ def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     assert 0 <= rendered_again < (5 if stops_at < PICTURES else 9)  # a look and a batch; or what chose the sample count
 
 
-# ---- configuration and command line ---------------------------------------------------------------------------------
-
-
 def kept_configuration(folder: Path, controls: dict[str, Any], answer: list[float]) -> Path:
     """Make a run of an attack whose answer is put in by hand."""
     config = AttackConfig(object="mug", controls=controls, over={"camera": {"elevation": [5, 60]}}, run=str(folder))
@@ -426,9 +409,6 @@ def kept_configuration(folder: Path, controls: dict[str, Any], answer: list[floa
         run.write_summary(attack_result(run=str(folder), ending="interrupted", verified=None))
         write_configuration(run.path, np.array(answer, dtype=np.float32))
     return folder
-
-
-# ---- with the renderer ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -462,9 +442,6 @@ def test_pictures_are_kept_as_asked(tmp_path: Path, keep: Literal["all", "wrong"
     assert 0 < len(wrong) < 8
     files = (tmp_path / "run" / "images" / "rows").glob("*/*.jpg")
     assert {int(file.stem) for file in files} == {"all": set(range(8)), "wrong": wrong, "none": set()}[keep]
-
-
-# ---- the answer of a run beside the clean scene ----------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -537,9 +514,6 @@ def test_what_is_rendered_with_an_adversarial_scene_is_the_adversarial_scene_rea
     assert clean == pytest.approx([row.margin for row in plain.rows()], abs=1e-3)
     assert answer == pytest.approx([row.margin for row in found.rows()], abs=1e-3)
     assert abs(clean[0] - answer[0]) > 0.1
-
-
-# ---- changed pictures -----------------------------------------------------------------------------------------------
 
 
 CHANGES: dict[str, Any] = {"must_change": "black,covered,away", "must_not_change": "exposure,shift,jpeg"}

@@ -93,9 +93,6 @@ def stuck_picture(random: Random) -> Case:
     return Case(f"picture: {what}", "picture", "print.png", {"print.png": data})
 
 
-# --- Radiance ----------------------------------------
-
-
 def radiance(height: int = 8, width: int = 16, *, packed: bool = True) -> bytes:
     """Return a small honest Radiance map."""
     pixels = (np.arange(height * width * 4) % 120 + 40).astype(np.uint8).reshape(height, width, 4)
@@ -133,9 +130,6 @@ def hdr(random: Random) -> Case:
     else:
         what, data = damaged(random, radiance(packed=random.random() < 0.5))
     return Case(f"hdr: {what}", "environment", "room.hdr", {"room.hdr": data})
-
-
-# --- OpenEXR ----------------------------------------
 
 
 @cache

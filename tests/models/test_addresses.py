@@ -107,9 +107,6 @@ def chat(text: str, **more: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
     return lambda asked: {"choices": [{"message": {"content": text}}], "usage": usage, **more}
 
 
-# ---- the protocols --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_the_server_of_the_page_is_the_model_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its logits are those of the model that it asks, of a picture of 8 bits, up to a constant of each picture."""
@@ -155,9 +152,6 @@ def test_a_chat_is_asked_with_its_name_and_the_key(server: Server, monkeypatch: 
     assert text == {"type": "text", "text": "What?"}
     assert picture["image_url"]["url"].startswith("data:image/png;base64,")
     assert SECRET not in f"{model!r}{vars(model)}{vars(model.module)}"
-
-
-# ---- servers that behave badly --------------------------------------------------------------------------------------
 
 
 def ask_of(server: Server, **ask: float) -> Any:
@@ -274,9 +268,6 @@ def test_the_key_is_in_no_message(server: Server, monkeypatch: pytest.MonkeyPatc
     assert SECRET not in str(refused.value)
 
 
-# ---- what is refused ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [
@@ -301,9 +292,6 @@ def test_an_address_that_only_a_file_names_is_asked_nothing(
         assert main(["run", str(file), "--quiet"]) == 2
     assert f"a file names the model {server.url}" in capsys.readouterr().err
     assert not server.came
-
-
-# ---- limits, and runs -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -288,10 +288,6 @@ def test_expressions_that_are_none(text: str) -> None:
     assert message and len(message) < 250
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# TorchScript
-
-
 def scripted(module: nn.Module, path: Path) -> Path:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -469,10 +465,6 @@ def test_torchscript_that_swells_is_refused(script: Path, tmp_path: Path) -> Non
     path = repacked(script, tmp_path / "net.pt", {"extra/zeros": bytes(64 << 20)}, zipfile.ZIP_DEFLATED)
     with pytest.raises(FileFormatError, match="unpacks to at most 20 times its size"):
         load_model(path, input_size=8)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# what is no ordinary file
 
 
 def test_pipes_and_devices_are_no_models(tmp_path: Path) -> None:

@@ -54,10 +54,6 @@ def images(count: int = 2, height: int = 8, width: int = 8, seed: int = 0) -> Te
     return torch.rand((count, height, width, 3), generator=torch.Generator().manual_seed(seed))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# the function from images to logits
-
-
 def test_one_image_and_a_batch_give_the_same_rows() -> None:
     model = tiny()
     batch = images(3)
@@ -136,10 +132,6 @@ def test_batches_are_cut_and_padded() -> None:
     torch.testing.assert_close(logits, tiny()(batch))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# the network that was passed stays the caller's own
-
-
 def test_evaluation_mode_and_frozen_without_touching_the_original() -> None:
     first, second = nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)
     original = nn.Sequential(first, second, nn.Dropout(0.9), nn.AdaptiveAvgPool2d(1), nn.Flatten())
@@ -156,10 +148,6 @@ def test_evaluation_mode_and_frozen_without_touching_the_original() -> None:
         before = model(leaf)
         first.bias -= 1.0
     assert not torch.allclose(before, model(leaf))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# the probe
 
 
 class Answering(nn.Module):
@@ -232,9 +220,6 @@ def test_a_network_for_single_images_is_asked_one_at_a_time() -> None:
     torch.testing.assert_close(model(images(3)), tiny()(images(3)))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# labels and label sets
-
 LABELS = ("tench, Tinca tinca", "Coffee Mug", "cup", "crane", "teapot", "crane", "7", "missile", "projectile, missile")
 
 
@@ -286,10 +271,6 @@ def test_label_files_that_are_errors(tmp_path: Path, name: str, content: bytes) 
     (tmp_path / name).write_bytes(content)
     with pytest.raises(FileFormatError, match=name):
         tiny(labels=tmp_path / name)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# files
 
 
 @pytest.fixture(scope="module")
@@ -398,9 +379,6 @@ def test_damaged_files(tmp_path: Path, exported: Path) -> None:
             load_model(tmp_path / name)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Python code
-
 NETS = """
 import torch
 from advsearch.models import load_model
@@ -455,10 +433,6 @@ def test_callables_that_are_errors(nets: Path, spec: str, named: str) -> None:
     with pytest.raises(ModelError, match=named):
         load_model(spec)
     sys.modules.pop("my_nets", None)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# the reference network
 
 
 def test_reference_is_stored_and_loaded(tmp_path: Path) -> None:

@@ -205,10 +205,6 @@ def test_timm_brings_its_weights_and_what_belongs_to_them(timm: Any, tmp_path: P
         load_model("timm:tinynet")
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# ONNX
-
-
 class Session:
     """The few functions of onnxruntime's sessions that are used."""
 
@@ -317,10 +313,6 @@ def test_an_input_of_onnx_that_is_no_picture(
     monkeypatch.setattr(Session, "shape", shape)
     with pytest.raises(ModelError, match=named):
         load_model(onnx_file(tmp_path, b"\x08\x09"))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# gradients that do not say how answers change
 
 
 class Steps(nn.Module):

@@ -88,8 +88,6 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
     assert words.READING in capsys.readouterr().out
 
 
-# ---- the plan of a search -------------------------------------------------------------------------------------------
-
 PLANNED: dict[str, Any] = {
     **SMALL,
     "loss": "model",

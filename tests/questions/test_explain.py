@@ -166,9 +166,6 @@ def test_failures_are_grouped_by_what_the_model_decides_by(
     assert shades == {0.2, 0.8}
 
 
-# ---- the same draw, come twice ---------------------------------------------------------------------------------------
-
-
 def test_few_drives_with_many_frames_in_view_do_not_make_a_parameter_decide() -> None:
     """One drive of ten has the object in 12 frames, the others in one; nothing decides. 2.5 of 100 are asked."""
     decides, runs = 0, 80

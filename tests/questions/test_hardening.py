@@ -76,9 +76,6 @@ def pupils() -> list[Lesson]:
     return [RenderedLesson.create((n % 3,), coloured(n % 3, 0.4, n), one[None]) for n, one in enumerate(worst)]
 
 
-# ---- the split ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     bundled = Path(str(resources.files("advsearch.bundled")))
@@ -107,9 +104,6 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     assert len(list(files[0].generate_objects(5))) == 1
     with pytest.raises(InputError, match="held_out_environment"):
         check_disjoint(SceneSplit(HELD_OUT, ("ball",), ("noon",), 2), [training])
-
-
-# ---- lessons and training -------------------------------------------------------------------------------------------
 
 
 def test_the_worst_of_what_was_rendered_is_that_of_the_model_as_it_is() -> None:
@@ -194,9 +188,6 @@ def test_lessons_that_judge_are_left_as_they_are() -> None:
     course_of(student()).score([*textured, rendered])
     assert all(torch.equal(one.texture, torch.full((3,), 0.5)) for one in textured)
     assert rendered.losses.isinf().all()
-
-
-# ---- the data set ---------------------------------------------------------------------------------------------------
 
 
 def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -> None:

@@ -24,9 +24,6 @@ FEW = [case for group in GROUPS for case in [case for case in CHEAP if case.grou
 """Of each group the first, and of every three more one; the other cheap ones are among the slow tests."""
 
 
-# ---- the cases ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("case", only(FEW, CHEAP), ids=lambda case: case.name)
 def test_a_cheap_case_holds(case: Case) -> None:
@@ -41,9 +38,6 @@ def test_a_case_holds(case: Case) -> None:
     assert row.status == OK, row.decides
 
 
-# ---- rows -----------------------------------------------------------------------------------------------------------
-
-
 def made(outcome: CaseOutcome | Exception, name: str = "made") -> Case:
     def find() -> CaseOutcome:
         if isinstance(outcome, Exception):
@@ -51,9 +45,6 @@ def made(outcome: CaseOutcome | Exception, name: str = "made") -> Case:
         return outcome
 
     return Case(name, "noise", "It holds.", False, find)
-
-
-# ---- the command ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(autouse=True)

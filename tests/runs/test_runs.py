@@ -65,9 +65,6 @@ def run(tmp_path: Path) -> Iterator[RunDirectory]:
         yield made
 
 
-# ---- what survives ----
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("acknowledged", [1, 20, 137])
 def test_every_acknowledged_row_survives_sigkill(tmp_path: Path, acknowledged: int) -> None:
@@ -168,9 +165,6 @@ def test_any_values_come_back(codec: Store, values: dict[str, Any], objective: f
     assert found.objective == (objective if math.isfinite(objective) else None)
 
 
-# ---- the lock ----
-
-
 def test_a_second_process_is_refused(run: RunDirectory) -> None:
     code = (
         "import sys; from pathlib import Path; from advsearch.trust.writing import RunLock; RunLock(Path(sys.argv[1]))"
@@ -178,9 +172,6 @@ def test_a_second_process_is_refused(run: RunDirectory) -> None:
     second = subprocess.run([sys.executable, "-c", code, run.path], capture_output=True, text=True)
     assert f"process {os.getpid()} is working on this run; wait for it or choose another name" in second.stderr
     assert second.returncode != 0
-
-
-# ---- where a run goes ----
 
 
 def test_runs_are_numbered(home: Path) -> None:
@@ -315,9 +306,6 @@ def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value:
             (RunDirectory.resume("first", config) if Path("runs").is_dir() else RunDirectory.create_for(config)).close()
 
 
-# ---- whole or not at all ----
-
-
 def _raises(number: int) -> Any:
     def fail(*_: Any, **__: Any) -> Any:
         raise OSError(number, os.strerror(number))
@@ -365,9 +353,6 @@ def test_a_full_disk_stops_the_store_and_keeps_the_rows_before(run: RunDirectory
     assert [row.step for row in run.store.rows()] == [0]
 
 
-# ---- pictures ----
-
-
 @given(st.lists(st.floats(-1.0, 2.0, width=32), min_size=1, max_size=30))
 @settings(max_examples=50, deadline=None)
 def test_eight_bits_round_as_verification_does(values: list[float]) -> None:
@@ -395,9 +380,6 @@ def test_exr_round_trip_is_exact_and_equal_bytes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(exr(grey), image[..., 1])
 
 
-# ---- the summary ----
-
-
 def test_a_summary_that_is_not_there_or_damaged_is_said(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="no such file"):
         read_result(tmp_path)
@@ -417,9 +399,6 @@ def test_the_log_is_forced_to_the_disk_once_a_second(tmp_path: Path, monkeypatch
             store.append([Row("search", step)])
             forced.append(store._db.execute("PRAGMA synchronous").fetchone()[0] == 2)
     assert forced == [True, False, True, True, False]
-
-
-# ---- the rows as a table ----
 
 
 @pytest.fixture
@@ -476,9 +455,6 @@ def test_json_and_parquet_have_the_same_rows(filled: Store, tmp_path: Path) -> N
     table = pyarrow.parquet.read_table(out)
     assert table.column_names == COLUMNS and table.to_pylist() == rows
     assert str(table.schema.field("seed").type) == "int64" and str(table.schema.field("success").type) == "bool"
-
-
-# ---- the runs at a glance ----
 
 
 def test_runs_are_listed_with_their_state(home: Path) -> None:

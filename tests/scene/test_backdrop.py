@@ -99,8 +99,6 @@ def test_the_derivative_in_a_photograph_is_that_of_differences(photograph: Path)
     assert float(u.grad @ direction) == pytest.approx(difference, rel=0.02)
 
 
-# ---- the shadow
-
 TABLE = {"ground.size": 12.0, "ground.red": 0.5, "ground.green": 0.4, "ground.blue": 0.3}
 
 
@@ -225,9 +223,6 @@ def test_the_map_beside_a_photograph_lights_it(tmp_path: Path) -> None:
     assert environment is not None and environment.radiance[0, 0].tolist() == pytest.approx([2.0, 1.0, 1.0], rel=0.02)
     assert str(tmp_path / "a.hdr") in list_opened_files(tmp_path / "a.png"), "a run keeps its digest"
     assert advsearch.load_scene("mug", "studio", backdrop=tmp_path / "a.png").description.environment_name == "studio"
-
-
-# ---- noise, blur and what is in front
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.5, 4.0, 9.0])
@@ -554,9 +549,6 @@ def test_no_pose_of_an_object_is_refused(tmp_path: Path, pose: np.ndarray, words
 def test_an_object_without_a_file_has_no_measured_pose() -> None:
     with pytest.raises(InputError, match="mesh file with a known unit"):
         compute_view_settings(load_description("mug").object, np.eye(4))
-
-
-# ---- what is refused
 
 
 def refuse(match: str, scene: SceneDescription, spec: str | Path, size: tuple[int, int] = SIZE) -> None:

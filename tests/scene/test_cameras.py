@@ -66,9 +66,6 @@ def grid(side: int = 33) -> Tensor:
     return torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1).reshape(-1, 2)
 
 
-# ---- against OpenCV -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("model", list(TABLE["lenses"]))
 def test_points_are_seen_where_opencv_sees_them(model: str, tmp_path: Path) -> None:
     lens = TABLE["lenses"][model]
@@ -102,8 +99,6 @@ def test_a_lens_that_folds_says_at_which_angle_and_is_black_beyond() -> None:
     _, inside = lens.compute_rays(torch.tensor([[0.5, 0.5], [0.0, 0.0]], dtype=torch.float64))
     assert inside[0] > 0.0 > inside[1]
 
-
-# ---- files ----------------------------------------------------------------------------------------------------------
 
 K = [-0.28, 0.07, 0.001, -0.002]
 CAMERA_FILES: dict[str, Any] = yaml.safe_load((HERE / "camera_files.yaml").read_text("utf-8"))
@@ -214,9 +209,6 @@ def test_files_of_other_tools_that_are_not_read_are_refused(text: str, tmp_path:
     path.write_text(text)
     with pytest.raises(FileFormatError, match=r"camera\.yaml"):
         read_camera(str(path))
-
-
-# ---- inside Mitsuba -------------------------------------------------------------------------------------------------
 
 
 def scene_with(model: CameraModel) -> Scene:

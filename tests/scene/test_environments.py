@@ -93,9 +93,6 @@ def write_hdr(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], byt
     return path
 
 
-# --- values ----------------------------------------
-
-
 @pytest.mark.parametrize("encode", [run_lengths, repeats, np.ndarray.tobytes], ids=["runs", "repeats", "plain"])
 def test_radiance_encodings(tmp_path: Path, encode: Callable[[np.ndarray], bytes]) -> None:
     pixels = rgbe(12, 24)
@@ -201,9 +198,6 @@ def test_a_map_is_the_same_in_both_formats(tmp_path: Path) -> None:
     assert np.array_equal(one.radiance, other.radiance) and one.photographed and other.photographed
 
 
-# --- sizes ----------------------------------------
-
-
 def energy(radiance: np.ndarray) -> np.ndarray:
     """Return the irradiance (3,) that a map sends to its centre from all sides."""
     height, width = radiance.shape[:2]
@@ -223,9 +217,6 @@ def test_large_maps_keep_their_energy(tmp_path: Path, height: int, width: int) -
     assert got.radiance.shape == (512, 1024, 3) and got.warnings == ()
     assert energy(got.radiance) == pytest.approx(energy(image), rel=1e-5)
     assert got.radiance[-1, -1] == pytest.approx([0.5] * 3, rel=1e-5)
-
-
-# --- bad input ----------------------------------------
 
 
 @pytest.mark.parametrize("value", [-1.0, np.nan])
@@ -267,9 +258,6 @@ def test_bad_files(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str])
         import_environment(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
     assert capfd.readouterr() == ("", "")
-
-
-# --- environments that nobody here made ----------------------------------------
 
 
 @real_data

@@ -78,18 +78,12 @@ def test_what_is_the_front_of_a_file_faces_x(
     assert asset.front.reason not in asset.notes  # told where it matters
 
 
-# ---- in the lane -----------------------------------------------------------------------------------------------------
-
-
 def place(scene: SceneDescription) -> np.ndarray:
     return np.asarray(camera_to_world(scene)[:3, 3] * scene.size_in_metres)
 
 
 def dashcam(name: object, environment: str = "street", **given: Any) -> SceneDescription:
     return load_scene(str(name), environment, camera="dashcam", **given).description
-
-
-# ---- beside the object, around it, and written again -----------------------------------------------------------------
 
 
 def test_a_thing_faces_as_its_file_or_its_facing_says(tmp_path: Path) -> None:

@@ -115,9 +115,6 @@ def area(part: ImportedPart) -> np.ndarray:
     return np.asarray(np.cross(b - a, c - a).sum(axis=0) / 2.0)
 
 
-# --- geometry ----------------------------------------
-
-
 @pytest.mark.parametrize(
     ("positions", "kind", "normalized"),
     [
@@ -157,9 +154,6 @@ def test_sparse_accessors_are_read(based: bool, tmp_path: Path) -> None:
     file.header["accessors"][place]["sparse"]["indices"]["bufferView"] = elsewhere
     with pytest.raises(FileFormatError, match="sparse"):
         parts_of(file, tmp_path)
-
-
-# --- colours and textures ----------------------------------------
 
 
 def test_sharp_texels_stay_sharp(tmp_path: Path) -> None:
@@ -254,9 +248,6 @@ def test_pictures_of_all_kinds_are_colours_as_they_are_stored(name: str, tmp_pat
     assert notes == [] and part.surface.texture is not None
     assert part.surface.texture.shape == (2, 4, 3)
     assert part.surface.texture == pytest.approx(np.broadcast_to(wanted, (2, 4, 3)), abs=0.01)
-
-
-# --- anything at all ----------------------------------------
 
 
 def reference(light: np.ndarray, u: float, v: float, wraps: tuple[int, int], *, sharp: bool) -> np.ndarray:

@@ -33,9 +33,6 @@ def add(file: File, **node: Any) -> int:
     return len(file.header["nodes"]) - 1
 
 
-# ---- cameras --------------------------------------------------------------------------------------------------------
-
-
 def with_camera(folder: Path, lens: dict[str, float], **node: Any) -> SceneDescription:
     file = square()
     file.header["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, **lens}, "name": "front"}]
@@ -87,9 +84,6 @@ def test_a_camera_under_a_mirror_or_a_shear_is_refused(
         import_scene(path, "plate")
 
 
-# ---- units of light -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("generator", "shines", "candela"),
     [("", True, 1.0), ("Khronos glTF Blender I/O v4.2.57", True, LUMENS), ("", False, LUMENS)],
@@ -111,9 +105,6 @@ def test_candela_and_nit_are_of_one_kind(generator: str, shines: bool, candela: 
     assert ("candela and nit" in said) == (shines and not generator) and ("as Blender shows them" in said) == bool(
         generator
     )
-
-
-# ---- skins ----------------------------------------------------------------------------------------------------------
 
 
 def matrices(*given: np.ndarray) -> np.ndarray:

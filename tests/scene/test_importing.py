@@ -115,9 +115,6 @@ def check_sound(asset: ObjectAsset) -> None:
     assert asset.base_color.min() >= 0.0 and asset.base_color.max() <= 1.0
 
 
-# --- geometry ----------------------------------------
-
-
 def test_cube_without_anything(tmp_path: Path) -> None:
     asset = import_object(written(tmp_path, "my cube.obj", CUBE))
     check_sound(asset)
@@ -267,9 +264,6 @@ def test_scale_and_offset_do_not_matter(tmp_path: Path, scale: float, offset: fl
     assert asset.mesh.vertices == pytest.approx(import_object(written(tmp_path, "b.obj", CUBE)).mesh.vertices)
 
 
-# --- texture coordinates and textures ----------------------------------------
-
-
 def textured_quad(folder: Path, uvs: str, *, size: int = 16) -> tuple[ObjectAsset, np.ndarray]:
     """Import a square with a texture and the given four ``vt`` lines; return it and the texture's values."""
     pixels = picture(folder, size=size)
@@ -358,9 +352,6 @@ def test_large_textures_are_averaged_down(tmp_path: Path, width: int, height: in
     assert srgb_to_linear(got).mean() == pytest.approx(0.5, abs=1e-3)
 
 
-# --- materials ----------------------------------------
-
-
 def painted_quad(folder: Path, material: str, *, head: str = "mtllib quad.mtl\nusemtl paint\n") -> ObjectAsset:
     """Import a square whose .mtl file has the given text."""
     written(folder, "quad.mtl", material)
@@ -440,9 +431,6 @@ def test_gltf_with_separate_files(tmp_path: Path) -> None:
         import_object(path)
 
 
-# --- bad input ----------------------------------------
-
-
 def obj(text: str) -> Callable[[Path], Path]:
     """Return a function that writes an OBJ file."""
     return lambda folder: written(folder, "thing.obj", text)
@@ -511,9 +499,6 @@ def test_bad_files(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str])
         import_object(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
     assert capfd.readouterr() == ("", "")
-
-
-# --- hostile input ----------------------------------------
 
 
 REFERENCES = {
@@ -655,9 +640,6 @@ def test_gltf_that_is_not_gltf(tmp_path: Path, case: str) -> None:
     place[key] = value
     with pytest.raises(FileFormatError, match=r"thing\.glb"):
         import_object(written(tmp_path, "thing.glb", join_glb(header, rest)))
-
-
-# --- objects that nobody here made ----------------------------------------
 
 
 @pytest.mark.medium

@@ -141,8 +141,6 @@ def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], ca
     assert (lights.find_refusal(rendered_by(controls, **options)) is None) == can_predict
 
 
-# ---- searches -------------------------------------------------------------------------------------------------------
-
 SEARCH: dict[str, Any] = {
     "controls": {"light": {"power": [0, 12]}}, "resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8,
     "baseline": False,

@@ -158,8 +158,6 @@ def test_damage_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
         read_parts(tmp_path / "a.ply", (tmp_path / "a.ply").read_bytes())
 
 
-# --- whatever a file has ----------------------------------------
-
 VERTEX = {
     **dict.fromkeys(("float confidence", "double quality", "float intensity", "uchar flags", "int radius"), True),
     **dict.fromkeys(
@@ -228,8 +226,6 @@ def test_whatever_a_file_has_is_read_or_named(
     expected = [f"vertex property {name!r} is left out" for name in unread] + ["face property 'group' is left out"]
     assert sorted(notes) == sorted(expected)
 
-
-# --- STL ----------------------------------------
 
 FACETS = [[(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(1, 0, 0), (1, 1, 0), (0, 1, 0)]]
 

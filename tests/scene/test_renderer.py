@@ -196,9 +196,6 @@ def test_non_finite_radiance_is_counted_and_set_to_zero(raw: Renderer, monkeypat
     assert bool(torch.isfinite(image).all()) and float(image[0, 0, 0]) == 0.0
 
 
-# ---- image formation ------------------------------------------------------------------------------------------------
-
-
 def test_a_picture_is_radiance_times_the_gain_through_the_curve() -> None:
     radiance = torch.tensor([[0.0, 0.1, 0.2]])
     light = 2.5 * radiance

@@ -103,9 +103,6 @@ def figure(weights: str = "f4", **header: Any) -> File:
     return file
 
 
-# ---- the format's formulas, once more --------------------------------------------------------------------------------
-
-
 def matrix(shift: Any, turn: Any, scale: Any) -> np.ndarray:
     x, y, z, w = turn
     found = np.eye(4)
@@ -238,9 +235,6 @@ def test_derivatives_are_those_of_differences(clip: str | None, values: dict[str
     assert float(slope) == pytest.approx((up - down) / 2e-6, rel=1e-5)
 
 
-# ---- the control -----------------------------------------------------------------------------------------------------
-
-
 def space_of(path: Path, **settings: object) -> Any:
     return make_space([make_control("body", settings)], load_description(str(path)))
 
@@ -293,9 +287,6 @@ def test_true_boxes_follow(tmp_path: Path) -> None:
         (found,) = find_visible_meshes(renderer, torch.tensor([time]))
         wanted = columns.min(), rows.min(), columns.max(), rows.max()
         assert np.abs(np.array(found.box) - wanted).max() <= 1.0, (found.box, wanted)
-
-
-# ---- hostile files ---------------------------------------------------------------------------------------------------
 
 
 def _set(*keys: Any, value: Any) -> Callable[[File], None]:

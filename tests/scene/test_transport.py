@@ -144,8 +144,6 @@ def test_where_it_can_predict(controls: object, options: dict[str, object], can_
     assert (lights.find_refusal(made) is None) == can_predict
 
 
-# ---- searches -------------------------------------------------------------------------------------------------------
-
 SMALL = {"resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8, "controls": {"texture": {"resolution": 8}}}
 
 

@@ -179,9 +179,6 @@ def test_binary_files_and_packages_are_the_same(mug: tuple[ObjectAsset, Path]) -
         assert np.array_equal(found.base_color, expected.base_color)
 
 
-# ---- the parts of a stage -------------------------------------------------------------------------------------------
-
-
 def written(folder: Path, body: str, **head: Any) -> Path:
     file = folder / "scene.usda"
     file.write_text(stage(body, **head))
@@ -244,8 +241,6 @@ def test_polygons_holes_and_orientation(tmp_path: Path, orientation: str) -> Non
     assert np.linalg.norm(across, axis=1).sum() / 2 == pytest.approx(2.5 / 4.0, rel=1e-4), "of a largest extent of 1"
     assert (across[:, 1] < 0).all(), "towards the viewer, which is +z with y up"
 
-
-# ---- scenes ---------------------------------------------------------------------------------------------------------
 
 ROOM = f"""
     def Xform "shelf" {{
@@ -370,9 +365,6 @@ def test_a_skeleton_is_at_rest(tmp_path: Path) -> None:
     }}"""
     (node,) = list_contents(written(tmp_path, body, root="SkelRoot")).nodes
     assert node.size == pytest.approx((3.0, 1.0, 1.0))
-
-
-# ---- what is refused ------------------------------------------------------------------------------------------------
 
 
 def refers_to(name: str) -> str:

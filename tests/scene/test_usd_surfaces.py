@@ -296,9 +296,6 @@ def test_normal_maps_by_their_scale_and_bias(tmp_path: Path) -> None:
     assert y["down"] == pytest.approx(-0.39, abs=0.02) and y["without"] == pytest.approx(y["usual"], abs=0.01)
 
 
-# ---- without a material ---------------------------------------------------------------------------------------------
-
-
 def colors_of(parts: list[ImportedPart]) -> list[tuple[float, ...]]:
     return sorted(tuple(np.round(linear_color(part), 2)) for part in parts)
 
@@ -320,9 +317,6 @@ def test_display_colors_and_opacities_of_faces_and_vertices(tmp_path: Path) -> N
     colors = [part.surface.color for part in parts if part.surface.color is not None]
     shares = sorted(1.0 if len(color) == 3 else float(color[3]) for color in colors)
     assert shares == pytest.approx([0.25, 1.0], abs=0.003)
-
-
-# ---- packages as layers ---------------------------------------------------------------------------------------------
 
 
 def write_package(folder: Path, name: str, entries: dict[str, bytes]) -> None:

@@ -58,9 +58,6 @@ def areas(part: ImportedPart) -> np.ndarray:
     return found
 
 
-# --- material files ----------------------------------------
-
-
 @pytest.mark.parametrize(
     ("rest", "name", "options"),
     [
@@ -115,9 +112,6 @@ def test_roughness_and_metallic(tmp_path: Path) -> None:
     assert part.surface.roughness == pytest.approx(pixels[:, :, 1].mean(), abs=1e-6)
     assert part.surface.metallic == pytest.approx(pixels[:, :, 2].mean() / 2.0, abs=1e-6)
     assert len(notes) == 1 and "roughness and metallic" in notes[0]
-
-
-# --- what OBJ files have ----------------------------------------
 
 
 def test_colors_of_vertices_times_the_color_of_the_material(tmp_path: Path) -> None:

@@ -166,9 +166,6 @@ def test_it_is_compared_with_the_distance_along_the_axis() -> None:
         assert right.map is not None and torch.allclose(right.map, moved(2.0), atol=1e-4)
 
 
-# ---- on a model -----------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The flags of the task with a model file."""

@@ -45,9 +45,6 @@ def judged(task: Detection, output: list[dict[str, Tensor]], truth: DetectionTru
     return found
 
 
-# ---- boxes ----------------------------------------------------------------------------------------------------------
-
-
 def test_boxes_overlap_by_the_share_of_their_union() -> None:
     box = torch.tensor(HERE)
     boxes = torch.tensor([HERE, NEAR, AWAY, [0.2, 0.2, 0.4, 0.6], [0.6, 0.6, 0.2, 0.2]])
@@ -60,8 +57,6 @@ def test_all_forms_of_a_box_are_the_same_corners() -> None:
     for form, numbers in forms.items():
         assert to_corners(torch.tensor(numbers).float(), form).tolist() == [1, 2, 5, 8]
 
-
-# ---- what a detector returns ----------------------------------------------------------------------------------------
 
 BOXES, SCORES = torch.tensor([[HERE, AWAY]] * 2), torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(1))
 LABELS, ONE = torch.tensor([[0, 2], [1, 1]]), torch.tensor([[0.9, 0.2], [0.4, 0.3]])
@@ -116,8 +111,6 @@ def test_what_is_no_detection_is_refused(answer: Any, text: str) -> None:
         read_detections(answer, 2)
 
 
-# ---- suppression ----------------------------------------------------------------------------------------------------
-
 FAR = [0.34, 0.2, 0.74, 0.6]
 """Overlaps `NEAR` by 0.82, and the object by 0.48: not where it is."""
 
@@ -151,8 +144,6 @@ def test_what_is_left_has_a_derivative_and_what_is_dropped_has_none() -> None:
     TASK.loss(output, TRUTH).sum().backward()
     assert scores.grad is not None and scores.grad[0].tolist() == [0.0, 0.0, 0.0] and float(scores.grad[1, 0]) < 0.0
 
-
-# ---- the judgement --------------------------------------------------------------------------------------------------
 
 FOUND = dense((HERE, [0.8, 0.1, 0.0]), (AWAY, [0.1, 0.2, 0.1]))
 
@@ -310,9 +301,6 @@ def test_the_payload_has_all_boxes_in_pixels_and_marks_show_those_that_count() -
     (marks,) = TASK.marks(FOUND, TRUTH)
     assert [(one.text, one.true) for one in marks] == [("cup", True), ("cup 0.80", False)]
     assert [one.box for one in marks] == [pytest.approx((4.0, 4.0, 12.0, 12.0))] * 2
-
-
-# ---- on a model -----------------------------------------------------------------------------------------------------
 
 
 class Pixels(nn.Module):

@@ -91,9 +91,6 @@ def test_predictions_are_the_classes_of_most_pixels() -> None:
     assert said.mask.int().tolist() == [[1, 1, 0, 1], [1, 0, 0, 1]]
 
 
-# ---- on a model -----------------------------------------------------------------------------------------------------
-
-
 class Mapped(nn.Module):
     """As torchvision's segmenters: a mapping with `out`."""
 

@@ -83,8 +83,6 @@ def features(model: Model, pictures: Tensor) -> Tensor:
     return nn.functional.normalize(model(pictures), dim=1)
 
 
-# ---- networks -------------------------------------------------------------------------------------------------------
-
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 SIZES = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 8}
 EYES = {**SIZES, "image_size": 16, "patch_size": 8}
@@ -131,9 +129,6 @@ def test_features_are_those_of_the_librarys_own_pipeline(architecture: str, tmp_
     torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=0.0)
     again = advsearch.load_model(network, task="similarity")  # from Python, as it is
     torch.testing.assert_close(again(torch.from_numpy(read_png(file))), theirs, atol=1e-4, rtol=0.0)
-
-
-# ---- references -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("k", [1, 2, 50])
@@ -208,9 +203,6 @@ def test_objectives_of_logits_have_a_true_gradient(
         assert value == pytest.approx(-task.judge(model(picture.detach()), (0,))[0].margin)
 
 
-# ---- the clean picture ----------------------------------------------------------------------------------------------
-
-
 def test_a_threshold_compares_with_the_clean_picture(model: Model) -> None:
     task = Similarity(threshold=0.8).on(model)
     clean, other = noisy(COLOURS["red"], 1), noisy(COLOURS["blue"], 1)
@@ -236,9 +228,6 @@ def test_the_distance_is_one_minus_the_cosine_and_leads_away_from_the_start(mode
     with torch.no_grad():
         moved = clean + 0.01 * slope / slope.norm()
         assert float(objective(model(moved), moved[None], (0,))) > float(objective(model(clean), clean[None], (0,)))
-
-
-# ---- as a user types it ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

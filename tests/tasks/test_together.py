@@ -68,8 +68,6 @@ def test_one_configuration_against_a_detector_and_a_model_of_depth(
         assert (abs(drawn - torch.tensor(colour).numpy() / 255) < 1 / 255).all(axis=2).sum() > 100
 
 
-# ---- how it is asked for --------------------------------------------------------------------------------------------
-
 FORMS: list[tuple[Any, Any]] = [
     ("detection+depth", "detection+depth"),
     ("detection={iou: 0.7} + depth", {"name": "detection+depth", "detection": {"iou": 0.7}}),
@@ -97,9 +95,6 @@ def test_all_models_have_a_derivative() -> None:
     image = torch.full((1, 1, 3), 0.5, requires_grad=True)
     torch.stack([output.sum() for output in model(image)[0]]).sum().backward()
     torch.testing.assert_close(image.grad, sum(one.weight.detach().sum(dim=0) for one in layers)[None, None])
-
-
-# ---- what is judged -------------------------------------------------------------------------------------------------
 
 
 def models(*tasks: tuple[nn.Module, Task, Any]) -> list[Model]:

@@ -148,9 +148,6 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     assert not task.ambiguities and not task.doubts
 
 
-# ---- what is refused ------------------------------------------------------------------------------------------------
-
-
 def more(columns: int, span: float = 0.9) -> Callable[[Tensor], Tensor]:
     """A grid with so many numbers more after those of each place, in [-span, span]."""
     return lambda n: first(torch.cat([n, noisy(len(n), PLACES, columns) / 3.0 * span], dim=2))
@@ -192,9 +189,6 @@ def test_an_order_says_what_a_head_is(order: str) -> None:
     assert not task.remarks
     with pytest.raises(InputError, match="order"):
         Detection(order="boxes objectness")
-
-
-# ---- names, suppression, derivatives --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("names", [dict(enumerate(NAMES)), list(NAMES)])

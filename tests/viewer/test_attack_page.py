@@ -59,9 +59,6 @@ def page_of(run: Path) -> Page:
     return Page(written_page(run).read_text(encoding="utf-8"))
 
 
-# ---- the page ----
-
-
 def test_the_page_says_it_all(tmp_path: Path) -> None:
     page = page_of(make_run(tmp_path / "run", attack(warnings=["A texture is missing."])))
     for text in (
@@ -125,9 +122,6 @@ def test_a_run_that_has_little_still_has_a_page(tmp_path: Path, ending: str) -> 
     assert not page.all("img") and "Verified rates" not in page.text
 
 
-# ---- charts and markup ----
-
-
 def test_text_is_escaped_and_markup_is_not() -> None:
     assert make_element("p", "<b>", Html("<i></i>"), None, class_='"') == '<p class="&quot;">&lt;b&gt;<i></i></p>'
     assert make_element("img", src="&") == '<img src="&amp;">'
@@ -156,9 +150,6 @@ def test_a_chart_of_any_values_is_drawn_inside_its_frame(values: list[float | No
     assert all(0 <= x <= width and 0 <= y <= 300 for x, y in points)
     assert [x for x, _ in points] == sorted(x for x, _ in points)
     assert "wrong" in page.text
-
-
-# ---- words ----
 
 
 ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."

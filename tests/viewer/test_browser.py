@@ -405,9 +405,6 @@ def test_intervals_over_drives_are_those_of_the_summary(browser: Browser) -> Non
         assert mine == pytest.approx(rate_interval(right, of), abs=1e-6), units
 
 
-# ---- photographs ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_a_photograph_is_aligned_taken_and_counted(browser: Browser, tmp_path: Path) -> None:
     """With a camera that isn't there, over HTTPS as a phone has it; and everybody can use the page."""

@@ -94,9 +94,6 @@ def kept(run: Path) -> int:
     return len(list((run / "images/photos").glob("*"))) if (run / "images/photos").is_dir() else 0
 
 
-# ---- what is taken in -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_a_photograph_is_cut_to_the_renderings_shape_and_says_nothing_else() -> None:
     stream = io.BytesIO()
@@ -135,9 +132,6 @@ def test_a_rendering_is_found_by_its_own_name_only(run: Path, name: str) -> None
         find_photo(run, name)
 
 
-# ---- judged and counted ---------------------------------------------------------------------------------------------
-
-
 def test_photographs_are_judged_by_the_runs_model_and_counted(tmp_path: Path, taker: Photographs) -> None:
     run = make_sweep(tmp_path / "sweep", keep="all")
     for name in ("0", "2", "2"):  # 2 is wrong in the rendering; the model calls a grey picture something else as well
@@ -166,9 +160,6 @@ def test_a_run_at_work_takes_no_photographs(tmp_path: Path, taker: Photographs) 
     with RunDirectory.resume(run), pytest.raises(InputError, match="working on"):
         taker.add(run, "3", picture())
     assert kept(run) == 0
-
-
-# ---- over the network -----------------------------------------------------------------------------------------------
 
 
 def test_a_page_takes_a_photograph(server: Dashboard, run: Path) -> None:

@@ -207,9 +207,6 @@ def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.Mon
         assert ask(server, "/runs/first/cover")[0].status == 200
 
 
-# ---- what lies in a run is somebody else's ---------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("path", "kind", "own"),

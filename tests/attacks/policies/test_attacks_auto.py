@@ -79,9 +79,6 @@ def played(domain: Domain, policy: Policy[Any], steps: int, seed: int = 0) -> tu
     return search(partial(map, problem), domain, policy, steps=steps, seed=seed), problem
 
 
-# ---- rules
-
-
 @once_each("blocks, seed", [(BALL,), (Block(30, "l2", 0.4),), (BALL, Block(7, "l2", 0.1))], [0, 1])
 def test_norm_balls_alone_are_pgd_bit_for_bit(blocks: tuple[Block, ...], seed: int) -> None:
     domain = domain_of(blocks)
@@ -104,9 +101,6 @@ def test_it_stays_inside_and_spends_its_budget_exactly(name: str, price: tuple[i
     if cost == 12:
         ball = "ball" in name or "texture" in name
         assert set(problem.asked) <= {False, "free" if ball and free else True}
-
-
-# ---- what the renders are for
 
 
 def test_a_texture_beside_a_pose_takes_free_gradients_where_there_are_some() -> None:
@@ -143,9 +137,6 @@ def test_an_angle_is_searched_across_its_seam() -> None:
     assert sides == {True, False}
 
 
-# ---- the parts
-
-
 def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> None:
     box = find_box_coordinates(domain_of((Block(2),)))
     x = box.sample_screen(3, 60)
@@ -158,9 +149,6 @@ def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> Non
     assert float(error) < 0.12  # well under the noise of 0.2
     assert float(surrogate.scales.lengths[1]) > float(surrogate.scales.lengths[0])  # the second number does nothing
     assert float((mean - torch.sin(5 * new[:, 0])).abs().div(deviation).mean()) < 2.0
-
-
-# ---- against random search at equal renders
 
 
 def waves(rng: np.random.Generator, d: int, length: float) -> Callable[[np.ndarray], float]:

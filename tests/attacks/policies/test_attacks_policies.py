@@ -113,9 +113,6 @@ KINDS = ("linear", "peak inside", "peak outside")
 NORMS = ("linf", "l2", "box")
 
 
-# ---- known optima
-
-
 @once_each("kind, norm, d", KINDS, NORMS, DIMS)
 def test_pgd_reaches_the_optimum(kind: str, norm: str, d: int) -> None:
     problem = make_problem(kind, norm, d, seed=1)
@@ -133,9 +130,6 @@ def test_pgd_reaches_the_optimum_through_noise(kind: str, norm: str, d: int) -> 
         result = search(problem.evaluator(seed, noise=0.5), problem.domain, PGD(), steps=STEPS, seed=seed)
         values.append(problem.value(result.best_u) / problem.optimum)
     assert sum(values) / 3 >= 1 / RATIO
-
-
-# ---- how pgd steps
 
 
 def test_pgd_starts_at_the_start_and_steps_by_a_fraction_of_epsilon() -> None:
@@ -177,8 +171,6 @@ def test_a_non_finite_objective_sends_pgd_back_with_half_the_step() -> None:
     assert 0 < result.non_finite_objectives < STEPS / 2
     assert float(result.best_u[0]) > 0.54
 
-
-# ---- the battery: every registered policy, every objective
 
 MIXED = Domain(
     torch.rand(18, generator=seeded(0, 0)),

@@ -100,9 +100,6 @@ def test_an_optimum_in_a_corner_is_reached_and_the_mean_stays_inside(policy: Pol
     assert float(w @ result.distribution.mean) - start > 0.9 * (best - start)
 
 
-# ---- cmaes
-
-
 def test_cmaes_learns_a_ridge() -> None:
     """Two numbers matter by their sum, a hundred times less by their difference; separable steps zigzag there."""
     domain = Domain(torch.full((2,), 0.2), (Block(2),))
@@ -125,9 +122,6 @@ def test_cmaes_is_separable_in_many_dimensions_and_refuses_more() -> None:
     over = Domain(torch.full((10_001,), 0.5), (Block(10_001, "linf", 0.1),))
     with pytest.raises(InputError, match="cmaes"):
         search(evaluator(bowl(0.5)), over, CMAES(), steps=10, seed=0)
-
-
-# ---- nes
 
 
 def test_samples_come_in_mirrored_pairs() -> None:

@@ -39,9 +39,6 @@ def points(policy: Policy[Any], domain: Domain, steps: int, seed: int = 0) -> tu
     return torch.stack(seen), result
 
 
-# ---- grid
-
-
 def test_a_grid_is_full_and_each_point_comes_once() -> None:
     domain = Domain(torch.tensor([0.5, 0.5, 0.1]), (Block(1, low=0.2, high=0.8), Block(1), Block(1, options=3)))
     seen, result = points(Grid(), domain, 40)
@@ -92,9 +89,6 @@ def test_a_grid_of_given_size_and_a_grid_that_does_not_fit() -> None:
         points(Grid(points=5), Domain(torch.full((2,), 0.5), (Block(2),)), 24)
     with pytest.raises(InputError, match="points"):
         Grid(points=1)
-
-
-# ---- sobol
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])

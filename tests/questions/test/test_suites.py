@@ -91,9 +91,6 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-# ---- answers --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tuple[SuiteResult, Path]) -> None:
     result, folder = tested
@@ -229,9 +226,6 @@ def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_p
     assert base64.b64encode(picture).decode() in (tmp_path / "run" / "report.html").read_text("utf-8")
 
 
-# ---- counterexamples and expectations -------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Path, tmp_path: Path) -> None:
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
@@ -264,9 +258,6 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
 )  # fmt: skip
 def test_what_trials_say_of_a_counterexample(right: int, wrong: int, over: bool, verdict: str) -> None:
     assert decide_trials(right, wrong, over=over) == verdict
-
-
-# ---- for machines ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -307,9 +298,6 @@ def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
     assert json.loads(words.format_sarif(odd_result))["runs"][0]["results"][0]["ruleId"] == "right"
 
 
-# ---- bad suites -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -335,9 +323,6 @@ def test_a_bad_suite_is_one_sentence_before_anything_is_rendered(
         carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "never")))
     assert str(caught.value).startswith(suite) and "\n" not in str(caught.value)
     assert not (tmp_path / "never").exists()
-
-
-# ---- for pytest -----------------------------------------------------------------------------------------------------
 
 
 def always() -> advsearch.Model:
