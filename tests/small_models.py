@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor, nn
 
 import advsearch
 from advsearch import Model
+from advsearch.cli.main import main
 
 SIDE = 32
 
@@ -82,6 +86,20 @@ class Blue(nn.Module):
         band = (x[:, 2] - x[:, 0])[:, 15 * side // 32 : 21 * side // 32, side // 4 : 22 * side // 32]
         mug = 40.0 * (band.mean(dim=(1, 2)) - self.threshold)
         return torch.stack([-mug - 9.0, -mug, mug] if self.last else [mug, -mug], dim=1)
+
+
+def save_exported(network: nn.Module, path: Path | str) -> None:
+    """Write a network of pictures of `SIDE` as an exported program that takes any batch up to 64."""
+    batch = {0: torch.export.Dim("batch", min=1, max=64)}
+    program = torch.export.export(network.eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
+    torch.export.save(program, path)
+
+
+def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
+    """Type a command, and return what it prints, as JSON."""
+    assert main(list(command)) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
 
 
 def easy() -> Model:

@@ -19,11 +19,6 @@ AGREEMENT = 0.1
 """Relative difference allowed between 64-sample adjoints and 128-sample differences."""
 
 
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
-
-
 def bound(scene: SceneDescription, **settings: Any) -> ContentsControl:
     control = ContentsControl(**settings)
     return control.bind(control.prepare(scene))

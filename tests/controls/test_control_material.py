@@ -20,7 +20,7 @@ from advsearch.controls.material import (
 )
 from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.meshes import make_principled, to_loadable
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, translate_mesh, translate_part
 from advsearch.scene.mitsuba_backend.variant import mi
@@ -31,11 +31,6 @@ BASE_COLOR = "object.base_color"
 
 AGREEMENT = 0.15
 """Relative difference allowed between a 64-sample adjoint and a 64-sample difference of a smooth weight."""
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
 
 
 @pytest.mark.medium

@@ -28,11 +28,6 @@ ACCURACY = 0.02
 """Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""
 
 
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
-
-
 def hidden(scene: SceneDescription, **settings: Any) -> Placement:
     """The placement at the upper end of the coverage's range."""
     control = OcclusionControl(**{"coverage": [0, 0.9], **settings})

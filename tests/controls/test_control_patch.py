@@ -15,17 +15,12 @@ from advsearch.controls import make_space
 from advsearch.controls.patch import BASE_COLOR, PatchControl
 from advsearch.controls.texture import TextureControl
 from advsearch.scene.assets import Float32Array, Mesh
-from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.library import list_objects, load_object
 from advsearch.scene.raster import MeshSurface, rasterize_charts
 from covering import only
 
 SIDE = 512
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.objectives import get_objective
-from advsearch.cli.main import main
 from advsearch.options import NOT_A_NUMBER
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
@@ -30,7 +28,7 @@ from advsearch.tasks.depth import (
     Depth,
     DepthTruth,
 )
-from small_models import SIDE, Ranger
+from small_models import Ranger, answer, save_exported
 
 HIGH, WIDE = 8, 10
 MASK = torch.zeros(HIGH, WIDE).bool()
@@ -170,17 +168,8 @@ def test_it_is_compared_with_the_distance_along_the_axis() -> None:
 def asked(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The flags of the task with a model file."""
     file = tmp_path_factory.mktemp("depth") / "net.pt2"
-    batch = {0: torch.export.Dim("batch", min=1, max=64)}
-    program = torch.export.export(Ranger().eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
-    torch.export.save(program, file)
+    save_exported(Ranger(), file)
     return ["--object", "mug", "--task", f"depth={{kind: {DISPARITY}}}", "--model", str(file), "--json"]
-
-
-def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
-    """Type a command, and return what it prints."""
-    assert main(list(command)) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
 
 
 SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none", "--trials", "6"]

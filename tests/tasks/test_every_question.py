@@ -9,18 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from torch import nn
 
 import advsearch
-from advsearch.cli.main import main
 from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.photographs.result import find_rendering
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
-from small_models import SIDE, Finder, Painter, Slider
+from small_models import SIDE, Finder, Painter, Slider, answer, save_exported
 
 pytestmark = pytest.mark.medium
 
@@ -38,20 +36,11 @@ def asked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         "detection": (Finder(), ["cup", "bowl", "dog"], "cup"),
         "segmentation": (Painter(), ["background", "mug", "dog"], "mug"),
     }[request.param]
-    batch = {0: torch.export.Dim("batch", min=1, max=64)}
-    program = torch.export.export(network.eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
-    torch.export.save(program, folder / "net.pt2")
+    save_exported(network, folder / "net.pt2")
     (folder / "labels.json").write_text(json.dumps(names), "utf-8")
     task = "detection" if request.param == "detection" else "segmentation={accuracy: 0.7}"
     model = ["--task", task, "--model", str(folder / "net.pt2"), "--labels", str(folder / "labels.json")]
     return [*model, "--label", label, "--json"]
-
-
-def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
-    """Type a command, and return what it prints."""
-    assert main(list(command)) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
 
 
 def task_of(asked: list[str]) -> str:

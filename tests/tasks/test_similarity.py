@@ -20,7 +20,7 @@ from advsearch.models import Model
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.tasks import Facts
 from advsearch.tasks.similarity import ITSELF, SOMETHING_ELSE, TEMPERATURE, Similarity
-from small_models import SIDE
+from small_models import SIDE, save_exported
 
 COLOURS = {"blue": (0.2, 0.3, 0.9), "green": (0.2, 0.8, 0.3), "red": (0.9, 0.2, 0.2)}
 NAMES = tuple(COLOURS)
@@ -240,9 +240,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
             name, network, around=2, spp=2, denoise="none", task=Similarity(threshold=0)
         ).views:
             write(place / "refs" / name / f"{view.azimuth:.0f}.png", view.picture)
-    batch = {0: torch.export.Dim("batch", min=1, max=64)}
-    shape = torch.zeros(2, 3, SIDE, SIDE)
-    torch.export.save(torch.export.export(Banded().eval(), (shape,), dynamic_shapes=(batch,)), place / "net.pt2")
+    save_exported(Banded(), place / "net.pt2")
     return place
 
 
