@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pytest
 import torch
 from torch import Tensor, nn
 
 import advsearch
 from advsearch import Model
-from advsearch.cli.main import main
+
+if TYPE_CHECKING:
+    import pytest
 
 SIDE = 32
 
@@ -88,6 +89,20 @@ class Blue(nn.Module):
         return torch.stack([-mug - 9.0, -mug, mug] if self.last else [mug, -mug], dim=1)
 
 
+def loud(network: Any) -> Any:
+    """The network with random weights that are large enough for answers that differ, always the same."""
+    generator = torch.Generator().manual_seed(0)
+    for name, parameter in network.named_parameters():
+        if parameter.dim() > 1 or "embedding" in name:
+            parameter.data = torch.randn(parameter.shape, generator=generator) * 0.3
+    return network
+
+
+def levels(one: Tensor, other: Tensor) -> float:
+    """Root mean square difference of two pictures in levels of 255."""
+    return 255.0 * float(((one - other) ** 2).mean().sqrt())
+
+
 def save_exported(network: nn.Module, path: Path | str) -> None:
     """Write a network of pictures of `SIDE` as an exported program that takes any batch up to 64."""
     batch = {0: torch.export.Dim("batch", min=1, max=64)}
@@ -97,6 +112,8 @@ def save_exported(network: nn.Module, path: Path | str) -> None:
 
 def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
     """Type a command, and return what it prints, as JSON."""
+    from advsearch.cli.main import main  # late: networks are loaded without the command line
+
     assert main(list(command)) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found

@@ -50,11 +50,10 @@ def test_own_entries_come_first_and_win_and_those_of_the_catalog_are_imported(mo
 @pytest.mark.parametrize(
     ("entry", "complaint"),
     [
-        ("two", "expected a number"),
-        (ImportError("no module x"), r"cannot be imported \(no module x\)"),
+        ("two", "expected a number"), (ImportError("no module x"), r"cannot be imported \(no module x\)"),
         (RuntimeError("too old"), r"cannot be imported \(too old\)"),
     ],
-)
+)  # fmt: skip
 def test_an_entry_that_does_not_fit_is_named_with_its_package(
     monkeypatch: pytest.MonkeyPatch, entry: Any, complaint: str
 ) -> None:

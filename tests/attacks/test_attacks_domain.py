@@ -34,13 +34,11 @@ def brute_force(u: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
         jac=lambda p: 2 * (p - u),
         bounds=[(0.0, 1.0)] * len(u),
         constraints={
-            "type": "ineq",
-            "fun": lambda p: radius**2 - ((p - centre) ** 2).sum(),
-            "jac": lambda p: -2 * (p - centre),
+            "type": "ineq", "fun": lambda p: radius**2 - ((p - centre) ** 2).sum(), "jac": lambda p: -2 * (p - centre),
         },
         method="SLSQP",
         options={"ftol": 1e-12, "maxiter": 500},
-    )
+    )  # fmt: skip
     return np.asarray(answer.x)
 
 

@@ -88,10 +88,8 @@ def test_targeted_dlr_is_the_published_ratio_where_the_right_label_leads() -> No
 
 
 FORMS = {
-    "plain": Classification(),
-    "targeted": Classification(target=(2, 4)),
-    "minimised": Classification(minimise=True),
-}
+    "plain": Classification(), "targeted": Classification(target=(2, 4)), "minimised": Classification(minimise=True),
+}  # fmt: skip
 RIGHT = (0, 3)
 LARGE = (1.0, 1e3, 1e4)
 

@@ -99,11 +99,10 @@ def test_clopper_pearson_covers_at_least_as_often_as_it_says(rate: float) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((1, 0), "trials: expected at least 1, got 0"),
-        ((3, 2), "successes: expected a number from 0 to 2, got 3"),
+        ((1, 0), "trials: expected at least 1, got 0"), ((3, 2), "successes: expected a number from 0 to 2, got 3"),
         ((1, 2, 1.0), "confidence: expected a number between 0 and 1, got 1.0"),
     ],
-)
+)  # fmt: skip
 def test_impossible_counts_are_refused(arguments: tuple[float, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
         clopper_pearson(*arguments)  # type: ignore[arg-type]
@@ -447,10 +446,8 @@ def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
     found = verify(evaluate, DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
     assert made == ["control"] * 20 + ["verification"] * 2, "what nobody asks for any more is not made"
     assert (found.adversarial_counts.successes, found.adversarial_counts.trials, found.ending) == (
-        0,
-        2,
-        Ending.BUDGET_SPENT,
-    )
+        0, 2, Ending.BUDGET_SPENT,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -474,18 +471,13 @@ def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[
 @pytest.mark.parametrize(
     ("told", "made", "clean", "ending"),
     [
-        ("1" * 200, (30, 30), 30, Ending.FOUND),
-        ("-1" * 100, (30, 30), 60, Ending.FOUND),
-        ("0" + "1" * 199, (59, 60), 60, Ending.FOUND),
-        ("00000" + "1" * 195, (95, 100), 100, Ending.FOUND),
-        ("000000" + "1" * 194, (144, 150), 150, Ending.FOUND),
-        ("0" * 10 + "1" * 190, (190, 200), 200, Ending.FOUND),
-        ("-000" + "1" * 197, (97, 100), 101, Ending.FOUND),
-        ("1" * 20 + "0" * 180, (20, 41), 60, Ending.NOT_VERIFIED),
-        ("--1" * 67, (66, 66), 200, Ending.ALREADY_WRONG),
-        ("-1" * 10 + "-" * 180, (10, 10), 200, Ending.ALREADY_WRONG),
+        ("1" * 200, (30, 30), 30, Ending.FOUND), ("-1" * 100, (30, 30), 60, Ending.FOUND),
+        ("0" + "1" * 199, (59, 60), 60, Ending.FOUND), ("00000" + "1" * 195, (95, 100), 100, Ending.FOUND),
+        ("000000" + "1" * 194, (144, 150), 150, Ending.FOUND), ("0" * 10 + "1" * 190, (190, 200), 200, Ending.FOUND),
+        ("-000" + "1" * 197, (97, 100), 101, Ending.FOUND), ("1" * 20 + "0" * 180, (20, 41), 60, Ending.NOT_VERIFIED),
+        ("--1" * 67, (66, 66), 200, Ending.ALREADY_WRONG), ("-1" * 10 + "-" * 180, (10, 10), 200, Ending.ALREADY_WRONG),
     ],
-)
+)  # fmt: skip
 def test_trials_over_conditions_end_with_the_verdict(
     told: str, made: tuple[int, int], clean: int, ending: Ending
 ) -> None:

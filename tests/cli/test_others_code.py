@@ -109,12 +109,9 @@ IMPORTING = {
 """Commands that load what a run, a suite or a recipe names."""
 
 READING = {
-    "show": ["show theirs", "show stopped"],
-    "view": ["view theirs", "view swept --bundle site"],
-    "runs": ["runs"],
-    "report": ["report theirs swept --evidence"],
-    "export": ["export swept", "export kept --format 3db --out a"],
-}
+    "show": ["show theirs", "show stopped"], "view": ["view theirs", "view swept --bundle site"], "runs": ["runs"],
+    "report": ["report theirs swept --evidence"], "export": ["export swept", "export kept --format 3db --out a"],
+}  # fmt: skip
 """And those that look at them."""
 
 ALONE = (

@@ -95,13 +95,10 @@ def test_the_vertices_are_differentiable_in_the_level(scene: SceneDescription) -
 @pytest.mark.parametrize(
     "settings",
     [
-        {},
-        {"milk": [0, 0.3]},
-        {"water": 0.2},
-        {"coffee": [0.1, 0.6], "water": [0.3, 0.5], "milk": [0.0, 0.5]},
+        {}, {"milk": [0, 0.3]}, {"water": 0.2}, {"coffee": [0.1, 0.6], "water": [0.3, 0.5], "milk": [0.0, 0.5]},
         {"coffee": 0.25, "milk": [0.2, 0.4]},
     ],
-)
+)  # fmt: skip
 def test_proportions_add_up_to_one_within_their_ranges(scene: SceneDescription, settings: dict[str, object]) -> None:
     filled = bound(scene, **settings)
     generator = torch.Generator().manual_seed(0)

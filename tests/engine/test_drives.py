@@ -73,11 +73,9 @@ DRIVE: dict[str, Any] = {"controls": {"path": {"seconds": 4.0, "reach": 5.0}}, "
 @pytest.mark.parametrize(
     ("frames", "right", "gap", "flicker", "first"),
     [
-        ("00110", 0.4, 2.0, 0.5, 3.0),
-        ("00000", 0.0, 5.0, 0.0, None),
-        ("10001", 0.4, 3.0, 0.5, 5.0),
+        ("00110", 0.4, 2.0, 0.5, 3.0), ("00000", 0.0, 5.0, 0.0, None), ("10001", 0.4, 3.0, 0.5, 5.0),
     ],
-)
+)  # fmt: skip
 def test_rates_of_one_drive_are_those_worked_out_by_hand(
     frames: str, right: float, gap: float, flicker: float, first: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

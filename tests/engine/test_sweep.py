@@ -161,12 +161,11 @@ def test_a_draw_is_the_same_from_wherever_it_is_asked(sampler: str) -> None:
 @pytest.mark.parametrize(
     ("parameter", "given", "values"),
     [
-        (YAW, "0:360:24", [15.0 * k for k in range(24)]),
-        (YAW, "0:90:4", [0.0, 30.0, 60.0, 90.0]),
+        (YAW, "0:360:24", [15.0 * k for k in range(24)]), (YAW, "0:90:4", [0.0, 30.0, 60.0, 90.0]),
         (ELEVATION, "5:60:8", [float(v) for v in np.linspace(5, 60, 8)]),
         (ELEVATION, [np.int64(10), np.float64(30)], [10.0, 30.0]),
     ],
-)
+)  # fmt: skip
 def test_values_of_an_axis(parameter: Parameter, given: Any, values: list[float]) -> None:
     assert list(parse_axis_values("--grid x", parameter, given)) == values
 
@@ -354,13 +353,9 @@ def test_outputs_that_are_not_finite_are_counted_and_not_right() -> None:
 
 
 SURVIVES: dict[str, Any] = {
-    "grid": {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]},
-    "controls": {"camera": {"azimuth": [0, 90]}},
-    "samples": 3,
-    "batch": 4,
-    "trials": 6,
-    "environment": "studio,noon",
-}
+    "grid": {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]}, "controls": {"camera": {"azimuth": [0, 90]}},
+    "samples": 3, "batch": 4, "trials": 6, "environment": "studio,noon",
+}  # fmt: skip
 
 
 PICTURES, WHOLE = 2 * 6 * 3 * 3, 108 + 8 + 6 + 1

@@ -247,21 +247,11 @@ def load_threedb(path: Path) -> None:
 
 
 LOADERS: dict[str, Callable[[Path], object]] = {
-    "object": load_object,
-    "node": load_node,
-    "mitsuba": load_mitsuba,
-    "environment": load_environment,
-    "picture": load_picture,
-    "rig": load_rig,
-    "model": load_model,
-    "labels": load_labels,
-    "settings": load_settings,
-    "run": load_run,
-    **{f"whole {kind}": partial(load_whole_run, kind) for kind in ASKED},
-    "answer": load_answer,
-    "blend": load_blend,
-    "3db": load_threedb,
-}
+    "object": load_object, "node": load_node, "mitsuba": load_mitsuba, "environment": load_environment,
+    "picture": load_picture, "rig": load_rig, "model": load_model, "labels": load_labels, "settings": load_settings,
+    "run": load_run, **{f"whole {kind}": partial(load_whole_run, kind) for kind in ASKED}, "answer": load_answer,
+    "blend": load_blend, "3db": load_threedb,
+}  # fmt: skip
 """Each gets the path of a case's main file, and returns or raises an `AdvsearchError`."""
 
 

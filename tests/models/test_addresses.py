@@ -271,12 +271,11 @@ def test_the_key_is_in_no_message(server: Server, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [
-        ("http://host:port/", "expected an address"),
-        ("https://user:pass@host/", "would be stored with the run"),
+        ("http://host:port/", "expected an address"), ("https://user:pass@host/", "would be stored with the run"),
         ("https://host/?api_key=1", "`api_key` in the address"),
         ("http://localhost.example.org/", "would go there unencrypted"),
     ],
-)
+)  # fmt: skip
 def test_addresses_that_are_refused(spec: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(KEY, SECRET)
     with pytest.raises(InputError, match=expected):

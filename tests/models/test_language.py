@@ -16,6 +16,7 @@ import advsearch
 from advsearch.errors import ModelError
 from advsearch.models import Model, load_model
 from advsearch.models.zoo import transformers as own
+from small_models import loud
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -82,15 +83,6 @@ def qwen() -> tuple[Any, Any]:
         chat_template=TEMPLATE.replace("PICTURE", "<|vision_start|><|image_pad|><|vision_end|>"),
     )
     return transformers.Qwen2_5_VLForConditionalGeneration(qwen_config()), processor
-
-
-def loud(network: Any) -> Any:
-    """The network with random weights that are large enough for answers that differ, always the same."""
-    generator = torch.Generator().manual_seed(0)
-    for name, parameter in network.named_parameters():
-        if parameter.dim() > 1 or "embedding" in name:
-            parameter.data = torch.randn(parameter.shape, generator=generator) * 0.3
-    return network
 
 
 def published(folder: Path, made: tuple[Any, Any], dtype: torch.dtype = torch.float32) -> str:

@@ -177,12 +177,10 @@ def test_usual_containers_of_logits_are_opened(answer: Any) -> None:
     ("answer", "named"),
     [
         (lambda z: z[:, :, None, None], "task=segmentation"),
-        (lambda z: (z[:, :, None].expand(-1, -1, 4), z), "task=detection"),
-        (lambda z: z[0], "batch"),
-        (lambda z: z.argmax(1, keepdim=True).expand(-1, 3), "int64"),
-        (lambda z: z * float("nan"), "NaN"),
+        (lambda z: (z[:, :, None].expand(-1, -1, 4), z), "task=detection"), (lambda z: z[0], "batch"),
+        (lambda z: z.argmax(1, keepdim=True).expand(-1, 3), "int64"), (lambda z: z * float("nan"), "NaN"),
     ],
-)
+)  # fmt: skip
 def test_outputs_that_are_not_logits(answer: Any, named: str) -> None:
     with pytest.raises(ModelError, match=named):
         load_model(Answering(answer), input_size=8)
@@ -249,11 +247,10 @@ def test_label_sets_that_are_errors(text: str, message: str) -> None:
 @pytest.mark.parametrize(
     "name, text",
     [
-        ("a.json", '["mug", "bowl", "vase"]'),
-        ("b.json", '{"2": "vase", "0": "mug", "1": "bowl"}'),
+        ("a.json", '["mug", "bowl", "vase"]'), ("b.json", '{"2": "vase", "0": "mug", "1": "bowl"}'),
         ("c.txt", "mug\nbowl\r\nvase\n"),
     ],
-)
+)  # fmt: skip
 def test_label_files(tmp_path: Path, name: str, text: str) -> None:
     path = tmp_path / name
     path.write_text(text)

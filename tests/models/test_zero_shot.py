@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.models import Model, load_model
+from small_models import loud
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -39,15 +40,6 @@ def tokenizer() -> Any:
     )
     marks = dict(zip(("pad_token", "unk_token", "bos_token", "eos_token"), SPECIAL, strict=True))
     return transformers.PreTrainedTokenizerFast(tokenizer_object=words, model_max_length=12, **marks)
-
-
-def loud(network: Any) -> Any:
-    """The network with random weights that are large enough for answers that differ, always the same."""
-    generator = torch.Generator().manual_seed(0)
-    for name, parameter in network.named_parameters():
-        if parameter.dim() > 1 or "embedding" in name:
-            parameter.data = torch.randn(parameter.shape, generator=generator) * 0.3
-    return network
 
 
 def published(folder: Path, family: str = "CLIP", *, picture: dict[str, Any] | None = None) -> str:

@@ -29,10 +29,9 @@ REMOVABLE = [part for part in BUILT_INS if part.kind == "experiment" and part.na
 
 CORE_PARTS = {
     "control": "pose camera texture material light environment geometry",
-    "policy": "random grid pgd adam cmaes nes auto sobol restarts portfolio",
-    "task": "classification detection",
+    "policy": "random grid pgd adam cmaes nes auto sobol restarts portfolio", "task": "classification detection",
     "reader": "obj ply stl gltf glb vrm",
-}
+}  # fmt: skip
 
 
 def copy_package(folder: Path, without: tuple[str, ...] = ()) -> None:

@@ -373,11 +373,9 @@ def test_a_run_that_links_elsewhere_changes_nothing_there(name: str, run: Path, 
 @pytest.mark.parametrize(
     "change",
     [
-        "u = 3",
-        "gradient = x'010203'",
-        "picture = x'01', height = 1",
+        "u = 3", "gradient = x'010203'", "picture = x'01', height = 1",
     ],
-)
+)  # fmt: skip
 def test_what_a_search_was_told_is_checked(change: str, tmp_path: Path) -> None:
     path = tmp_path / "results.sqlite"
     with Store(path) as store:

@@ -335,10 +335,9 @@ def test_a_pixel_between_two_depths_is_hidden_by_its_part() -> None:
     """Two of four points of the object are hidden, and one of the two of the ground in the next pixel."""
     infinite = math.inf
     surfaces = SimpleNamespace(
-        names=("ground", "object"),
-        z_depth=torch.tensor([[2.0, 2.0, 3.0, infinite], [2.0, 2.0, 3.0, infinite]]),
+        names=("ground", "object"), z_depth=torch.tensor([[2.0, 2.0, 3.0, infinite], [2.0, 2.0, 3.0, infinite]]),
         visible_mask=lambda name: torch.tensor([[False, False, True, False]] * 2),
-    )
+    )  # fmt: skip
     depth = torch.tensor([[1.0, infinite, 1.0, 1.0], [1.0, 1.99, 2.98, 1.0]])
     front = compute_front(surfaces, depth, 2, 1)  # type: ignore[arg-type]
     # the second pixel has no point of the object, and the first none of the ground

@@ -13,11 +13,10 @@ from advsearch.scene.importing.objects import import_object
 @pytest.mark.parametrize(
     ("ending", "what", "do"),
     [
-        (".splat", "Gaussian splats", "fuse_post.ply"),
-        (".fbx", "an FBX model", "bpy.ops.import_scene.fbx"),
+        (".splat", "Gaussian splats", "fuse_post.ply"), (".fbx", "an FBX model", "bpy.ops.import_scene.fbx"),
         (".DAE", "a COLLADA model", "assimp export 'my thing.DAE' 'my thing.obj'"),
     ],
-)
+)  # fmt: skip
 def test_it_says_what_the_file_is_and_then_what_to_do(ending: str, what: str, do: str, tmp_path: Path) -> None:
     path = tmp_path / f"my thing{ending}"
     path.write_bytes(b"anything")

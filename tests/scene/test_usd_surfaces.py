@@ -150,14 +150,11 @@ def test_each_texture_is_looked_up_by_its_own_reader(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("levels", "space", "expected"),
     [
-        ([[[188, 100, 50]]], "raw", np.array([188, 100, 50]) / 255),
-        ([[[188, 100, 50]]], "sRGB", COLOR_OF_188),
-        ([[[188, 100, 50]]], "auto", COLOR_OF_188),
-        ([[[188, 100, 50, 255]]], "auto", COLOR_OF_188),
-        ([[188]], "auto", np.full(3, 188 / 255)),
-        ([[188]], "sRGB", srgb_to_linear(np.full(3, 188 / 255, np.float32))),
+        ([[[188, 100, 50]]], "raw", np.array([188, 100, 50]) / 255), ([[[188, 100, 50]]], "sRGB", COLOR_OF_188),
+        ([[[188, 100, 50]]], "auto", COLOR_OF_188), ([[[188, 100, 50, 255]]], "auto", COLOR_OF_188),
+        ([[188]], "auto", np.full(3, 188 / 255)), ([[188]], "sRGB", srgb_to_linear(np.full(3, 188 / 255, np.float32))),
     ],
-)
+)  # fmt: skip
 def test_color_spaces(tmp_path: Path, levels: object, space: str, expected: np.ndarray) -> None:
     save(tmp_path / "a.png", levels)
     more = f'token inputs:sourceColorSpace = "{space}"'

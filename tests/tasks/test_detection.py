@@ -72,12 +72,10 @@ class Output:
 @pytest.mark.parametrize(
     "answer",
     [
-        (BOXES, SCORES),
-        {"boxes": BOXES, "scores": SCORES},
-        Output(boxes=BOXES, scores=SCORES),
+        (BOXES, SCORES), {"boxes": BOXES, "scores": SCORES}, Output(boxes=BOXES, scores=SCORES),
         [{"boxes": BOXES[k], "scores": SCORES[k]} for k in range(2)],
     ],
-)
+)  # fmt: skip
 def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
     found = read_detections(answer, 2)
     assert [sorted(one) for one in found] == [["boxes", "scores"]] * 2
@@ -88,11 +86,10 @@ def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
 @pytest.mark.parametrize(
     "answer",
     [
-        (BOXES, ONE, LABELS),
-        {"boxes": BOXES, "labels": LABELS, "scores": ONE},
+        (BOXES, ONE, LABELS), {"boxes": BOXES, "labels": LABELS, "scores": ONE},
         [(BOXES[k], LABELS[k], ONE[k]) for k in range(2)],
     ],
-)
+)  # fmt: skip
 def test_one_label_a_box_is_read_in_every_form(answer: Any) -> None:
     for k, one in enumerate(read_detections(answer, 2)):
         assert one["boxes"].equal(BOXES[k]) and one["labels"].equal(LABELS[k]) and one["scores"].equal(ONE[k])
@@ -101,11 +98,10 @@ def test_one_label_a_box_is_read_in_every_form(answer: Any) -> None:
 @pytest.mark.parametrize(
     ("answer", "text"),
     [
-        ((BOXES, SCORES[:1]), "expected boxes"),
-        ((BOXES[..., :3], SCORES), "expected boxes"),
+        ((BOXES, SCORES[:1]), "expected boxes"), ((BOXES[..., :3], SCORES), "expected boxes"),
         ((BOXES, 3.0 * SCORES - 1.0), r"probabilities in \[0, 1\]; apply a sigmoid"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_detection_is_refused(answer: Any, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         read_detections(answer, 2)

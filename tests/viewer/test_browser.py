@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 import threading
 from collections.abc import Callable, Iterator
@@ -377,6 +378,7 @@ def test_everybody_can_use_the_pages_of_results(browser: Browser, tmp_path: Path
         Image.new("RGB", (700, 40)).save(tmp_path / "images" / name)
     with opened(browser, write_page(tmp_path, result).as_uri(), 390, bypass_csp=True, color_scheme="light") as page:
         assert faults(page) == []
+        assert not re.search(r"\bNone\b|\bnan\b", page.inner_text("body"))
         page.emulate_media(color_scheme="dark")
         assert faults(page) == []
         page.set_viewport_size({"width": 1440, "height": 900})

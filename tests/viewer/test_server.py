@@ -108,12 +108,10 @@ def test_a_picture_that_is_a_link_is_none(server: Dashboard, run: Path, tmp_path
 @pytest.mark.parametrize(
     "headers",
     [
-        {"Host": "evil.example"},
-        {"Host": ""},
-        {"Origin": "http://evil.example"},
+        {"Host": "evil.example"}, {"Host": ""}, {"Origin": "http://evil.example"},
         {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors"},
     ],
-)
+)  # fmt: skip
 def test_another_sites_page_reads_nothing(server: Dashboard, headers: dict[str, str]) -> None:
     answer, data = ask(server, "/runs/first/rows", **headers)
     assert answer.status == 403
