@@ -380,8 +380,7 @@ def evaluations(name: str, curvatures: Sequence[float], scale: float) -> float:
 @pytest.mark.medium
 @pytest.mark.parametrize("name", ["pgd", "adam"])
 @pytest.mark.parametrize(
-    ("curvatures", "scale"),
-    [([RATIO, 1.0], 1.0), ([1.0, RATIO], 1.0), ([1.0, 1.0], RATIO), ([1.0, 1.0], 1.0 / RATIO)],
+    ("curvatures", "scale"), [([RATIO, 1.0], 1.0), ([1.0, RATIO], 1.0), ([1.0, 1.0], RATIO), ([1.0, 1.0], 1.0 / RATIO)]
 )
 def test_curvatures_and_derivatives_that_differ_by_a_million_take_no_more_evaluations(
     name: str, curvatures: list[float], scale: float

@@ -553,10 +553,7 @@ def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [
-        ({"trials": 0}, "trials: expected at least 1, got 0"),
-        ({"spp": 0}, "verify_spp: expected at least 1, got 0"),
-    ],
+    [({"trials": 0}, "trials: expected at least 1, got 0"), ({"spp": 0}, "verify_spp: expected at least 1, got 0")],
 )
 def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> None:
     with pytest.raises(InputError, match=message):

@@ -108,8 +108,7 @@ def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_sam
 
 @pytest.mark.medium
 @pytest.mark.parametrize(
-    ("grid", "samples"),
-    [({}, 3), ({"path.time": [0, 4, 2], "pose.yaw": [0, 90]}, 1), ({"pose.yaw": [0, 90]}, 3)],
+    ("grid", "samples"), [({}, 3), ({"path.time": [0, 4, 2], "pose.yaw": [0, 90]}, 1), ({"pose.yaw": [0, 90]}, 3)]
 )
 def test_frames_of_a_drive_share_their_draws_and_drives_do_not(grid: dict[str, Any], samples: int) -> None:
     result = advsearch.sweep(

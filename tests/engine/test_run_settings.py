@@ -20,13 +20,7 @@ def settings(controls: Any, **options: Any) -> dict[str, dict[str, object]]:
     return {one.name: one.to_settings() for one in make_configured_controls(config, config.controls)}
 
 
-@pytest.mark.parametrize(
-    ("asked", "name"),
-    [
-        ("texture", "texture"),
-        ("texture.texels:label", "texture:label"),
-    ],
-)
+@pytest.mark.parametrize(("asked", "name"), [("texture", "texture"), ("texture.texels:label", "texture:label")])
 def test_a_control_takes_the_settings_of_the_run_whatever_its_name(asked: str, name: str) -> None:
     found = settings({asked: {}}, **ALL)[name]
     assert (found["epsilon"], found["norm"], found["resolution"]) == (0.07, "l2", 16)

@@ -107,10 +107,7 @@ QUESTIONS = (
     ("show", "{run}"), ("show", "{run}", "--json"), ("report", "{run}", "--evidence", "--out", "made/report"),
     ("view", "{run}", "--bundle", "made/site"),
 )  # fmt: skip
-EXPORTS = (
-    ("export", "{run}", "--out", "made/rows.csv"),
-    ("export", "{run}", "--out", "made/rows.json"),
-)
+EXPORTS = (("export", "{run}", "--out", "made/rows.csv"), ("export", "{run}", "--out", "made/rows.json"))
 OF_SWEEPS = (
     ("export", "{run}", "--format", "3db", "--out", "made/3db"),
     ("compare", "{run}", "../honest/sweep", "--run", "made/compare", "--pictures", "2"),

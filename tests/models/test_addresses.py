@@ -174,7 +174,6 @@ def test_a_busy_server_is_asked_again(server: Server, status: int) -> None:
         ((200, {}, b"[" * 100_000), "expected JSON", 1),
         ((200, {}, b'{"scores": {"mug": NaN}}'), "expected JSON", 1),
         ((200, {}, b'{"text": "' + b"a" * (2 << 20)), "an answer of at most 1,048,576 bytes, got a longer one", 1),
-        
     ],
 )  # fmt: skip
 def test_what_cannot_be_read_ends_in_a_sentence(server: Server, reply: Reply, expected: str, calls: int | None) -> None:

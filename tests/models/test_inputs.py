@@ -67,10 +67,7 @@ def sized_onnx(folder: Path, name: str = "orig_target_sizes") -> Path:
         onnx_files.integers("column", -1, 1), onnx_files.integers("one", 1),
         onnx_files.floats("part", [0.0, 0.0, 0.5, 1.0], (1, 1, 4)),
     ]  # fmt: skip
-    inputs = [
-        onnx_files.value("images", ["N", 3, HEIGHT, WIDTH]),
-        onnx_files.value(name, ["N", 2], onnx_files.INT64),
-    ]
+    inputs = [onnx_files.value("images", ["N", 3, HEIGHT, WIDTH]), onnx_files.value(name, ["N", 2], onnx_files.INT64)]
     outputs = [
         onnx_files.value("labels", ["N", 1], onnx_files.INT64), onnx_files.value("boxes", ["N", 1, 4]),
         onnx_files.value("scores", ["N", 1]),

@@ -54,11 +54,7 @@ def setting(count: int, estimator: str = "independent") -> SampleSetting:
 
 
 def measured(
-    reference: ReferenceValue,
-    *,
-    bias: float = 0.0,
-    power: float = -0.5,
-    estimator: str = "independent",
+    reference: ReferenceValue, *, bias: float = 0.0, power: float = -0.5, estimator: str = "independent"
 ) -> list[PrecisionPoint]:
     """Points of synthetic noise; a sample takes a millisecond."""
     points = []

@@ -62,10 +62,7 @@ def test_two_parameters_that_matter_only_together_are_told_as_two_rules() -> Non
     assert (
         {one.factor for one in first.conditions}
         == {one.factor for one in second.conditions}
-        == {
-            "pose.yaw",
-            "camera.distance",
-        }
+        == {"pose.yaw", "camera.distance"}
     )
     under_first, under_second = (find_covered(rule.conditions, planted("red")) for rule in (first, second))
     assert (under_first & under_second).mean() <= 0.03

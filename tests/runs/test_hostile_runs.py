@@ -121,10 +121,7 @@ def test_damaged_results_are_named(case: str, run: Path, capsys: pytest.CaptureF
         list(opened.store.rows())
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["", "[]", "{", "[" * 100_000, '{"a": ' + "9" * 6000 + "}", "\0", '{"ending": NaN'],
-)
+@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"a": ' + "9" * 6000 + "}", "\0", '{"ending": NaN'])
 def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "summary.json").write_text(text)
     for command in ("show", "resume"):
@@ -218,13 +215,7 @@ def test_a_link_in_a_run_is_followed_by_nobody(
     link.unlink(missing_ok=True)
     how(link, outside)
     commands = [["show", "it"], ["export", "it"], ["view", "it"], ["view", "it", "--bundle", "site"], ["resume", "it"]]
-    for command in [
-        *commands,
-        ["report", "it", "--evidence"],
-        ["replay", "it"],
-        ["compare", "it"],
-        ["explain", "it"],
-    ]:
+    for command in [*commands, ["report", "it", "--evidence"], ["replay", "it"], ["compare", "it"], ["explain", "it"]]:
         assert main(command) == 2, command
         assert "got a link; remove it" in capsys.readouterr().err.splitlines()[-1], command
     assert "got a link; remove it" in read_listed_run(run).fault

@@ -207,9 +207,9 @@ def ask_as(server: Dashboard, host: str) -> tuple[HTTPResponse, bytes]:
 @pytest.mark.parametrize(
     "path",
     [
-        "/",  "/runs/first/rows",  "/runs/none/align/renderings/3",
+        "/", "/runs/first/rows", "/runs/none/align/renderings/3",
         "/runs/first/align/renderings/99", "/runs/first/align/renderings/..%2f..%2frun.yaml",
-         "/runs/..%2f..%2fetc/align/renderings/3", 
+        "/runs/..%2f..%2fetc/align/renderings/3",
     ],
 )  # fmt: skip
 def test_a_photograph_goes_nowhere_else(server: Dashboard, run: Path, path: str) -> None:

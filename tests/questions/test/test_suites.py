@@ -109,11 +109,7 @@ def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tu
 
 
 @pytest.mark.parametrize(
-    ("asked", "needed"),
-    [
-        (claim("right", at_least=0.99), 426),
-        (claim("no_worse", than=HARD, points=5, pictures=6), 7),
-    ],
+    ("asked", "needed"), [(claim("right", at_least=0.99), 426), (claim("no_worse", than=HARD, points=5, pictures=6), 7)]
 )
 def test_a_claim_that_its_pictures_cannot_decide_is_refused_before_any_is_made(
     asked: dict[str, Any], needed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -303,10 +299,7 @@ def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
         ({"claims": {"a": {**GOOD, "at_least": 95}}}, "claims.a.at_least"),
         ({"claims": {"a": {"claim": "right", "atleast": 0.9}}}, "claims.a.atleast"),
         ({"claims": {"a": claim("right", {"camra": {}}, at_least=0.9)}}, "camra"),
-        (
-            {"claims": {"a": {"claim": "not_broken", "at_least": 0.9}}},
-            r"a claim of this kind has no at_least",
-        ),
+        ({"claims": {"a": {"claim": "not_broken", "at_least": 0.9}}}, r"a claim of this kind has no at_least"),
         ({"claims": {"a": {"claim": "no_worse", "points": 3}}}, "a.than"),
         ({"claims": {"A b": GOOD}}, "claims: expected names"),
         ({"claims": {"a": claim("no_worse", than="nonesuch", points=3)}}, "nonesuch"),
