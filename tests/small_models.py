@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +102,17 @@ def loud(network: Any) -> Any:
 def levels(one: Tensor, other: Tensor) -> float:
     """Root mean square difference of two pictures in levels of 255."""
     return 255.0 * float(((one - other) ** 2).mean().sqrt())
+
+
+def assert_slope(value: Callable[[Tensor], Tensor], at: Tensor, way: Tensor, step: float, rel: float) -> float:
+    """Compare a scalar's derivative along a direction, relative, with its central difference, which is returned."""
+    at = at.detach().requires_grad_()
+    (slope,) = torch.autograd.grad(value(at), at)
+    with torch.no_grad():
+        seen = float(value(at + step * way) - value(at - step * way)) / (2.0 * step)
+    found = float((slope * way).sum())
+    assert abs(found - seen) <= rel * abs(seen), (found, seen)
+    return seen
 
 
 def save_exported(network: nn.Module, path: Path | str) -> None:

@@ -463,6 +463,9 @@ NOISE = np.random.default_rng(0).bytes(3000)
 BAD: dict[str, Callable[[Path], Path]] = {
     "directory": lambda folder: folder,
     "missing": lambda folder: folder / "no.obj",
+    "splats": raw("my thing.splat", b"anything"),
+    "fbx": raw("my thing.fbx", b"anything"),
+    "collada": raw("my thing.DAE", b"anything"),
     "empty": raw("thing.ply", b""),
     "ending": raw("thing.thing", b"x"),
     "png as obj": raw("thing.obj", png()),
