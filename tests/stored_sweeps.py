@@ -19,12 +19,18 @@ from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import make_table
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import Row
+from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer import thumbnails
 from advsearch.viewer.server import Dashboard
 from samples import sweep
 
 YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
+
+
+def rows_of(run: Path) -> list[Row]:
+    """The rows of a sweep, as its store has them."""
+    with Store(run / NAME, read_only=True) as store:
+        return list(store.rows("sweep"))
 
 
 def described(value: float | str, unit: str = "") -> Value:

@@ -123,14 +123,10 @@ def test_a_name_that_leads_here_is_refused_with_the_right_port(server: Dashboard
     assert ask(server, "/", Host=f"localhost:{server.server_port}")[0].status == 200
 
 
-@pytest.mark.parametrize("method", ["PUT", "DELETE", "OPTIONS", "CONNECT"])
-def test_nothing_is_changed(server: Dashboard, method: str) -> None:
-    assert ask(server, "/", method)[0].status == 501
-
-
-def test_only_photographs_are_sent(server: Dashboard) -> None:
-    assert ask(server, "/", "POST")[0].status == 404
-    assert ask(server, "/runs/first/rows", "POST")[0].status == 404
+def test_nothing_is_changed_and_only_photographs_are_sent(server: Dashboard) -> None:
+    for method in ("PUT", "DELETE", "OPTIONS", "CONNECT"):
+        assert ask(server, "/", method)[0].status == 501, method
+    assert ask(server, "/", "POST")[0].status == ask(server, "/runs/first/rows", "POST")[0].status == 404
 
 
 def test_beyond_this_machine_the_token_is_asked_for(run: Path) -> None:
