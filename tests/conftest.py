@@ -16,10 +16,13 @@ from collections import defaultdict
 from collections.abc import Generator, Iterator
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from PIL import Image
+
+if TYPE_CHECKING:
+    from advsearch.scene.description import SceneDescription
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -64,6 +67,14 @@ def empty_charts(request: pytest.FixtureRequest) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Figure, "savefig", save)
         yield
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    """The bundled mug by itself; files that need another scene have a fixture of this name of their own."""
+    from advsearch.scene.description import load_description
+
+    return load_description("mug")
 
 
 @pytest.fixture(scope="session")

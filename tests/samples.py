@@ -76,13 +76,8 @@ SWEEP: dict[str, Any] = {
     "sampler": None, "spp": 16, "renders": {"sweep": 8, "verification": 0}, "renders_per_second": None,
 }  # fmt: skip
 STUDY: dict[str, Any] = {
-    **RUN,
-    "schema": 1,
-    "model": "reference",
-    "task": "classification",
-    "policy": "auto",
-    "parts": ["a"],
-}
+    **RUN, "schema": 1, "model": "reference", "task": "classification", "policy": "auto", "parts": ["a"],
+}  # fmt: skip
 CURVE: dict[str, Any] = {
     **STUDY, "command": "attack", "run": "runs/mug-texture-001", "objects": ["mug", "bowl"], "controls": ["texture"],
     "epsilons": [0.01, 0.1],

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 import advsearch
 from advsearch import Model
+
+if TYPE_CHECKING:
+    import pytest
 
 SIDE = 32
 
@@ -82,6 +88,47 @@ class Blue(nn.Module):
         band = (x[:, 2] - x[:, 0])[:, 15 * side // 32 : 21 * side // 32, side // 4 : 22 * side // 32]
         mug = 40.0 * (band.mean(dim=(1, 2)) - self.threshold)
         return torch.stack([-mug - 9.0, -mug, mug] if self.last else [mug, -mug], dim=1)
+
+
+def loud(network: Any) -> Any:
+    """The network with random weights that are large enough for answers that differ, always the same."""
+    generator = torch.Generator().manual_seed(0)
+    for name, parameter in network.named_parameters():
+        if parameter.dim() > 1 or "embedding" in name:
+            parameter.data = torch.randn(parameter.shape, generator=generator) * 0.3
+    return network
+
+
+def levels(one: Tensor, other: Tensor) -> float:
+    """Root mean square difference of two pictures in levels of 255."""
+    return 255.0 * float(((one - other) ** 2).mean().sqrt())
+
+
+def assert_slope(value: Callable[[Tensor], Tensor], at: Tensor, way: Tensor, step: float, rel: float) -> float:
+    """Compare a scalar's derivative along a direction, relative, with its central difference, which is returned."""
+    at = at.detach().requires_grad_()
+    (slope,) = torch.autograd.grad(value(at), at)
+    with torch.no_grad():
+        seen = float(value(at + step * way) - value(at - step * way)) / (2.0 * step)
+    found = float((slope * way).sum())
+    assert abs(found - seen) <= rel * abs(seen), (found, seen)
+    return seen
+
+
+def save_exported(network: nn.Module, path: Path | str) -> None:
+    """Write a network of pictures of `SIDE` as an exported program that takes any batch up to 64."""
+    batch = {0: torch.export.Dim("batch", min=1, max=64)}
+    program = torch.export.export(network.eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
+    torch.export.save(program, path)
+
+
+def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
+    """Type a command, and return what it prints, as JSON."""
+    from advsearch.cli.main import main  # late: networks are loaded without the command line
+
+    assert main(list(command)) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
 
 
 def easy() -> Model:

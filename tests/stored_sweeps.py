@@ -19,12 +19,18 @@ from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import make_table
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import Row
+from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer import thumbnails
 from advsearch.viewer.server import Dashboard
 from samples import sweep
 
 YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
+
+
+def rows_of(run: Path) -> list[Row]:
+    """The rows of a sweep, as its store has them."""
+    with Store(run / NAME, read_only=True) as store:
+        return list(store.rows("sweep"))
 
 
 def described(value: float | str, unit: str = "") -> Value:
@@ -50,12 +56,10 @@ def make_sweep(
         for step, (environment, yaw, elevation, power) in enumerate(points):
             wrong = environment == "noon" and elevation > 30
             values: dict[str, Value] = {
-                "environment": described(environment),
-                "model": described("reference"),
-                "pose.yaw": described(yaw, "degrees"),
-                "camera.elevation": described(elevation, "degrees"),
+                "environment": described(environment), "model": described("reference"),
+                "pose.yaw": described(yaw, "degrees"), "camera.elevation": described(elevation, "degrees"),
                 "light.power": described(power + step / 1000, "1"),
-            }
+            }  # fmt: skip
             rows.append(
                 Row("sweep", step, correct=not wrong, margin=-2.0 - step / 100 if wrong else 3.0, probability=0.9,
                     label="cup" if wrong else label, values=values, payload=payload)
@@ -67,11 +71,8 @@ def make_sweep(
         if ended:
             right = sum(bool(one.correct) for one in rows)
             counts = {
-                "configurations": len(rows),
-                "correct": right,
-                "accuracy": right / len(rows),
-                "interval": (0.5, 0.9),
-            }
+                "configurations": len(rows), "correct": right, "accuracy": right / len(rows), "interval": (0.5, 0.9),
+            }  # fmt: skip
             axis = {"axis": "pose.yaw", "unit": "degrees", "value": 45.0, **counts}
             summary = sweep(**counts, planned=len(rows), run=str(path), **{"axes": [axis], **summarised})
             run.write_summary(summary)

@@ -24,23 +24,9 @@ PACKAGE = ROOT / "advsearch"
 
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
 COMMON = {
-    "calls",
-    "catalog",
-    "copies",
-    "distributions",
-    "described",
-    "errors",
-    "files",
-    "interrupts",
-    "options",
-    "pictures",
-    "registry",
-    "seeds",
-    "threads",
-    "progress",
-    "trust",
-    "version",
-}
+    "calls", "catalog", "copies", "distributions", "described", "errors", "files", "interrupts", "options", "pictures",
+    "registry", "seeds", "threads", "progress", "trust", "version",
+}  # fmt: skip
 """Small modules, and the room of guards, that anyone may import and that import nobody but each other."""
 
 
@@ -110,13 +96,9 @@ BROUGHT_ALONG = {"drjit": "mitsuba", "typing_extensions": "pydantic"}
 pydantic's classes are written with its own typing_extensions."""
 
 OPTIONAL = {
-    "pyarrow": "parquet",
-    "textual_image": "terminal",
-    "distributed": "dask",
-    "dask": "dask",
-    "ribs": "archive",
+    "pyarrow": "parquet", "textual_image": "terminal", "distributed": "dask", "dask": "dask", "ribs": "archive",
     "shtab": "completion",
-}
+}  # fmt: skip
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 
@@ -312,8 +294,6 @@ def _imports(statement: ast.stmt, package: str) -> bool:
     return any(_imports(one, package) for one in inner)  # type: ignore[arg-type]
 
 
-# -- what is heavy ---------------------------------------------------------------------------------------------------
-
 LATE = ("torch", "mitsuba", "drjit", "scipy", "matplotlib", "pandas", "pyarrow")
 SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
 
@@ -352,9 +332,6 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
     assert done.stdout == "[]\n"
 
 
-# -- what is shipped -------------------------------------------------------------------------------------------------
-
-
 @cache
 def setup_cfg() -> configparser.ConfigParser:
     parser = configparser.ConfigParser()
@@ -382,9 +359,6 @@ def test_every_data_file_is_listed_as_package_data() -> None:
             name = path.relative_to(folder).as_posix()
             shipped = any(fnmatch.fnmatch(name, pattern.replace("**/", "*")) for pattern in patterns[package])
             assert shipped or path.is_dir(), f"{name} matches none of {package}'s patterns"
-
-
-# -- what is pinned --------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -424,9 +398,6 @@ def test_what_the_dependencies_need_is_pinned_too() -> None:
                 wanted.add(canonicalize_name(one.name))
     cuda = {name for name in seen if name.startswith(("nvidia-", "cuda-")) or name == "triton"}
     assert seen - cuda - set(pins()) == set()
-
-
-# -- what must not be in the repository ------------------------------------------------------------------------------
 
 
 def repository_files() -> list[Path]:

@@ -197,16 +197,11 @@ def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> No
 @pytest.mark.parametrize(
     "line",
     [
-        "--epsilon ''",
-        "--epsilon 1e308",
-        "--epsilon 0.1,0.10",
-        "--epsilon texture=0.1,texture=0.2",
-        "--control pose --control pose",
-        "--over camera --over 'camera={fov: 30}'",
-        "--estimator adjoint --estimator differences",
-        "--over 'camera={azimuth: [0, .inf]}'",
+        "--epsilon ''", "--epsilon 1e308", "--epsilon 0.1,0.10", "--epsilon texture=0.1,texture=0.2",
+        "--control pose --control pose", "--over camera --over 'camera={fov: 30}'",
+        "--estimator adjoint --estimator differences", "--over 'camera={azimuth: [0, .inf]}'",
     ],
-)
+)  # fmt: skip
 def test_slips_on_the_command_line_are_refused(line: str) -> None:
     with pytest.raises(InputError) as error:
         of_command_line(f"advsearch attack --object mug {line}")
@@ -284,15 +279,11 @@ def test_any_values_go_round(
 @pytest.mark.parametrize(
     ("content", "name"),
     [
-        (None, r"study\.yaml"),
-        (b"- a\n", r"study\.yaml"),
-        (b"a: [1,\n", r"study\.yaml"),
-        (b"schema: 7\nobject: mug\n", r"study\.yaml"),
-        (b"object: mug\nset:\n  a: .inf\n", r"study\.yaml: set"),
-        (b"objekt: mug\n", "'objekt'"),
-        (b"\xff\xfe\x00", r"study\.yaml"),
+        (None, r"study\.yaml"), (b"- a\n", r"study\.yaml"), (b"a: [1,\n", r"study\.yaml"),
+        (b"schema: 7\nobject: mug\n", r"study\.yaml"), (b"object: mug\nset:\n  a: .inf\n", r"study\.yaml: set"),
+        (b"objekt: mug\n", "'objekt'"), (b"\xff\xfe\x00", r"study\.yaml"),
     ],
-)
+)  # fmt: skip
 def test_a_bad_file_is_named(tmp_path: Path, content: bytes | None, name: str) -> None:
     path = tmp_path / "study.yaml"
     if content is not None:

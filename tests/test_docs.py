@@ -57,9 +57,6 @@ every_page_with = {
 }
 
 
-# ---- examples -------------------------------------------------------------------------------------------------------
-
-
 def lines(page: Path) -> list[list[str]]:
     """Return the words of every command in a page's shell blocks."""
     joined = (line for block in blocks(page, "sh") for line in block.replace("\\\n", " ").splitlines())

@@ -110,9 +110,6 @@ def test_the_smallest_change_counts_what_it_says() -> None:
     assert progress.named("trying smaller changes")[0].done > 6
 
 
-# ---- with the renderer ----------------------------------------------------------------------------------------------
-
-
 FEW: dict[str, Any] = {"object": "mug", "resolution": 16, "threads": 1}
 SMALL: dict[str, Any] = {**FEW, "spp": 1}
 
@@ -136,9 +133,6 @@ def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, confi
     progress.check()
     hints = [format_as_flags(one.hint) for one in progress.stages]
     assert any("--" in one for one in hints) and not any("`" in one for one in hints)
-
-
-# ---- what is stored is not rendered again ---------------------------------------------------------------------------
 
 
 @pytest.mark.medium

@@ -12,6 +12,8 @@ import pytest
 
 from advsearch.attacks.verification import WORST_CASE
 
+pytestmark = pytest.mark.slow
+
 SMALL = ["--resolution", "96", "--steps", "8", "--verify-spp", "8"]
 CASES = {
     "small mug": ("mug.obj", "comfy_cafe_1k.hdr", "coffee mug,cup", 0.06, SMALL),
@@ -51,7 +53,6 @@ TASKS = {
 """By name: object, task, model, right answer, more flags, control."""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", TASKS)
 def test_a_real_detector_and_a_real_segmenter_are_fooled(case: str, real_data: Path, tmp_path: Path) -> None:
     thing, task, model, label, flags, control = TASKS[case]
@@ -70,7 +71,6 @@ def test_a_real_detector_and_a_real_segmenter_are_fooled(case: str, real_data: P
 
 
 @pytest.mark.medium
-@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_real_object_is_fooled_and_verified(case: str, real_data: Path, tmp_path: Path) -> None:
     summary = attack(real_data, tmp_path / case, case)

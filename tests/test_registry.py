@@ -50,11 +50,10 @@ def test_own_entries_come_first_and_win_and_those_of_the_catalog_are_imported(mo
 @pytest.mark.parametrize(
     ("entry", "complaint"),
     [
-        ("two", "expected a number"),
-        (ImportError("no module x"), r"cannot be imported \(no module x\)"),
+        ("two", "expected a number"), (ImportError("no module x"), r"cannot be imported \(no module x\)"),
         (RuntimeError("too old"), r"cannot be imported \(too old\)"),
     ],
-)
+)  # fmt: skip
 def test_an_entry_that_does_not_fit_is_named_with_its_package(
     monkeypatch: pytest.MonkeyPatch, entry: Any, complaint: str
 ) -> None:
@@ -64,9 +63,6 @@ def test_an_entry_that_does_not_fit_is_named_with_its_package(
     assert list(numbers) == ["one", "mod", "two", "three"] and numbers["three"] == 3  # it disturbs no other
     assert [*numbers.list_usable()] == ["one", "mod", "three"]
     assert numbers.get_help("two").endswith("repair or uninstall the package that declares it.")
-
-
-# ---- a package from the pages ---------------------------------------------------------------------------------------
 
 
 def blocks(page: str, language: str) -> list[str]:

@@ -7,32 +7,20 @@ import shlex
 from pathlib import Path
 
 import pytest
-import torch
 from check_docs import DOCS, blocks
 
 from advsearch.cli.main import main
-from small_models import SIDE, Finder
+from small_models import Finder, save_exported
 
 PAGE = DOCS / "your-detector.md"
 NETWORK = "torchvision:ssdlite320_mobilenet_v3_large"
 SMALL = {
     "render": ["--spp", "2", "--denoise", "none"],
     "attack": [
-        "--spp",
-        "2",
-        "--verify-spp",
-        "2",
-        "--trials",
-        "6",
-        "--steps",
-        "6",
-        "--denoise",
-        "none",
-        "--measure",
-        "no",
+        "--spp", "2", "--verify-spp", "2", "--trials", "6", "--steps", "6", "--denoise", "none", "--measure", "no",
     ],
     "sweep": ["--samples", "12", "--spp", "2", "--denoise", "none", "--trials", "0"],
-}
+}  # fmt: skip
 
 
 @pytest.mark.docs
@@ -40,9 +28,7 @@ def test_the_steps_can_be_typed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    batch = {0: torch.export.Dim("batch", min=1, max=64)}
-    program = torch.export.export(Finder().eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
-    torch.export.save(program, "net.pt2")
+    save_exported(Finder(), "net.pt2")
     Path("labels.json").write_text(json.dumps(["cup", "bowl", "dog"]), "utf-8")
     commands = [shlex.split(line) for block in blocks(PAGE, "sh") for line in block.splitlines()]
     assert [command[1] for command in commands] == ["render", "attack", "sweep", "export"]

@@ -115,11 +115,7 @@ def test_render_runs_in_ordinary_autograd(scene: advsearch.Scene, level: float) 
 
 @pytest.mark.medium
 def test_a_stopped_run_goes_on_where_it_was(
-    whole: advsearch.AttackResult,
-    scene: advsearch.Scene,
-    level: float,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    whole: advsearch.AttackResult, scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
         interrupted(patch, 3)

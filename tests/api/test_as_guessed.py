@@ -59,9 +59,6 @@ def attacked(scene: advsearch.Scene, model: advsearch.Model, tmp_path_factory: p
     return advsearch.attack(scene, model, controls="texture", epsilon=1.0, run=run, metrics={"red": red}, **FAST)
 
 
-# ---- a run from its folder ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_an_attack_comes_back_from_its_folder(attacked: AttackResult) -> None:
     assert attacked.run is not None
@@ -95,9 +92,6 @@ def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.
         advsearch.load_run(tmp_path / "region")
 
 
-# ---- an answer elsewhere --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_an_adversarial_scene_is_rendered_under_another_view(attacked: AttackResult) -> None:
     same, turned = attacked.render(spp=64), attacked.render(settings={"camera.azimuth": 200.0}, spp=64)
@@ -122,9 +116,6 @@ def test_a_result_is_replayed_with_the_network_of_the_session(attacked: AttackRe
     own = replayed.table[0]
     assert attacked.summary.verified is not None and own.verified is not None
     assert own.verified.trials == 6 and own.clean is not None
-
-
-# ---- metrics --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium

@@ -28,9 +28,6 @@ def test_a_run_is_a_name_or_a_folder(name: str, run: Any) -> None:
             getattr(advsearch, name)(*(["mug"] if name in ("attack", "sweep") else []), run=run)
 
 
-# ---- losses that lead away from a target ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "loss", [F.cross_entropy, F.nll_loss, nn.CrossEntropyLoss(), partial(F.cross_entropy, reduction="none")]
 )
@@ -39,9 +36,6 @@ def test_a_loss_of_torch_that_leads_away_from_the_target_is_refused(loss: Any) -
         losses.check_direction(loss, targeted=True)
     losses.check_direction(loss, targeted=False)
     losses.check_direction(lambda logits, labels: -loss(logits, labels), targeted=True)
-
-
-# ---- controls of one's own ------------------------------------------------------------------------------------------
 
 
 class Sets(NumberControl):

@@ -17,10 +17,11 @@ from advsearch.cli.main import main
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.files import read_png
-from advsearch.runs.store import NAME, Row, Store
+from advsearch.runs.store import Row
 from advsearch.scene.geometry import camera_to_world
 from samples import make_attacked
 from small_models import easy
+from stored_sweeps import rows_of
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -53,11 +54,6 @@ def decoded(segmentation: Any) -> npt.NDArray[np.bool_]:
         values, filled = values + [filled] * count, not filled
     found: npt.NDArray[np.bool_] = np.array(values).reshape(width, height).T
     return found
-
-
-def rows_of(run: Path) -> list[Row]:
-    with Store(run / NAME, read_only=True) as store:
-        return list(store.rows("sweep"))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])

@@ -21,7 +21,7 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from samples import make_attacked
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.medium]
 
 CONTROLS = {"texture": {"resolution": 64}, "pose": {}, "light": {}, "camera": {}, "lens": {}}
 
@@ -35,7 +35,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_attacked(tmp_path_factory.mktemp("runs") / "mug-all-001", config, u.numpy())
 
 
-@pytest.mark.medium
 def test_stock_mitsuba_renders_the_adversarial_scene(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -61,7 +60,6 @@ def test_stock_mitsuba_renders_the_adversarial_scene(
         np.testing.assert_allclose(one, renderer.formation.display(torch.from_numpy(ours)).numpy(), atol=1e-5)
 
 
-@pytest.mark.medium
 def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "mug.glb"
     assert main(["export", str(run), "--out", str(out), "--json"]) == 0

@@ -80,9 +80,6 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"
 
 
-# ---- several models as one ------------------------------------------------------------------------------------------
-
-
 def test_an_ensemble_answers_as_its_models_do() -> None:
     models = easy(), hard()
     pictures = torch.rand((3, 32, 32, 3), generator=torch.Generator().manual_seed(0))
@@ -95,12 +92,11 @@ def test_an_ensemble_answers_as_its_models_do() -> None:
 @pytest.mark.parametrize(
     ("logits", "score", "right"),
     [
-        ([[0.0, 2.0], [0.0, 1.0]], 1.0, False),
-        ([[0.0, 2.0], [3.0, 0.0]], -3.0, False),
+        ([[0.0, 2.0], [0.0, 1.0]], 1.0, False), ([[0.0, 2.0], [3.0, 0.0]], -3.0, False),
         ([[1.0, 0.0], [3.0, 0.0]], -3.0, True),
     ],
     ids=["both wrong", "one wrong", "both right"],
-)
+)  # fmt: skip
 def test_a_prediction_counts_where_it_does_for_each_model(logits: list[list[float]], score: float, right: bool) -> None:
     """One model that errs is neither a success nor a right answer."""
     tasks = (Classification(labels=("mug", "vase")), Classification(labels=("cup", "jar")))

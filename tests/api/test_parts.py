@@ -18,19 +18,9 @@ from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import read_configuration
 
 SMALL = AttackConfig(
-    object="mug,bowl",
-    controls={"pose": {"yaw": [-30, 30]}},
-    policy="random",
-    resolution=16,
-    denoise="none",
-    spp=1,
-    steps=2,
-    trials=6,
-    verify_spp=2,
-    average=6,
-    baseline=False,
-    deterministic=True,
-)
+    object="mug,bowl", controls={"pose": {"yaw": [-30, 30]}}, policy="random", resolution=16, denoise="none", spp=1,
+    steps=2, trials=6, verify_spp=2, average=6, baseline=False, deterministic=True,
+)  # fmt: skip
 
 
 class Backwards:

@@ -63,9 +63,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return advsearch.attack
 
 
-# ---- what torch is in the middle of ---------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_a_search_learns_whatever_is_switched_off_around_it(scene: advsearch.Scene, level: float) -> None:
     with torch.inference_mode():
@@ -161,8 +158,6 @@ def test_questions_and_renders_of_several_threads_come_out_as_they_do_alone(
         one.join()
     assert [torch.equal(found[seed], alone[seed]) for seed in range(4)] == [True] * 4
 
-
-# ---- a run of this session ------------------------------------------------------------------------------------------
 
 SMALL: dict[str, Any] = {**FAST, "spp": 2, "verify_spp": 2, "steps": 4}
 

@@ -20,6 +20,8 @@ from advsearch.runs.directory import RunDirectory
 from samples import ATTACK, AVERAGE, rated
 from samples import attack as attacked
 
+pytestmark = pytest.mark.medium
+
 FLIPS = {"mug": 0.02, "bowl": 0.1, "vase": 0.0, "pan": 9.0}
 """The epsilon at which each object flips; 0: it is wrong already."""
 
@@ -55,7 +57,6 @@ def summary_of(config: AttackConfig, run: str) -> AttackSummary:
     )
 
 
-@pytest.mark.medium
 def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
     summary = run_and_save(curve, RunContext(config))
@@ -72,7 +73,6 @@ def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]
     assert json.loads(Path("runs/study/summary.json").read_text())["curve"] == summary.to_dict()["curve"]
 
 
-@pytest.mark.medium
 def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     asked: list[AttackConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:

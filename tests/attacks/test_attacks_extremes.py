@@ -81,9 +81,6 @@ def quadratic(u: Tensor) -> Tensor:
     return -0.5 * away.sum() - 1.0
 
 
-# ---- what a model may answer ----------------------------------------------------------------------------------------
-
-
 def differentiated(row: Sequence[float], objective: Any, dtype: torch.dtype) -> tuple[float, Tensor]:
     at = torch.tensor([row]).to(dtype).requires_grad_()
     value = objective(at, IMAGE, LABELS)[0]
@@ -186,9 +183,6 @@ def test_what_a_search_claims_of_random_predictions_is_never_verified(rate: floa
         assert checked.ending is not Ending.FOUND
 
 
-# ---- noise without a variance ---------------------------------------------------------------------------------------
-
-
 def noise(kind: str, number: int, size: int, generator: torch.Generator) -> Tensor:
     """Noise (size,) of one gradient, its median absolute value 1; a heavy tail is Pareto's with index 1.5.
 
@@ -237,9 +231,6 @@ def share_of_optimum(name: str, kind: str) -> float:
 def test_heavy_tails_make_a_search_little_worse_than_gaussian_noise(kind: str, name: str) -> None:
     usual = 1.0 if kind == "spike" else share_of_optimum(name, "gaussian")
     assert usual / share_of_optimum(name, kind) <= 1.25
-
-
-# ---- single precision and many steps --------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -321,8 +312,6 @@ def test_an_angle_that_goes_round_in_small_steps_does_not_drift_and_no_two_steps
     assert len({seeds.stream(0, "search", index) for index in range(LONG)}) >= LONG - 1
 
 
-# ---- stiff objectives -----------------------------------------------------------------------------------------------
-
 Value = Callable[[Tensor], Tensor]
 """From (d,) float64 in [0, 1] to a number with a graph; the larger the better."""
 RATIO, PEAK = 1e6, [0.63, 0.37]
@@ -391,8 +380,7 @@ def evaluations(name: str, curvatures: Sequence[float], scale: float) -> float:
 @pytest.mark.medium
 @pytest.mark.parametrize("name", ["pgd", "adam"])
 @pytest.mark.parametrize(
-    ("curvatures", "scale"),
-    [([RATIO, 1.0], 1.0), ([1.0, RATIO], 1.0), ([1.0, 1.0], RATIO), ([1.0, 1.0], 1.0 / RATIO)],
+    ("curvatures", "scale"), [([RATIO, 1.0], 1.0), ([1.0, RATIO], 1.0), ([1.0, 1.0], RATIO), ([1.0, 1.0], 1.0 / RATIO)]
 )
 def test_curvatures_and_derivatives_that_differ_by_a_million_take_no_more_evaluations(
     name: str, curvatures: list[float], scale: float
@@ -441,9 +429,6 @@ def test_a_peak_a_thousandth_of_the_range_wide_is_found_by_what_converges(width:
 
     off = medians(value, [0.2, 0.9], 150, lambda result: abs(float(result.best_u[1] - peak[1])))
     assert all(off[name] <= 3.0 * width for name in ("pgd", "adam", "cmaes"))
-
-
-# ---- units ----------------------------------------------------------------------------------------------------------
 
 
 def same_path(toys: Sequence[Toy], *policies: str) -> None:

@@ -38,9 +38,6 @@ def slope(objective: Callable[..., Tensor], logits: Tensor, labels: tuple[int, .
     return gradient
 
 
-# ---- values ---------------------------------------------------------------------------------------------------------
-
-
 def test_margin_is_the_best_wrong_logit_minus_the_best_right_one() -> None:
     assert torch.allclose(margin(LOGITS, IMAGES, (0,)), torch.tensor([-1.0, 5.0]))
     assert torch.allclose(margin(LOGITS, IMAGES, (0, 2)), torch.tensor([-2.0, 4.0]))
@@ -90,27 +87,19 @@ def test_targeted_dlr_is_the_published_ratio_where_the_right_label_leads() -> No
     assert float(targeted_dlr(led_by_a_third, IMAGES, (1,))) < 0  # published: over 0, since 1 beats 0
 
 
-# ---- the battery: every objective in every form ---------------------------------------------------------------------
-
 FORMS = {
-    "plain": Classification(),
-    "targeted": Classification(target=(2, 4)),
-    "minimised": Classification(minimise=True),
-}
+    "plain": Classification(), "targeted": Classification(target=(2, 4)), "minimised": Classification(minimise=True),
+}  # fmt: skip
 RIGHT = (0, 3)
 LARGE = (1.0, 1e3, 1e4)
 
 EXTREMES = {
-    "all equal": [0.0] * 6,
-    "a tie at the top": [5.0, 5.0, 0.0, 1.0, 2.0, 3.0],
-    "a tie of the wrong": [5.0, 3.0, 3.0, 0.0, 3.0, 3.0],
-    "a tie of the right": [5.0, 3.0, 1.0, 5.0, 0.0, 2.0],
-    "sure and right": [10.0, 1.0, 0.0, -2.0, 2.0, 3.0],
-    "sure and wrong": [0.0, 10.0, 1.0, -2.0, 2.0, 3.0],
-    "sure of the target": [0.0, 1.0, 10.0, -2.0, 2.0, 3.0],
-    "all others tied": [10.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    "all equal": [0.0] * 6, "a tie at the top": [5.0, 5.0, 0.0, 1.0, 2.0, 3.0],
+    "a tie of the wrong": [5.0, 3.0, 3.0, 0.0, 3.0, 3.0], "a tie of the right": [5.0, 3.0, 1.0, 5.0, 0.0, 2.0],
+    "sure and right": [10.0, 1.0, 0.0, -2.0, 2.0, 3.0], "sure and wrong": [0.0, 10.0, 1.0, -2.0, 2.0, 3.0],
+    "sure of the target": [0.0, 1.0, 10.0, -2.0, 2.0, 3.0], "all others tied": [10.0, 0.0, 0.0, 0.0, 0.0, 0.0],
     "a tie above the target": [5.0, 5.0, 0.0, 5.0, 0.0, 5.0],
-}
+}  # fmt: skip
 
 
 def form(name: str, chosen: str) -> Callable[[Tensor, tuple[int, ...]], Tensor]:
@@ -186,8 +175,6 @@ def test_nan_stays_nan_and_with_its_image(name: str, chosen: str) -> None:
     assert torch.isnan(values).tolist() == [False, True, False]
 
 
-# ---- the distance of features ---------------------------------------------------------------------------------------
-
 CLEAN = torch.tensor([3.0, 0.0, 4.0]).reshape(1, 1, 3)
 
 
@@ -199,9 +186,6 @@ def test_feature_distance_has_its_full_gradient_at_the_clean_picture() -> None:
     far = (CLEAN[None] + torch.tensor([0.0, 3.0, 0.0])).requires_grad_()
     (gradient,) = torch.autograd.grad(objective(LOGITS[:1], far, (0,)).sum(), far)
     assert gradient.flatten().tolist() == pytest.approx([0.0, 1 / 5.0, 0.0], abs=2 * NEARBY / 5)
-
-
-# ---- names, targets, and the user's own -----------------------------------------------------------------------------
 
 
 def test_a_users_function_gets_the_target_and_is_negated_too() -> None:

@@ -133,9 +133,6 @@ def test_ranking_takes_the_winners_curse_out() -> None:
     assert abs(sum(believed) / 20) < 0.5
 
 
-# ---- what an evaluation costs
-
-
 def priced(cost: int, log: list[tuple[int, bool | str]]) -> Evaluate:
     """RISE with gradients that cost so many renders more; notes what was asked for."""
 
@@ -166,9 +163,6 @@ def test_the_budget_is_in_renders(steps: int, gradients: int, evaluations: int) 
     assert result.renders == result.ranking[-1].renders == steps + 3 == sum(1 + 12 * (g is True) for _, g in asked)
     assert result.renders <= count_planned_renders(steps, 2, 3)
     assert max(i for i, _ in asked[:evaluations]) < steps == min(i for i, _ in asked[evaluations:])
-
-
-# ---- more samples
 
 
 @dataclass(frozen=True)
@@ -202,9 +196,6 @@ def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
     assert torch.equal(result.best_u, at(0.2))
 
 
-# ---- stopping early
-
-
 def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
     monkeypatch.setattr("time.perf_counter", lambda: now)
@@ -219,9 +210,6 @@ def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them(monkeypatch
     assert result.stopped is Ending.BUDGET_SPENT
     assert len(search(partial(map, slow), DOMAIN, Random(), steps=9, seed=0, seconds=1e-9, candidates=0).history) == 1
     assert len(search(partial(map, slow), DOMAIN, Random(), steps=3, seed=0, seconds=60.0, candidates=0).history) == 3
-
-
-# ---- batches
 
 
 ALL_AT_ONCE = (Random(), CMAES(population=6), Restarts(NES()))
@@ -239,9 +227,6 @@ def test_rows_do_not_depend_on_when_answers_come(policy: Policy[Any]) -> None:
         lazy, eager = rows(RISE, last), rows(lambda queries: list(RISE(queries)), last)
         assert repr(lazy[0]) == repr(eager[0]) and torch.equal(lazy[1], eager[1])
         assert [one.step for one in lazy[0]] == list(range(last + 8))
-
-
-# ---- non-finite numbers
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -263,20 +248,13 @@ def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
         return Evaluation(0.5, value, True, non_finite=1)
 
     result = search(
-        partial(map, evaluate),
-        DOMAIN,
-        Script((at(0.0), at(0.1)), gradient=True),
-        steps=2,
-        seed=0,
+        partial(map, evaluate), DOMAIN, Script((at(0.0), at(0.1)), gradient=True), steps=2, seed=0,
         on_step=lambda record, u, evaluation: gradients.append(evaluation.gradient),
-    )
+    )  # fmt: skip
     assert gradients[0] is not None and gradients[0].tolist() == [0.0, 1.0, 0.0]
     assert result.history[0].non_finite == 3  # two here and one that the renderer had found
     assert result.non_finite_elements == 3 + 1 + 4  # the last step and four ranking renders report one each
     assert result.history[0].gradient_norm == 1.0
-
-
-# ---- interrupts
 
 
 @pytest.fixture(autouse=True)
@@ -307,9 +285,6 @@ def test_an_interrupt_keeps_the_best_so_far(number: int, expected: float) -> Non
     assert result.renders == number - 1
 
 
-# ---- candidates
-
-
 def test_the_pool_holds_the_best_distinct_ones_and_puts_success_first() -> None:
     pool: tuple[Candidate, ...] = ()
     for value, objective, success in ((0.0, 3.0, False), (0.1, 1.0, True), (0.00001, 4.0, False), (0.2, 0.5, False)):
@@ -319,9 +294,6 @@ def test_the_pool_holds_the_best_distinct_ones_and_puts_success_first() -> None:
     again = add_candidate(pool, Candidate(at(0.00001), 9.0, True), 2)
     assert again[0] is pool[0]
     assert (again[1].objective, again[1].repeat_objectives, again[1].successes) == (4.0, (9.0,), 1)
-
-
-# ---- looks where it is close
 
 
 def test_who_is_clearly_worse_is_out() -> None:

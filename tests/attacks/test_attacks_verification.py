@@ -61,9 +61,6 @@ def noisy(clean: float, adversarial: float, noise: float) -> Evaluate:
     return partial(map, render)
 
 
-# ---- intervals
-
-
 @pytest.mark.parametrize(
     ("successes", "trials", "low", "high"),
     [  # tables of exact binomial limits
@@ -102,11 +99,10 @@ def test_clopper_pearson_covers_at_least_as_often_as_it_says(rate: float) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((1, 0), "trials: expected at least 1, got 0"),
-        ((3, 2), "successes: expected a number from 0 to 2, got 3"),
+        ((1, 0), "trials: expected at least 1, got 0"), ((3, 2), "successes: expected a number from 0 to 2, got 3"),
         ((1, 2, 1.0), "confidence: expected a number between 0 and 1, got 1.0"),
     ],
-)
+)  # fmt: skip
 def test_impossible_counts_are_refused(arguments: tuple[float, ...], message: str) -> None:
     with pytest.raises(InputError, match=message):
         clopper_pearson(*arguments)  # type: ignore[arg-type]
@@ -115,9 +111,6 @@ def test_impossible_counts_are_refused(arguments: tuple[float, ...], message: st
 def test_trials_have_a_rate_and_its_interval() -> None:
     trials = Trials(20, 20, 64)
     assert trials.rate == 1.0 and trials.interval == pytest.approx((0.8316, 1.0), abs=1e-4)
-
-
-# ---- sample counts
 
 
 @pytest.mark.parametrize(
@@ -156,11 +149,8 @@ def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
     choice = choose_spp({"clean": drifting(-3.0, 0.0, 0.1), "adversarial": drifting(2.0, 0.0, 0.1)}, seed=0)
     assert (choice.spp, choice.converged, choice.renders) == (16, True, 16), "the first look is enough"
     assert [(r.name, r.spp) for r in choice.table] == [
-        ("clean", 4),
-        ("clean", 16),
-        ("adversarial", 4),
-        ("adversarial", 16),
-    ]
+        ("clean", 4), ("clean", 16), ("adversarial", 4), ("adversarial", 16),
+    ]  # fmt: skip
     assert math.isnan(choice.table[0].drift)
 
 
@@ -281,9 +271,6 @@ def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
         choose_spp({}, seed=0, ladder=ladder)
 
 
-# ---- verdicts
-
-
 def test_nineteen_of_twenty_are_needed() -> None:
     assert [WORST_CASE.count_needed(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
 
@@ -350,20 +337,14 @@ def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_di
 @pytest.mark.parametrize(
     ("search_ending", "clean", "adversarial", "expected"),
     [
-        (Ending.FOUND, 20, 20, Ending.FOUND),
-        (Ending.FOUND, 19, 19, Ending.FOUND),
-        (Ending.FOUND, 20, 18, Ending.NOT_VERIFIED),
-        (Ending.FOUND, 18, 18, Ending.NOT_VERIFIED),
-        (Ending.FOUND, 18, 20, Ending.NOT_VERIFIED),
-        (Ending.BUDGET_SPENT, 20, 19, Ending.FOUND),
-        (Ending.BUDGET_SPENT, 20, 18, Ending.BUDGET_SPENT),
-        (Ending.STALLED, 20, 0, Ending.STALLED),
-        (Ending.NON_FINITE, 20, 0, Ending.NON_FINITE),
-        (Ending.FOUND, 9, 9, Ending.ALREADY_WRONG),
-        (Ending.BUDGET_SPENT, 0, 0, Ending.ALREADY_WRONG),
-        (Ending.INTERRUPTED, 20, 20, Ending.INTERRUPTED),
+        (Ending.FOUND, 20, 20, Ending.FOUND), (Ending.FOUND, 19, 19, Ending.FOUND),
+        (Ending.FOUND, 20, 18, Ending.NOT_VERIFIED), (Ending.FOUND, 18, 18, Ending.NOT_VERIFIED),
+        (Ending.FOUND, 18, 20, Ending.NOT_VERIFIED), (Ending.BUDGET_SPENT, 20, 19, Ending.FOUND),
+        (Ending.BUDGET_SPENT, 20, 18, Ending.BUDGET_SPENT), (Ending.STALLED, 20, 0, Ending.STALLED),
+        (Ending.NON_FINITE, 20, 0, Ending.NON_FINITE), (Ending.FOUND, 9, 9, Ending.ALREADY_WRONG),
+        (Ending.BUDGET_SPENT, 0, 0, Ending.ALREADY_WRONG), (Ending.INTERRUPTED, 20, 20, Ending.INTERRUPTED),
     ],
-)
+)  # fmt: skip
 def test_the_verdict(search_ending: Ending, clean: int, adversarial: int, expected: Ending) -> None:
     assert WORST_CASE.decide_ending(search_ending, Trials(clean, 20, 64), Trials(adversarial, 20, 64)) is expected
 
@@ -465,24 +446,19 @@ def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
     found = verify(evaluate, DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
     assert made == ["control"] * 20 + ["verification"] * 2, "what nobody asks for any more is not made"
     assert (found.adversarial_counts.successes, found.adversarial_counts.trials, found.ending) == (
-        0,
-        2,
-        Ending.BUDGET_SPENT,
-    )
+        0, 2, Ending.BUDGET_SPENT,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("told", "made", "ending"),
     [
-        ("1" * 23, (14, 14), Ending.FOUND),
-        ("0" + "1" * 22, (22, 23), Ending.FOUND),
-        ("1" * 20 + "011", (14, 14), Ending.FOUND),
-        ("0" + "1" * 20 + "01", (20, 22), Ending.NOT_VERIFIED),
-        ("00" + "1" * 21, (4, 6), Ending.NOT_VERIFIED),
-        ("-" + "1" * 22, (22, 23), Ending.FOUND),
+        ("1" * 23, (14, 14), Ending.FOUND), ("0" + "1" * 22, (22, 23), Ending.FOUND),
+        ("1" * 20 + "011", (14, 14), Ending.FOUND), ("0" + "1" * 20 + "01", (20, 22), Ending.NOT_VERIFIED),
+        ("00" + "1" * 21, (4, 6), Ending.NOT_VERIFIED), ("-" + "1" * 22, (22, 23), Ending.FOUND),
         ("--" + "1" * 21, (4, 6), Ending.NOT_VERIFIED),
     ],
-)
+)  # fmt: skip
 def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[int, int], ending: Ending) -> None:
     """Told are trials of the answer: successes, failures, and "-" where the clean scene is wrong."""
     found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=TRIAL_LOOKS)
@@ -495,18 +471,13 @@ def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[
 @pytest.mark.parametrize(
     ("told", "made", "clean", "ending"),
     [
-        ("1" * 200, (30, 30), 30, Ending.FOUND),
-        ("-1" * 100, (30, 30), 60, Ending.FOUND),
-        ("0" + "1" * 199, (59, 60), 60, Ending.FOUND),
-        ("00000" + "1" * 195, (95, 100), 100, Ending.FOUND),
-        ("000000" + "1" * 194, (144, 150), 150, Ending.FOUND),
-        ("0" * 10 + "1" * 190, (190, 200), 200, Ending.FOUND),
-        ("-000" + "1" * 197, (97, 100), 101, Ending.FOUND),
-        ("1" * 20 + "0" * 180, (20, 41), 60, Ending.NOT_VERIFIED),
-        ("--1" * 67, (66, 66), 200, Ending.ALREADY_WRONG),
-        ("-1" * 10 + "-" * 180, (10, 10), 200, Ending.ALREADY_WRONG),
+        ("1" * 200, (30, 30), 30, Ending.FOUND), ("-1" * 100, (30, 30), 60, Ending.FOUND),
+        ("0" + "1" * 199, (59, 60), 60, Ending.FOUND), ("00000" + "1" * 195, (95, 100), 100, Ending.FOUND),
+        ("000000" + "1" * 194, (144, 150), 150, Ending.FOUND), ("0" * 10 + "1" * 190, (190, 200), 200, Ending.FOUND),
+        ("-000" + "1" * 197, (97, 100), 101, Ending.FOUND), ("1" * 20 + "0" * 180, (20, 41), 60, Ending.NOT_VERIFIED),
+        ("--1" * 67, (66, 66), 200, Ending.ALREADY_WRONG), ("-1" * 10 + "-" * 180, (10, 10), 200, Ending.ALREADY_WRONG),
     ],
-)
+)  # fmt: skip
 def test_trials_over_conditions_end_with_the_verdict(
     told: str, made: tuple[int, int], clean: int, ending: Ending
 ) -> None:
@@ -582,10 +553,7 @@ def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [
-        ({"trials": 0}, "trials: expected at least 1, got 0"),
-        ({"spp": 0}, "verify_spp: expected at least 1, got 0"),
-    ],
+    [({"trials": 0}, "trials: expected at least 1, got 0"), ({"spp": 0}, "verify_spp: expected at least 1, got 0")],
 )
 def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> None:
     with pytest.raises(InputError, match=message):
@@ -595,13 +563,7 @@ def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> 
 def test_every_ending_has_a_value_for_json_and_a_sentence() -> None:
     values = {ending.value for ending in Ending}
     assert values >= {
-        "found",
-        "budget spent",
-        "not verified",
-        "stalled",
-        "non-finite objective",
-        "interrupted",
-        "already wrong",
-    }
+        "found", "budget spent", "not verified", "stalled", "non-finite objective", "interrupted", "already wrong",
+    }  # fmt: skip
     for ending in Ending:
         assert ending.explanation.endswith(".")

@@ -125,8 +125,6 @@ def test_a_rule_that_is_none_is_told_in_one_of_100_and_a_clear_one_always(side: 
     assert one_sided_p_value([1, 2], [8, 8], [0, 0], [0, 0]) == 1.0, "nothing is elsewhere"
 
 
-# ---- units of unequal size -------------------------------------------------------------------------------------------
-
 LARGE = 12  # predictions of the units that have many
 
 

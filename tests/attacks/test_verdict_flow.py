@@ -48,9 +48,6 @@ def test_a_configuration_that_wins_once_and_not_again_is_not_the_runs(study: dic
     assert any(one.outdone_verification is None and one.baseline_verification.first_index > 0 for one in checks)
 
 
-# ---- samples for a rate
-
-
 def steady(noise: float, shift: float = 0.0, middle: float = 3.0) -> Any:
     def margins(spp: int, seeds: Any) -> list[float]:
         conditions = [np.random.default_rng(seed).normal() for seed in seeds]

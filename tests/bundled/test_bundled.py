@@ -45,9 +45,6 @@ def charts(mesh: Mesh) -> np.ndarray:
     return found
 
 
-# ---------------------------------------------------------------------------------------------------- objects
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(("name", "seed"), INSTANCES)
 def test_a_mesh_is_sound(name: str, seed: int | None) -> None:
@@ -95,9 +92,6 @@ def test_charts_lie_apart_in_the_atlas(name: str, seed: int | None) -> None:
     assert len(owner) == len(np.unique(owner[:, :2], axis=0)), "two charts share a texel"
 
 
-# ----------------------------------------------------------------------------------------------- environments
-
-
 @pytest.mark.parametrize("name", sorted(ENVIRONMENTS))
 def test_a_shipped_environment_is_light_of_the_common_brightness(name: str) -> None:
     radiance = library.load_environment(name).radiance
@@ -120,9 +114,6 @@ def test_directions_and_irradiance_have_the_documented_conventions() -> None:
     assert towards[32, 0] @ np.array([0, 1, 0]) > 0.99
     assert towards[32, 32] @ np.array([1, 0, 0]) > 0.99
     np.testing.assert_allclose(irradiance(np.ones((64, 128, 3)), np.array([0.0, 0.0, 1.0])), np.pi, rtol=1e-3)
-
-
-# ------------------------------------------------------------------------------------------ what is shipped
 
 
 @pytest.mark.medium

@@ -59,9 +59,6 @@ def python(code: str, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
 
 
-# ---- the program ----
-
-
 def test_help_is_quick_and_imports_nothing_heavy() -> None:
     code = (
         "import sys; from advsearch.cli.main import main; status = main(['--help']);"
@@ -88,15 +85,12 @@ def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("argv", "named"),
     [
-        (["atack"], "'attack'"),
-        (["attack", "--epsilom", "1"], "'--epsilon'"),
-        (["region", "--workers", "2"], "--workers"),
-        (["attack", "--object", "mug", "--epsilon", "nan"], "--epsilon: "),
-        (["attack", "--object", "mug", "--set", "a"], "--set: "),
-        (["run", "no.yaml"], "no.yaml: "),
+        (["atack"], "'attack'"), (["attack", "--epsilom", "1"], "'--epsilon'"),
+        (["region", "--workers", "2"], "--workers"), (["attack", "--object", "mug", "--epsilon", "nan"], "--epsilon: "),
+        (["attack", "--object", "mug", "--set", "a"], "--set: "), (["run", "no.yaml"], "no.yaml: "),
         (["show", "no-run"], "'no-run'"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_is_one_line_and_status_2(
     argv: list[str], named: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,30 +146,6 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert process.returncode == 0
 
 
-# ---- attack and run ----
-
-
-def test_attack_builds_its_configuration_from_flags(asked: list[AttackConfig]) -> None:
-    argv = (
-        "attack --object mug.obj --up y --environment room.hdr --model net.pt2 --labels l.json --label cup --norm l2"
-        " --control texture,pose --control light --set camera.azimuth=130 --set a.b=[0,1] --epsilon 0.1 --exposure -1"
-        " --texture-resolution 64 --policy random --steps 3 --objective margin --spp 4 --verify-spp 32"
-        " --trials 7 --denoise none --resolution 64x96 --no-baseline --seed 9 --threads 1 --run x --overwrite"
-        " --deterministic --quiet"
-    )
-    assert main([*argv.split(), "--control", "patch={size: 0.3}"]) == 0
-    assert asked == [
-        AttackConfig(
-            object="mug.obj", up="y", environment="room.hdr", model="net.pt2", labels="l.json", label="cup",
-            controls={"texture": {}, "pose": {}, "light": {}, "patch": {"size": 0.3}},
-            set_={"camera.azimuth": 130, "a.b": [0, 1]}, epsilon=0.1, norm="l2", texture_resolution=64, policy="random",
-            steps=3, objective="margin", spp=4, verify_spp=32, trials=7, denoise="none",
-            resolution=(64, 96), exposure=-1, baseline=False, seed=9, threads=1, run="x", overwrite=True,
-            deterministic=True,
-        )
-    ]  # fmt: skip
-
-
 def test_json_is_all_that_stands_on_standard_output(
     api: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -213,9 +183,6 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
     assert asked == [
         AttackConfig(object="mug", steps=80, seed=4, set_={"camera.azimuth": 130}, run="again", overwrite=True)
     ]
-
-
-# ---- resume, runs, export ----
 
 
 @pytest.fixture

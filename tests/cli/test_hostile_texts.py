@@ -30,24 +30,16 @@ def aliases(levels: int, merge: bool) -> str:
 
 
 YAML = {
-    "many hexadecimal digits": "seed: 0x" + "f" * 6000,
-    "a binary number without digits": "seed: 0b_",
-    "a date that does not exist": "seed: 2026-02-30",
-    "a number by tag": "seed: !!int abc",
-    "a Python object": "seed: !!python/object/apply:os.mkdir [executed]",
-    "nested lists": "seed: " + "[" * 100_000,
-    "aliases": aliases(12, merge=False),
-    "an alias of itself": "seed: &a [*a]",
-    "a long list": "seed: [" + "x," * 200_000 + "x]",
-    "a zero byte": "seed: \0",
-    "a list as key": "controls: {? [a] : 1}",
-    "a long name": "x" * 5000 + ": 1",
-    "a long object": "object: " + "x" * 5000,
-    "a base with a zero byte": 'base: "a\\0b"',
-    "a base that is a device": "base: /dev/zero",
-    "a name that steers the terminal": '"\\e[2J": 1',
+    "many hexadecimal digits": "seed: 0x" + "f" * 6000, "a binary number without digits": "seed: 0b_",
+    "a date that does not exist": "seed: 2026-02-30", "a number by tag": "seed: !!int abc",
+    "a Python object": "seed: !!python/object/apply:os.mkdir [executed]", "nested lists": "seed: " + "[" * 100_000,
+    "aliases": aliases(12, merge=False), "an alias of itself": "seed: &a [*a]",
+    "a long list": "seed: [" + "x," * 200_000 + "x]", "a zero byte": "seed: \0",
+    "a list as key": "controls: {? [a] : 1}", "a long name": "x" * 5000 + ": 1",
+    "a long object": "object: " + "x" * 5000, "a base with a zero byte": 'base: "a\\0b"',
+    "a base that is a device": "base: /dev/zero", "a name that steers the terminal": '"\\e[2J": 1',
     "a schema of another type": "schema: {a: 1}",
-}
+}  # fmt: skip
 
 
 @pytest.mark.medium
@@ -97,10 +89,6 @@ def test_label_files_have_limits(content: bytes, message: str, tmp_path: Path) -
     assert len(str(caught.value)) < 300 + len(str(path))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# the terminal
-
-
 def test_what_steers_a_terminal_becomes_readable() -> None:
     assert escape_text(f"a{ESCAPES}b") == r"a\x1b]0;title\x07\x9b31m\x7f\u202e\x0db"
     assert escape_text("mug \u2014 coffee\u00a0cup\n\t\u00e9") == "mug \u2014 coffee\u00a0cup\n\t\u00e9"
@@ -111,16 +99,13 @@ def test_what_steers_a_terminal_becomes_readable() -> None:
     "arguments",
     [
         ["attack", "--object", f"mug{ESCAPES}", "--control", "pose"],
-        ["attack", "--object", "mug", "--control", "pose", f"--x{ESCAPES}"],
-        ["show", f"mug{ESCAPES}"],
+        ["attack", "--object", "mug", "--control", "pose", f"--x{ESCAPES}"], ["show", f"mug{ESCAPES}"],
         ["attack", "--object", "mug", "--labels", "x" * 5000, "--control", "pose"],
-        ["attack", "--object", "mug", "--control", "pose", "--seed", "1" * 6000],
-        ["show", "x" * 5000],
-        ["region", "--around", "x" * 5000],
-        ["attack", "--object", "a\0b", "--control", "pose"],
+        ["attack", "--object", "mug", "--control", "pose", "--seed", "1" * 6000], ["show", "x" * 5000],
+        ["region", "--around", "x" * 5000], ["attack", "--object", "a\0b", "--control", "pose"],
         ["attack", "--object", "mug", "--model", "a\0b.pt2", "--control", "pose"],
     ],
-)
+)  # fmt: skip
 def test_names_are_shown_short_and_without_escapes(
     arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

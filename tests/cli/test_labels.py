@@ -27,14 +27,11 @@ def test_labels_are_listed_from_the_file_alone(
     file.write_text(json.dumps(LABELS), encoding="utf-8")
     monkeypatch.setattr(models, "load_model", None)
     assert main(["labels", "mug", "--model", "large.pt2", "--labels", str(file), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["labels"] == [
-        {"index": 1, "label": "coffee mug"},
-        {"index": 4, "label": "cup"},
-    ]
+    found = json.loads(capsys.readouterr().out)["labels"]
+    assert found == [{"index": 1, "label": "coffee mug"}, {"index": 4, "label": "cup"}]
     assert main(["labels", "pan", "--labels", str(file)]) == 0
     assert capsys.readouterr().out == "  #2   frying pan, frypan\n  #3   giant panda\n"
-    assert main(["labels", "xyzzy", "--labels", str(file)]) == 2
-    assert "none of the 9 labels is like 'xyzzy'; leave the word out" in capsys.readouterr().err
+    assert main(["labels", "xyzzy", "--labels", str(file)]) == 2 and "'xyzzy'" in capsys.readouterr().err
 
 
 class Always(nn.Module):

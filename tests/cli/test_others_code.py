@@ -98,25 +98,20 @@ IMPORTING = {
     "replay": ["replay theirs", "replay theirs --model reference"],
     "sweep": ["sweep --adversarial-of theirs --control light --samples 2"],
     "export": [
-        "export theirs --format gltf --out a.glb",
-        "export theirs --format mitsuba --out folder",
-        "export patched --format print --out a.pdf",
-        "export kept --format coco --out b",
+        "export theirs --format gltf --out a.glb", "export theirs --format mitsuba --out folder",
+        "export patched --format print --out a.pdf", "export kept --format coco --out b",
     ],
     "explain": ["explain swept --confirm 0 --pairs 0 --clusters 4"],
     "compare": ["compare swept beside"],
     "test": ["test suite.yaml", "test beside.yaml", "test mine.yaml --add theirs"],
     "recipe": ["recipe ./recipe.yaml"],
-}
+}  # fmt: skip
 """Commands that load what a run, a suite or a recipe names."""
 
 READING = {
-    "show": ["show theirs", "show stopped"],
-    "view": ["view theirs", "view swept --bundle site"],
-    "runs": ["runs"],
-    "report": ["report theirs swept --evidence"],
-    "export": ["export swept", "export kept --format 3db --out a"],
-}
+    "show": ["show theirs", "show stopped"], "view": ["view theirs", "view swept --bundle site"], "runs": ["runs"],
+    "report": ["report theirs swept --evidence"], "export": ["export swept", "export kept --format 3db --out a"],
+}  # fmt: skip
 """And those that look at them."""
 
 ALONE = (
@@ -155,12 +150,10 @@ def test_who_looks_imports_nothing(line: str) -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        "controls: pose\nmetrics: {m: 'planted:make'}",
-        "controls: {mine: {kind: 'planted:Make'}}",
-        "base: base.yaml",
+        "controls: pose\nmetrics: {m: 'planted:make'}", "controls: {mine: {kind: 'planted:Make'}}", "base: base.yaml",
         "base: [base.yaml]",
     ],
-)
+)  # fmt: skip
 def test_any_setting_that_names_code_in_a_file(settings: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("base.yaml").write_text(f"model: &code {NAME}\nlabel: *code\ncontrols: pose\n")
     Path("a.yaml").write_text(f"command: sweep\nobject: mug\nsamples: 2\n{settings}\n")

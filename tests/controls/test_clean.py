@@ -24,8 +24,6 @@ def space_of(scene: SceneDescription, **controls: dict[str, Any]) -> Space:
     return make_space([make_control(name, given) for name, given in controls.items()], scene)
 
 
-# ---- what was asked for is kept -------------------------------------------------------------------------------------
-
 REFUSED: list[tuple[dict[str, float], str, dict[str, Any], str]] = [
     ({"camera.elevation": 80.0}, "studio", {"camera": {"elevation": [5, 30]}}, "--set camera.elevation=80"),
     ({"pose.yaw": 0.0}, "studio", {"pose": {"yaw": {"choices": [10, 20]}}}, "pose.yaw is one of 10, 20"),
@@ -71,9 +69,6 @@ def test_a_control_that_agrees_starts_at_what_was_asked_for(
             assert (value["value"] - given[name]) % 360.0 == pytest.approx(0.0, abs=1e-4)
 
 
-# ---- a control says what the setting of the same name says ----------------------------------------------------------
-
-
 @pytest.mark.parametrize("environment", ["noon", "kitchen"])
 def test_an_environment_that_is_chosen_is_the_environment(environment: str) -> None:
     own = EnvironmentAsset("mine", torch.rand(16, 32, 3).numpy())
@@ -91,9 +86,6 @@ def test_an_exposure_that_is_searched_is_over_the_metered_one_and_not_over_the_o
     searched = scene.renderer({"camera": {"exposure": [-2, 2]}}, resolution=16, denoise="none")
     plain = scene.renderer({"camera": {"roll": [-1, 1]}}, resolution=16, denoise="none")
     assert torch.equal(searched(searched.start, seed=1, spp=2), plain(plain.start, seed=1, spp=2))
-
-
-# ---- sweeps ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,7 @@ import torch
 
 import advsearch
 from advsearch.controls.background import BackgroundControl, hsv_to_rgb
-from advsearch.scene.description import SceneDescription, load_description
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
+from advsearch.scene.description import SceneDescription
 
 
 def test_the_colours_are_those_of_the_standard_library() -> None:

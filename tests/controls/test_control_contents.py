@@ -19,11 +19,6 @@ AGREEMENT = 0.1
 """Relative difference allowed between 64-sample adjoints and 128-sample differences."""
 
 
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
-
-
 def bound(scene: SceneDescription, **settings: Any) -> ContentsControl:
     control = ContentsControl(**settings)
     return control.bind(control.prepare(scene))
@@ -45,9 +40,6 @@ def cup(outer: float = 0.5, inner: float = 0.4, floor: float = 0.1, bottom: bool
     uvs = np.full((len(vertices), 2), 0.5, dtype=np.float32)
     mesh = Mesh(vertices.astype(np.float32), faces.astype(np.uint32), normals.astype(np.float32), uvs)
     return ObjectAsset("cup", mesh, np.full((4, 4, 3), 0.5, dtype=np.float32))
-
-
-# ---- the inside of a vessel -----------------------------------------------------------------------------------------
 
 
 def test_the_inside_of_a_turned_cup_is_that_of_its_profile() -> None:
@@ -100,19 +92,13 @@ def test_the_vertices_are_differentiable_in_the_level(scene: SceneDescription) -
     assert u.grad is not None and float(u.grad) == pytest.approx(float(step), rel=1e-3)
 
 
-# ---- proportions ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "settings",
     [
-        {},
-        {"milk": [0, 0.3]},
-        {"water": 0.2},
-        {"coffee": [0.1, 0.6], "water": [0.3, 0.5], "milk": [0.0, 0.5]},
+        {}, {"milk": [0, 0.3]}, {"water": 0.2}, {"coffee": [0.1, 0.6], "water": [0.3, 0.5], "milk": [0.0, 0.5]},
         {"coffee": 0.25, "milk": [0.2, 0.4]},
     ],
-)
+)  # fmt: skip
 def test_proportions_add_up_to_one_within_their_ranges(scene: SceneDescription, settings: dict[str, object]) -> None:
     filled = bound(scene, **settings)
     generator = torch.Generator().manual_seed(0)
@@ -123,9 +109,6 @@ def test_proportions_add_up_to_one_within_their_ranges(scene: SceneDescription, 
         assert sum(shares.values()) == pytest.approx(1.0, abs=1e-6)
         for name, (low, high) in filled.proportion_bounds.items():
             assert low - 1e-6 <= shares[name] <= high + 1e-6
-
-
-# ---- rendered -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium

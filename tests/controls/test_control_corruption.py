@@ -15,16 +15,10 @@ from torch import Tensor
 from advsearch.controls import corruption
 from advsearch.controls.corruption import CORRUPTION_NAMES, STEPPED_CORRUPTIONS, apply_corruption, filters
 from advsearch.controls.corruption.filters import sample_poisson
-from advsearch.scene.description import SceneDescription, load_description
 
 every_corruption = pytest.mark.parametrize("which", CORRUPTION_NAMES)
 DRAWN = ("shot_noise", "impulse_noise")
 """Their derivative is one of the average over draws."""
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")

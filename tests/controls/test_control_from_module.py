@@ -91,13 +91,12 @@ def test_how_to_go_on_names_the_code_that_is_needed(
 @pytest.mark.parametrize(
     ("settings", "name"),
     [
-        ({"model": "planted:make"}, "planted:make"),
-        ({"model": "planted:make@weights.safetensors"}, "planted:make"),
+        ({"model": "planted:make"}, "planted:make"), ({"model": "planted:make@weights.safetensors"}, "planted:make"),
         ({"controls": {"planted:Fade": {}}}, "planted:Fade"),
         ({"controls": {"mine": {"kind": "planted:Fade"}}}, "planted:Fade"),
         ({"over": {"planted:Fade": {}}}, "planted:Fade"),
     ],
-)
+)  # fmt: skip
 @pytest.mark.parametrize("command", ["resume theirs", "run runs/theirs/run.yaml", "region --around theirs"])
 def test_code_that_somebody_elses_file_names_is_not_run(
     command: str, settings: dict[str, object], name: str, capsys: pytest.CaptureFixture[str]

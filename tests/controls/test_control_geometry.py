@@ -24,11 +24,6 @@ OFFSETS = "object.offsets"
 FORMS = ("modes", "large-steps")
 
 
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
-
-
 def bound(scene: SceneDescription, **settings: Any) -> GeometryControl:
     return GeometryControl(**settings).bind(scene)
 

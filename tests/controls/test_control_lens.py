@@ -10,14 +10,9 @@ from torch import Tensor
 
 from advsearch.controls.lens import LensControl, draw_dots
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.description import SceneDescription
 
 NAMES = ("x", "y", "radius", "red", "green", "blue", "opacity", "falloff")
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
 
 
 def values(**given: float | list[float]) -> dict[str, Tensor]:

@@ -23,11 +23,6 @@ ROUNDING = 0.002
 """Relative: no sample depends on power or colour, so that at one seed adjoint and difference are of the same paths."""
 
 
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
-
-
 def rendered(control: LightControl, scene: SceneDescription, u: list[float], spp: int = 64, seed: int = 0) -> Tensor:
     prepared = control.prepare(scene)
     bound = control.bind(prepared)

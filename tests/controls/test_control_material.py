@@ -20,7 +20,7 @@ from advsearch.controls.material import (
 )
 from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.meshes import make_principled, to_loadable
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, translate_mesh, translate_part
 from advsearch.scene.mitsuba_backend.variant import mi
@@ -31,14 +31,6 @@ BASE_COLOR = "object.base_color"
 
 AGREEMENT = 0.15
 """Relative difference allowed between a 64-sample adjoint and a 64-sample difference of a smooth weight."""
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
-
-
-# ---- patterns -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -72,9 +64,6 @@ def searched(*names: str) -> MaterialControl:
     """A control over whole ranges."""
     ranges: dict[str, Any] = {name: [0, 1] for name in names}
     return MaterialControl(**ranges)
-
-
-# ---- from values to inputs ------------------------------------------------------------------------------------------
 
 
 def test_the_start_is_the_objects_own_surface(scene: SceneDescription) -> None:
@@ -143,19 +132,14 @@ def test_equal_numbers_of_a_surface_stay_two(scene: SceneDescription) -> None:
     assert [one for one in ("clearcoat", "sheen") if not any(key.endswith(f".{one}.value") for key in keys)] == []
 
 
-# ---- rendered -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("roughness", 0.3),
-        pytest.param("metallic", 0.4, marks=pytest.mark.slow),
-        pytest.param("specular", 0.5, marks=pytest.mark.slow),
-        ("green", 0.6),
+        ("roughness", 0.3), pytest.param("metallic", 0.4, marks=pytest.mark.slow),
+        pytest.param("specular", 0.5, marks=pytest.mark.slow), ("green", 0.6),
     ],
-)
+)  # fmt: skip
 def test_the_adjoint_agrees_with_differences(name: str, value: float) -> None:
     material = searched(name)
     render = advsearch.load_scene("mug").renderer([material], resolution=32, denoise="none")

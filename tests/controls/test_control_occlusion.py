@@ -28,19 +28,11 @@ ACCURACY = 0.02
 """Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""
 
 
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
-
-
 def hidden(scene: SceneDescription, **settings: Any) -> Placement:
     """The placement at the upper end of the coverage's range."""
     control = OcclusionControl(**{"coverage": [0, 0.9], **settings})
     bound = control.bind(control.prepare(scene))
     return bound.find_placement(bound.values(torch.ones_like(bound.start)), {})
-
-
-# ---- silhouettes ----------------------------------------------------------------------------------------------------
 
 
 def test_a_square_is_rasterised_without_gaps_or_excess() -> None:
@@ -80,9 +72,6 @@ def test_a_card_across_a_card_hides_what_geometry_says() -> None:
     np.testing.assert_allclose(sweep.compute_coverage(angles), [0.0, 0.25, 0.5, 0.75, 1.0], atol=ACCURACY)
     assert sweep.find_angle(0.3, 0.5) == pytest.approx(math.atan(0.12), abs=0.002)
     assert sweep.find_angle(1.0, 0.5) < math.atan(0.06)
-
-
-# ---- the control ----------------------------------------------------------------------------------------------------
 
 
 FOLDING = make_pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11]))
@@ -140,10 +129,9 @@ def test_it_comes_in_without_a_jump(scene: SceneDescription) -> None:
 
 def test_it_follows_the_camera_and_the_pose_whatever_the_order(scene: SceneDescription) -> None:
     occlusion, camera, pose = (
-        OcclusionControl(coverage=[0, 0.4], direction=180.0),
-        CameraControl(azimuth=[0, 360]),
+        OcclusionControl(coverage=[0, 0.4], direction=180.0), CameraControl(azimuth=[0, 360]),
         PoseControl(x=[-0.3, 0.3]),
-    )
+    )  # fmt: skip
     space = make_space([occlusion, camera, pose], scene)
     u = torch.tensor([1.0, 0.8, 0.9])
     inputs = space.inputs(u)

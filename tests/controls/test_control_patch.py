@@ -15,17 +15,13 @@ from advsearch.controls import make_space
 from advsearch.controls.patch import BASE_COLOR, PatchControl
 from advsearch.controls.texture import TextureControl
 from advsearch.scene.assets import Float32Array, Mesh
-from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.library import list_objects, load_object
 from advsearch.scene.raster import MeshSurface, rasterize_charts
 from covering import only
+from small_models import assert_slope
 
 SIDE = 512
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +48,6 @@ def covered(control: PatchControl, side: int = 32) -> np.ndarray:
     return (white - black).mean(dim=-1).numpy()
 
 
-# ---- the map of the surface ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", only(["mug", "book", "hammer"], list_objects()))
 def test_texels_know_their_place_on_every_object(name: str) -> None:
     mesh = load_object(name).mesh
@@ -66,9 +59,6 @@ def test_texels_know_their_place_on_every_object(name: str) -> None:
     corners = mesh.vertices[mesh.faces].astype(float)
     total = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
     assert float(charts.compute_areas().sum()) == pytest.approx(total, rel=0.02)
-
-
-# ---- where it lies ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -117,9 +107,6 @@ def test_its_top_is_up_and_its_left_is_left(
         assert sign * trend > 0.9  # rows run downwards; seen from +x, y runs to the right
 
 
-# ---- how it is painted -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_it_starts_as_what_is_underneath(scene: SceneDescription) -> None:
     control = bound(scene, resolution=64)
@@ -136,10 +123,8 @@ def test_it_starts_as_what_is_underneath(scene: SceneDescription) -> None:
 @pytest.mark.medium
 def test_two_patches_and_a_texture_compose(scene: SceneDescription) -> None:
     controls = [
-        PatchControl("left", azimuth=20, size=0.2),
-        TextureControl(),
-        PatchControl("right", azimuth=70, size=0.2),
-    ]
+        PatchControl("left", azimuth=20, size=0.2), TextureControl(), PatchControl("right", azimuth=70, size=0.2),
+    ]  # fmt: skip
     space = make_space(controls, scene)
     u = space.start
     before = space.inputs(u)[BASE_COLOR]
@@ -164,15 +149,9 @@ def test_derivatives_are_those_of_differences(scene: SceneDescription) -> None:
     def total(at: Tensor) -> Tensor:
         return (control.inputs(at)[BASE_COLOR].double() * weights).sum()
 
-    at = u.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(total(at), at)
     pixels = torch.cat([torch.randn(48, generator=generator), torch.zeros(2)])
     for direction, step in ((pixels, 1e-2), (torch.eye(50)[48], 2e-3), (torch.eye(50)[49], 5e-4)):
-        rise = float(total(u + step * direction) - total(u - step * direction)) / (2.0 * step)
-        assert float(slope @ direction) == pytest.approx(rise, rel=0.03)
-
-
-# ---- what may be asked for -------------------------------------------------------------------------------------------
+        assert_slope(total, u, direction, step, 0.03)
 
 
 @pytest.mark.medium

@@ -191,13 +191,10 @@ def test_a_path_through_what_the_camera_looks_at_is_refused(
 @pytest.mark.parametrize(
     ("headings", "middles", "told"),
     [
-        ([350, 10], [0.0], True),
-        ([-170, 170], [180.0], True),
-        ([0, 360], [180.0], False),
-        ([350, 10, 40], [0.0, 25.0], True),
-        ([700, 20], [0.0], False),
+        ([350, 10], [0.0], True), ([-170, 170], [180.0], True), ([0, 360], [180.0], False),
+        ([350, 10, 40], [0.0, 25.0], True), ([700, 20], [0.0], False),
     ],
-)
+)  # fmt: skip
 def test_headings_go_the_shorter_way_round(
     scene: SceneDescription, headings: list[int], middles: list[float], told: bool, tmp_path: Path
 ) -> None:
@@ -217,28 +214,6 @@ def _turned(scene: SceneDescription, control: Control, share: float) -> tuple[Te
     return turn[1, 0], turn[0, 0]
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n",
-        "time,x,y,z\n0,1,1," + 200_000 * "1" + "\n",
-        "time,x,y,z\n0,1,1,1\n",
-        "time,x,y,z\n0,1,1,1\n1,a,1,1\n",
-        "time,x,y,z\n0,1,1,1\n0,1,1,1\n",
-        "time,x,y,z\nnan,1,1,1\n1,1,1,1\n",
-        "time,x,y,z\n0,1,1,1\n1e300,1,1,1\n",
-        "time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n",
-        "time,x,y,z\n0,1,1,1\n1,1e300,1,1\n",
-    ],
-)
-def test_a_file_that_is_no_way_is_refused(text: str, tmp_path: Path) -> None:
-    file = tmp_path / "way.csv"
-    file.write_text(text)
-    with pytest.raises(FileFormatError, match=file.name):
-        PathControl(path=str(file))
-
-
 def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: SceneDescription, tmp_path: Path) -> None:
     (tmp_path / "way.csv").write_text(WAY)
     names = ["approach", "orbit+pass", str(tmp_path / "way.csv")]
@@ -255,8 +230,6 @@ def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: Scene
             torch.testing.assert_close(poses[one], pose)
     assert bound(scene, path=["approach", "orbit"]).to_settings() == {"path": ["approach", "orbit"]}
 
-
-# ---- trajectories of other tools ------------------------------------------------------------------------------------
 
 OPTICAL_TO_WORLD = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """A camera (x right, y down, z ahead) that looks level along -x, in a world whose z is up."""
@@ -302,16 +275,12 @@ def trajectory(form: str, axes: str = "optical", up: str = "z", at: tuple[float,
 @pytest.mark.parametrize(
     ("form", "axes", "up", "at"),
     [
-        ("tum", "optical", "z", (0.0, 0.0, 0.0)),
-        ("tum, real part first", "optical", "z", (0.0, 0.0, 0.0)),
-        ("tum in nanoseconds", "opengl", "y", (0.0, 0.0, 0.0)),
-        ("tum", "optical", "-y", (1.0, 2.0, 3.0)),
-        ("euroc", "euroc", "z", (4e5, 5e6, 100.0)),
-        ("euroc, all columns", "flu", "z", (0.0, 0.0, 0.0)),
-        ("euroc", "frd", "-z", (0.0, 0.0, 0.0)),
-        ("kitti", "optical", "-y", (20.0, 0.0, 0.0)),
+        ("tum", "optical", "z", (0.0, 0.0, 0.0)), ("tum, real part first", "optical", "z", (0.0, 0.0, 0.0)),
+        ("tum in nanoseconds", "opengl", "y", (0.0, 0.0, 0.0)), ("tum", "optical", "-y", (1.0, 2.0, 3.0)),
+        ("euroc", "euroc", "z", (4e5, 5e6, 100.0)), ("euroc, all columns", "flu", "z", (0.0, 0.0, 0.0)),
+        ("euroc", "frd", "-z", (0.0, 0.0, 0.0)), ("kitti", "optical", "-y", (20.0, 0.0, 0.0)),
     ],
-)
+)  # fmt: skip
 def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
     scene: SceneDescription, tmp_path: Path, form: str, axes: str, up: str, at: tuple[float, ...]
 ) -> None:
@@ -337,26 +306,30 @@ def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
 
 
 TUM_ROW = "1 6 0 1 -0.5 -0.5 0.5 0.5\n"
+NO_WAYS = [
+    "", "time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n", "time,x,y,z\n0,1,1," + 200_000 * "1" + "\n",
+    "time,x,y,z\n0,1,1,1\n", "time,x,y,z\n0,1,1,1\n1,a,1,1\n", "time,x,y,z\n0,1,1,1\n0,1,1,1\n",
+    "time,x,y,z\nnan,1,1,1\n1,1,1,1\n", "time,x,y,z\n0,1,1,1\n1e300,1,1,1\n", "time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n",
+    "time,x,y,z\n0,1,1,1\n1,1e300,1,1\n",
+]  # fmt: skip
+NO_TRAJECTORIES = [
+    "0 6 0 1 -0.5 -0.5 0.5 0.7\n" + TUM_ROW,
+    "0 6 0 1 nan 0 0 1\n" + TUM_ROW,
+    TUM_ROW + TUM_ROW,
+    "0 6 0 1 0 0 0 1\n5000000000 6 0 1 0 0 0 1\n",
+    "0 6e6 0 1 0 0 0 1\n" + TUM_ROW,
+    TUM_ROW + "2 6 0 1\n",
+    "1 2 3\n4 5 6\n",
+    "1,6,0,1,-0.5,-0.5,0.5,0.5\n2,5,0,1,-0.5,-0.5,0.5,0.5\n",
+    HEADER.replace("[ns]", "[h]") + "\n1,6,0,1,0.5,-0.5,-0.5,0.5\n" * 2,
+    "1 0 0 0 0 1 0 0 0 0 2 0\n" * 2,
+    1_100 * "1 " + "\n",
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "0 6 0 1 -0.5 -0.5 0.5 0.7\n" + TUM_ROW,
-        "0 6 0 1 nan 0 0 1\n" + TUM_ROW,
-        TUM_ROW + TUM_ROW,
-        "0 6 0 1 0 0 0 1\n5000000000 6 0 1 0 0 0 1\n",
-        "0 6e6 0 1 0 0 0 1\n" + TUM_ROW,
-        TUM_ROW + "2 6 0 1\n",
-        "1 2 3\n4 5 6\n",
-        "1,6,0,1,-0.5,-0.5,0.5,0.5\n2,5,0,1,-0.5,-0.5,0.5,0.5\n",
-        HEADER.replace("[ns]", "[h]") + "\n1,6,0,1,0.5,-0.5,-0.5,0.5\n" * 2,
-        "1 0 0 0 0 1 0 0 0 0 2 0\n" * 2,
-        1_100 * "1 " + "\n",
-    ],
-)
-def test_a_file_that_is_no_trajectory_is_refused(text: str, tmp_path: Path) -> None:
-    file = tmp_path / "poses.txt"
+@pytest.mark.parametrize("text", NO_WAYS + NO_TRAJECTORIES)
+def test_a_file_that_is_no_way_and_no_trajectory_is_refused(text: str, tmp_path: Path) -> None:
+    file = tmp_path / "way.csv"
     file.write_text(text)
     with pytest.raises(FileFormatError, match=file.name):
         PathControl(path=str(file))

@@ -10,14 +10,9 @@ from torch import Tensor
 
 from advsearch.controls.sensor import SensorControl, apply_aberration, apply_mosaic, apply_sensor
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.description import SceneDescription
 
 NAMES = ("vignetting", "aberration", "shot", "read", "mosaic", "red", "blue", "compression")
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
 
 
 def values(**given: float) -> dict[str, Tensor]:

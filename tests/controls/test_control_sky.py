@@ -29,11 +29,6 @@ SKIES = ((20.0, 45.0, 3.0, 1e-3), (200.0, 80.0, 10.0, 1e-3), (120.0, 12.0, 7.0, 
 """Azimuth, elevation, turbidity, tolerance: between whole turbidities Mitsuba interpolates linearly, we smoothly."""
 
 
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
-
-
 def numbers(*given: float) -> list[Tensor]:
     return [torch.tensor(one) for one in given]
 

@@ -12,16 +12,11 @@ from advsearch.controls.base import Control
 from advsearch.controls.texture import TextureControl, compute_palette
 from advsearch.errors import UnknownNameError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription, load_description
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.parts import MeshPart
 
 EIGHT_BIT = 1e-4
 """Colours may differ by this much after the way to linear values and back."""
-
-
-@pytest.fixture(scope="module")
-def scene() -> SceneDescription:
-    return load_description("mug")
 
 
 def texels(bound: Control, u: Tensor) -> Tensor:

@@ -127,9 +127,6 @@ def test_two_of_a_kind_live_side_by_side(kind: str) -> None:
     assert {name.split(".")[0] for name in space.describe(u)} == {"one", "two"}
 
 
-# ---- controls from elsewhere ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", CONTROLS)
 def test_no_value_of_any_control_ends_in_a_traceback(kind: str) -> None:
     """Neither a parameter, a choice, a name nor a kind; what is bound to a scene later is not looked at here."""

@@ -17,9 +17,7 @@ PICTURE = str(ROOT / "advsearch/bundled/data/objects/book/base_color.png")
 
 FORMS: dict[str, tuple[dict[str, Any], ...]] = {
     "camera": (
-        {"exposure": [-1, 1]},
-        {"aperture": [0.0, 0.1], "fov": [20, 60]},
-        {"focal_length": [20, 60], "shift_x": [0, 1]},
+        {"exposure": [-1, 1]}, {"aperture": [0.0, 0.1], "fov": [20, 60]}, {"focal_length": [20, 60], "shift_x": [0, 1]},
     ),
     "pose": ({}, {"rotation": [-90, 90], "on_ground": "no"}),
     "texture": tuple({"form": form, "resolution": 16} for form in ("texels", "palette", "waves")),
@@ -36,7 +34,7 @@ FORMS: dict[str, tuple[dict[str, Any], ...]] = {
     "corruption": tuple(
         {"which": which, "severity": severity} for which in CORRUPTION_NAMES for severity in ([0.2, 0.9], [3.2, 4.9])
     ),
-}
+}  # fmt: skip
 """Settings under which a control takes all its ways; it is tried with none where it is not here."""
 
 CASES = [

@@ -32,12 +32,9 @@ CAR: dict[str, list[Box]] = {
 }
 """Boxes from corner to corner by material, z up."""
 COLOURS = {
-    "Body Paint": (0.7, 0.1, 0.1),
-    "roof": (0.6, 0.6, 0.65),
-    "glass": (0.1, 0.2, 0.25),
-    "tyres": (0.05, 0.05, 0.05),
+    "Body Paint": (0.7, 0.1, 0.1), "roof": (0.6, 0.6, 0.65), "glass": (0.1, 0.2, 0.25), "tyres": (0.05, 0.05, 0.05),
     "plate": (0.9, 0.9, 0.7),
-}
+}  # fmt: skip
 SIDES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
 
 
@@ -99,9 +96,6 @@ def seen(mesh: Mesh, faces: np.ndarray, texture: np.ndarray, count: int = 40) ->
     return look_up_texture(texture, uvs[:, 0] * width - 0.5, (1.0 - uvs[:, 1]) * height - 0.5)
 
 
-# ---- what is known of a file ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("write", [car, car_as_gltf])
 def test_the_materials_of_a_file_keep_their_faces_and_their_texels(
     write: Callable[[Path], Path], tmp_path: Path
@@ -143,8 +137,6 @@ def test_the_texels_that_lookups_read_are_all_there(seed: int) -> None:
             wanted[(top[counts] + row) % 13, (left[counts] + column) % 17] = True
     assert read[wanted].all() and read.sum() <= wanted.sum() + 12
 
-
-# ---- the control ----------------------------------------------------------------------------------------------------
 
 FORMS: list[dict[str, object]] = [{}, {"form": "palette"}, {"form": "waves", "epsilon": 0.3}]
 

@@ -30,12 +30,9 @@ def accepted(share: float, bias: float = 0.0, deviation: float = 0.2) -> float:
 @pytest.mark.parametrize(
     ("share", "bias", "least", "most"),
     [
-        (0.5, 0.0, 0.97, 1.0),
-        (1.25, 0.0, 0.0, 0.06),
-        (0.5, 0.5, 0.0, 0.05),
-        (0.5, -0.5, 0.0, 0.05),
+        (0.5, 0.0, 0.97, 1.0), (1.25, 0.0, 0.0, 0.06), (0.5, 0.5, 0.0, 0.05), (0.5, -0.5, 0.0, 0.05),
     ],
-)
+)  # fmt: skip
 def test_right_predictions_are_accepted_and_wrong_ones_seldom(
     share: float, bias: float, least: float, most: float
 ) -> None:

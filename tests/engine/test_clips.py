@@ -19,6 +19,8 @@ from advsearch.models import ModelWarning
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.scene.description import load_description
 
+pytestmark = pytest.mark.medium
+
 transformers = pytest.importorskip("transformers")
 
 FRAMES, SIDE = 4, 32
@@ -54,7 +56,6 @@ def network(kind: str) -> Any:
     return made.eval()
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("kind", ["VideoMAE", "Timesformer", "Vivit"])
 def test_a_clip_is_classified_as_by_the_network_itself(kind: str) -> None:
     """And its gradient is that of central differences, for all frames."""
@@ -84,7 +85,6 @@ def test_a_clip_is_classified_as_by_the_network_itself(kind: str) -> None:
     assert float((slope * along).sum()) == pytest.approx((above - below) / 2e-4, rel=1e-3)
 
 
-@pytest.mark.medium
 def test_each_picture_of_a_clip_is_that_of_its_time(tmp_path: Path) -> None:
     """The first bit for bit, the others with noise of their own, as in stills at these times."""
     scene = advsearch.load_scene("mug", camera=clip(tmp_path)).description
@@ -103,7 +103,6 @@ def test_each_picture_of_a_clip_is_that_of_its_time(tmp_path: Path) -> None:
     assert float((pictures[3] - pictures[0]).abs().mean()) > 0.02
 
 
-@pytest.mark.medium
 def test_an_attack_on_a_video_classifier_is_carried_out(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)

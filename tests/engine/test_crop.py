@@ -114,11 +114,10 @@ def test_a_matrix_of_the_window_predicts_what_a_whole_one_does(renderer: Rendere
         cut, whole, other = [
             predictor(u) - predictor(traced.start)
             for predictor in (
-                LinearRenderer(crop, traced.start, 1),
-                LinearRenderer(traced, traced.start, 2),
+                LinearRenderer(crop, traced.start, 1), LinearRenderer(traced, traced.start, 2),
                 LinearRenderer(traced, traced.start, 5),
             )
-        ]
+        ]  # fmt: skip
     outside = WINDOW.is_outside((40, 40))
     assert not cut[outside].any()
     noise = float(WINDOW.select(whole - other).square().mean())
@@ -147,8 +146,7 @@ def test_the_window_is_chosen_by_what_changes_outside(monkeypatch: pytest.Monkey
     ("changes", "reason"),
     [
         ({"controls": {"camera": {}}}, "camera shows in more than a part"),
-        ({"controls": {"environment": {}}}, "environment is light"),
-        ({"controls": {"pose": {}}}, "object moves"),
+        ({"controls": {"environment": {}}}, "environment is light"), ({"controls": {"pose": {}}}, "object moves"),
         ({"controls": {"material": {}, "haze": {}}}, "there is haze"),
         ({"controls": {"lens": {}}}, "nothing that is searched needs a render"),
         ({"steps": 15}, "pays from 16 evaluations on"),
@@ -156,7 +154,7 @@ def test_the_window_is_chosen_by_what_changes_outside(monkeypatch: pytest.Monkey
         ({"denoise": "none"}, "noise is part of the picture"),
         ({"set": {"camera.distance": 0.2}}, "fills much of the picture"),
     ],
-)
+)  # fmt: skip
 def test_a_search_that_needs_whole_pictures_says_why(changes: dict[str, Any], reason: str) -> None:
     refusal = find_window(make_problem(**changes))
     assert isinstance(refusal, Refusal) and reason in str(refusal)

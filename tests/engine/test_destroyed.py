@@ -158,10 +158,9 @@ def test_a_task_from_a_function_and_the_facts_that_it_gets() -> None:
 
     mask = torch.ones(2, 2, dtype=torch.bool)
     facts = Facts(
-        "mug",
-        describe_values=lambda: {"pose.yaw": 1.0},
+        "mug", describe_values=lambda: {"pose.yaw": 1.0},
         compute_sight=lambda: Sight(mask, torch.ones(2, 2), torch.ones(2, 2)),
-    )
+    )  # fmt: skip
     task, output = make_task(judge), LOGITS.clone()
     assert [one.margin for one in task.judge(output, facts)] == [1.0, 3.5]
     assert torch.equal(output, LOGITS) and mask.all() and facts.depth.eq(1).all() and facts.z_depth.eq(1).all()
@@ -305,29 +304,15 @@ UNTOUCHED: dict[Any, set[str]] = {
     Policy: {"propose", "takes_differences", "counts", "distribution", "failures"},
     NumberControl: {
         *(
-            "declare_parameters",
-            "setting_name",
-            "to_settings",
-            "select_form",
-            "get_mesh",
-            "with_scene",
-            "list_allowed_values",
-            "is_searched",
-            "resolve_parameter",
+            "declare_parameters", "setting_name", "to_settings", "select_form", "get_mesh", "with_scene",
+            "list_allowed_values", "is_searched", "resolve_parameter",
         ),
         *(
-            "get_clean_value",
-            "get_scene_value",
-            "get_spec",
-            "get_budget",
-            "must_match_scene",
-            "record_adjusted_default",
-            "values",
-            "advance_time",
-            "scale_ambient",
+            "get_clean_value", "get_scene_value", "get_spec", "get_budget", "must_match_scene",
+            "record_adjusted_default", "values", "advance_time", "scale_ambient",
         ),
     },
-}
+}  # fmt: skip
 """Methods that get no tensors which anybody else reads; those of a declaration get the control's copy of a scene."""
 
 

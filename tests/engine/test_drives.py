@@ -73,11 +73,9 @@ DRIVE: dict[str, Any] = {"controls": {"path": {"seconds": 4.0, "reach": 5.0}}, "
 @pytest.mark.parametrize(
     ("frames", "right", "gap", "flicker", "first"),
     [
-        ("00110", 0.4, 2.0, 0.5, 3.0),
-        ("00000", 0.0, 5.0, 0.0, None),
-        ("10001", 0.4, 3.0, 0.5, 5.0),
+        ("00110", 0.4, 2.0, 0.5, 3.0), ("00000", 0.0, 5.0, 0.0, None), ("10001", 0.4, 3.0, 0.5, 5.0),
     ],
-)
+)  # fmt: skip
 def test_rates_of_one_drive_are_those_worked_out_by_hand(
     frames: str, right: float, gap: float, flicker: float, first: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,8 +108,7 @@ def test_frames_of_a_drive_of_both_have_their_distances_and_workers_have_the_sam
 
 @pytest.mark.medium
 @pytest.mark.parametrize(
-    ("grid", "samples"),
-    [({}, 3), ({"path.time": [0, 4, 2], "pose.yaw": [0, 90]}, 1), ({"pose.yaw": [0, 90]}, 3)],
+    ("grid", "samples"), [({}, 3), ({"path.time": [0, 4, 2], "pose.yaw": [0, 90]}, 1), ({"pose.yaw": [0, 90]}, 3)]
 )
 def test_frames_of_a_drive_share_their_draws_and_drives_do_not(grid: dict[str, Any], samples: int) -> None:
     result = advsearch.sweep(
@@ -217,15 +214,9 @@ def test_pictures_of_a_longer_sweep_of_the_same_seed_are_not_counted_twice(tmp_p
 def test_an_attack_over_a_path_keeps_its_adversarial_scene_along_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "run"
     size: dict[str, Any] = {
-        "resolution": 16,
-        "spp": 1,
-        "verify_spp": 1,
-        "steps": 3,
-        "policy": "pgd",
-        "epsilon": 0.5,
-        "trials": 6,
+        "resolution": 16, "spp": 1, "verify_spp": 1, "steps": 3, "policy": "pgd", "epsilon": 0.5, "trials": 6,
         "draws": 1,
-    }
+    }  # fmt: skip
     model = advsearch.load_model(Dark(), labels=("mug", "vase"), input_size=16, name="dark")
     over = {"path": {"seconds": 5.0, "reach": 1.5}}
     found = advsearch.attack(

@@ -38,9 +38,6 @@ def group(name: str, begin: int, size: int, valid: tuple[str, ...], **more: Any)
     return Group(parameter, size, valid, control=control, begin=begin, **more)
 
 
-# ---- what estimators compute ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_differences_are_central_differences_of_the_picture_with_one_seed() -> None:
     render = renderer(["camera"], estimators={"*": "differences"})
@@ -139,9 +136,6 @@ def test_turning_an_environment_has_the_right_sign_and_size() -> None:
     assert float(adjoint) == pytest.approx(truth.value, rel=0.1)
 
 
-# ---- nothing stays behind -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("others", [50, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_configuration_after_many_others_is_bitwise_that_of_a_fresh_scene(others: int) -> None:
@@ -183,9 +177,6 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
         if number < 4:
             assert len(of_a_move) == 1 + (number == 3)  # an integrator that is new makes recordings stale
     assert len(second) == len(held)
-
-
-# ---- settings of controls -------------------------------------------------------------------------------------------
 
 
 def test_a_rotation_vector_is_a_rotation_with_a_derivative_at_zero() -> None:

@@ -11,8 +11,9 @@ import torch
 
 import advsearch
 
+pytestmark = pytest.mark.medium
 
-@pytest.mark.medium
+
 def test_ground_truth_of_every_configuration_is_that_of_its_scene(tmp_path: Path) -> None:
     run = tmp_path / "run"
     advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, trials=0, run=run, aov="mask,depth", resolution=16, spp=1)
@@ -29,7 +30,6 @@ def test_ground_truth_of_every_configuration_is_that_of_its_scene(tmp_path: Path
     assert not np.array_equal(*masks)
 
 
-@pytest.mark.medium
 def test_an_attack_keeps_ground_truth_of_the_clean_scene_and_of_its_adversarial_scene(tmp_path: Path) -> None:
     names, scene = "mask,depth,normal,uv,id", advsearch.load_scene("mug")
     controls = {"pose": {"yaw": [0.0, 180.0]}}

@@ -130,9 +130,6 @@ def test_a_sweep_judges_each_picture_and_the_rig_by_its_rule(tmp_path: Path) -> 
     assert rights["any"] == 4 > rights["all"]  # the second looks away from the car
 
 
-# ---- scales of nerfstudio ---------------------------------------------------------------------------------------
-
-
 def transforms(folder: Path, factor: float, **entries: object) -> str:
     """Three frames, the second 0.3 m to the right of the first, the third turned; positions times a scale."""
     frames = []

@@ -20,13 +20,7 @@ def settings(controls: Any, **options: Any) -> dict[str, dict[str, object]]:
     return {one.name: one.to_settings() for one in make_configured_controls(config, config.controls)}
 
 
-@pytest.mark.parametrize(
-    ("asked", "name"),
-    [
-        ("texture", "texture"),
-        ("texture.texels:label", "texture:label"),
-    ],
-)
+@pytest.mark.parametrize(("asked", "name"), [("texture", "texture"), ("texture.texels:label", "texture:label")])
 def test_a_control_takes_the_settings_of_the_run_whatever_its_name(asked: str, name: str) -> None:
     found = settings({asked: {}}, **ALL)[name]
     assert (found["epsilon"], found["norm"], found["resolution"]) == (0.07, "l2", 16)
@@ -35,9 +29,6 @@ def test_a_control_takes_the_settings_of_the_run_whatever_its_name(asked: str, n
 def test_an_epsilon_for_one_control_leaves_the_others_their_own() -> None:
     found = settings("texture,geometry,texture:label", epsilon="geometry=0.02,texture:label=0.3")
     assert [one.get("epsilon") for one in found.values()] == [None, 0.02, 0.3]
-
-
-# ---- what nobody takes ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,8 @@ from advsearch.scene import library
 from advsearch.scene.surface_parts import MAP_SIZE
 from advsearch.tasks import make_task
 
+pytestmark = pytest.mark.medium
+
 SIDE = 48
 LABELS = ("mug", "vase")
 PATCH = (0.34, 0.42, 0.15, 0.3)
@@ -100,7 +102,6 @@ def is_the_patch(table: SurfaceTable, run: Path) -> None:
     )
 
 
-@pytest.mark.medium
 def test_a_patch_that_goes_with_failures_lights_up_and_no_other_model_s(tmp_path: Path) -> None:
     run = tmp_path / "run"
     summary = swept(run, Startled(), Never())
@@ -119,7 +120,6 @@ def test_a_patch_that_goes_with_failures_lights_up_and_no_other_model_s(tmp_path
     assert (found["wrong_0"] <= found["seen_0"]).all() and found["map_0"].shape == (5504, 3, 2)
 
 
-@pytest.mark.medium
 def test_a_stopped_sweep_and_one_that_is_asked_afterwards_have_the_same_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,17 +21,12 @@ from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels
 from stand_ins import Impatient, rows, shared
 
+pytestmark = pytest.mark.medium
+
 SMALL: dict[str, Any] = {
-    "resolution": 32,
-    "controls": {"texture": {"resolution": 8}},
-    "over": ["camera", "environment"],
-    "draws": 2,
-    "steps": 18,
-    "trials": 6,
-    "verify_spp": 4,
-    "baseline": False,
-    "deterministic": True,
-}
+    "resolution": 32, "controls": {"texture": {"resolution": 8}}, "over": ["camera", "environment"], "draws": 2,
+    "steps": 18, "trials": 6, "verify_spp": 4, "baseline": False, "deterministic": True,
+}  # fmt: skip
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -68,7 +63,6 @@ def off(monkeypatch: pytest.MonkeyPatch, *levels: float) -> None:
     monkeypatch.setattr(SurfaceLight, "_compare", found)
 
 
-@pytest.mark.medium
 def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, AttackResult], tmp_path: Path) -> None:
     """Light and comparisons are found again."""
     stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(9), **SMALL)
@@ -77,7 +71,6 @@ def test_a_search_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, Attack
     assert rows(tmp_path / "parts") == rows(whole[0])
 
 
-@pytest.mark.medium
 def test_light_is_renewed_and_then_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two comparisons in a row are too far off: the first finds light anew, after the second pictures are traced."""
     off(monkeypatch, 1.0, 9.0, 9.0)
@@ -87,7 +80,6 @@ def test_light_is_renewed_and_then_given_up(monkeypatch: pytest.MonkeyPatch) -> 
     assert summary.renders["products"] == 12 * 2
 
 
-@pytest.mark.medium
 def test_matrices_predict_what_light_on_surfaces_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it is too far off before the search."""
     off(monkeypatch, 9.0)
@@ -105,7 +97,6 @@ def viewpoints(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AttackRe
     return run, advsearch.attack("mug", run=run, **CAMERA)
 
 
-@pytest.mark.medium
 def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoints: tuple[Path, AttackResult]) -> None:
     """Two searches of 40 pictures, eight traced ones of each ranking; comparisons of two places after 0, 6, 12 and 24
     pictures. Rows say which were traced."""
@@ -118,7 +109,6 @@ def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoi
     assert spp == {("search", None, 0), ("ranking", 8, 1)}
 
 
-@pytest.mark.medium
 @pytest.mark.slow
 def test_a_search_for_a_viewpoint_goes_on_with_the_same_rows(
     viewpoints: tuple[Path, AttackResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

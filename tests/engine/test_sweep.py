@@ -119,20 +119,9 @@ def rows_of(run: Path) -> list[tuple[Any, ...]]:
 
 
 COMPARED = (
-    "kind",
-    "step",
-    "seed",
-    "spp",
-    "objective",
-    "score",
-    "success",
-    "correct",
-    "margin",
-    "label",
-    "label_index",
-    "probability",
-    "renders",
-)
+    "kind", "step", "seed", "spp", "objective", "score", "success", "correct", "margin", "label", "label_index",
+    "probability", "renders",
+)  # fmt: skip
 TIMES = ("seconds", "renders_per_second", "run", "command_line")
 
 
@@ -141,9 +130,6 @@ def timeless(summary: SweepSummary) -> dict[str, Any]:
 
 
 GRID = {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]}
-
-
-# ---- the product ----------------------------------------------------------------------------------------------------
 
 
 @examples(max_examples=200, deadline=None)
@@ -172,18 +158,14 @@ def test_a_draw_is_the_same_from_wherever_it_is_asked(sampler: str) -> None:
     np.testing.assert_array_equal(SampleSequence(3, sampler, 7).points(NET - 5, 10), whole[NET - 5 : NET + 5])
 
 
-# ---- axes -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("parameter", "given", "values"),
     [
-        (YAW, "0:360:24", [15.0 * k for k in range(24)]),
-        (YAW, "0:90:4", [0.0, 30.0, 60.0, 90.0]),
+        (YAW, "0:360:24", [15.0 * k for k in range(24)]), (YAW, "0:90:4", [0.0, 30.0, 60.0, 90.0]),
         (ELEVATION, "5:60:8", [float(v) for v in np.linspace(5, 60, 8)]),
         (ELEVATION, [np.int64(10), np.float64(30)], [10.0, 30.0]),
     ],
-)
+)  # fmt: skip
 def test_values_of_an_axis(parameter: Parameter, given: Any, values: list[float]) -> None:
     assert list(parse_axis_values("--grid x", parameter, given)) == values
 
@@ -199,9 +181,6 @@ def test_values_of_an_axis(parameter: Parameter, given: Any, values: list[float]
 def test_a_wrong_axis_is_named(name: str, values: Any) -> None:
     with pytest.raises(InputError, match=name):
         parse_axes({name: values}, ())
-
-
-# ---- from numbers to configurations ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -278,9 +257,6 @@ def test_a_million_million_points_start_at_once(scene: advsearch.Scene) -> None:
     assert [round(float(said[-1][name]["value"]), 6) for name in grid] == [359.964, 60.0, 0.1]
 
 
-# ---- what a sweep says ----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), GRID, controls="camera.azimuth", samples=10, run=tmp_path / "run")
@@ -339,13 +315,9 @@ def test_the_worst_is_the_smallest_margin_and_is_rendered_again(tmp_path: Path) 
 def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
     models = [model(0.5, "strict"), model(0.9, "easy")]
     result = advsearch.sweep(
-        ["mug", "bowl"],
-        models,
-        {"pose.yaw": [0, 90, 180]},
-        environment="studio,noon",
-        label="mug",
+        ["mug", "bowl"], models, {"pose.yaw": [0, 90, 180]}, environment="studio,noon", label="mug",
         run=tmp_path / "run",
-    )
+    )  # fmt: skip
     rows = list(result.rows())
     places = [
         (row.values["object"]["value"], row.values["environment"]["value"], row.values["model"]["value"])
@@ -380,16 +352,10 @@ def test_outputs_that_are_not_finite_are_counted_and_not_right() -> None:
     assert result.summary.worst is not None and math.isfinite(result.summary.worst.claimed.margin)
 
 
-# ---- what survives --------------------------------------------------------------------------------------------------
-
 SURVIVES: dict[str, Any] = {
-    "grid": {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]},
-    "controls": {"camera": {"azimuth": [0, 90]}},
-    "samples": 3,
-    "batch": 4,
-    "trials": 6,
-    "environment": "studio,noon",
-}
+    "grid": {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]}, "controls": {"camera": {"azimuth": [0, 90]}},
+    "samples": 3, "batch": 4, "trials": 6, "environment": "studio,noon",
+}  # fmt: skip
 
 
 PICTURES, WHOLE = 2 * 6 * 3 * 3, 108 + 8 + 6 + 1
@@ -431,9 +397,6 @@ def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     assert 0 <= rendered_again < (5 if stops_at < PICTURES else 9)  # a look and a batch; or what chose the sample count
 
 
-# ---- configuration and command line ---------------------------------------------------------------------------------
-
-
 def kept_configuration(folder: Path, controls: dict[str, Any], answer: list[float]) -> Path:
     """Make a run of an attack whose answer is put in by hand."""
     config = AttackConfig(object="mug", controls=controls, over={"camera": {"elevation": [5, 60]}}, run=str(folder))
@@ -441,9 +404,6 @@ def kept_configuration(folder: Path, controls: dict[str, Any], answer: list[floa
         run.write_summary(attack_result(run=str(folder), ending="interrupted", verified=None))
         write_configuration(run.path, np.array(answer, dtype=np.float32))
     return folder
-
-
-# ---- with the renderer ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -477,9 +437,6 @@ def test_pictures_are_kept_as_asked(tmp_path: Path, keep: Literal["all", "wrong"
     assert 0 < len(wrong) < 8
     files = (tmp_path / "run" / "images" / "rows").glob("*/*.jpg")
     assert {int(file.stem) for file in files} == {"all": set(range(8)), "wrong": wrong, "none": set()}[keep]
-
-
-# ---- the answer of a run beside the clean scene ----------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -552,9 +509,6 @@ def test_what_is_rendered_with_an_adversarial_scene_is_the_adversarial_scene_rea
     assert clean == pytest.approx([row.margin for row in plain.rows()], abs=1e-3)
     assert answer == pytest.approx([row.margin for row in found.rows()], abs=1e-3)
     assert abs(clean[0] - answer[0]) > 0.1
-
-
-# ---- changed pictures -----------------------------------------------------------------------------------------------
 
 
 CHANGES: dict[str, Any] = {"must_change": "black,covered,away", "must_not_change": "exposure,shift,jpeg"}

@@ -24,6 +24,8 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Store
 
+pytestmark = pytest.mark.medium
+
 SMALL = {"object": "mug", "grid": {"pose.yaw": "0:360:3", "camera.elevation": [5, 35]}, "environment": "studio,noon"}
 CONFIG = SweepConfig(**SMALL, batch=2, resolution=16, spp=1, trials=0)
 
@@ -79,7 +81,6 @@ def shared(path: Path, resumed: bool = False, **given: Any) -> Any:
         return Sweep(job, run, NullProgress(), executor).execute()
 
 
-@pytest.mark.medium
 def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_path: Path) -> None:
     job = load_job(CONFIG)
     with RunDirectory.create(tmp_path / "alone") as run:
@@ -92,7 +93,6 @@ def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_p
     assert rows(path) == rows(tmp_path / "alone") and summary(again) == summary(alone)
 
 
-@pytest.mark.medium
 def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path: Path) -> None:
     result = shared(tmp_path / "run", lose=7)
     (lost,) = [row for row in result.rows() if row.label == LOST_LABEL]
@@ -105,7 +105,6 @@ def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path:
     assert any("every worker that took it died" in text for text in again.summary.warnings)
 
 
-@pytest.mark.medium
 def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: Path) -> None:
     class Two(Disorder):
         def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
@@ -123,7 +122,6 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
     assert any(told in text for text in result.summary.warnings)
 
 
-@pytest.mark.medium
 def test_two_workers_have_the_rows_of_none(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Really rendered, by processes of their own."""
     words = ["sweep", "--object", "mug", "--grid", "pose.yaw=0:360:4", "--grid", "camera.elevation=5:60:2"]

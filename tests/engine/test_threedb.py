@@ -12,18 +12,12 @@ import pytest
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError
 from advsearch.questions.sweep.result import import_threedb
-from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.thumbnails import find_thumbnails
-from stored_sweeps import make_sweep
+from stored_sweeps import make_sweep, rows_of
 
 
 def lines_of(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "details.log").read_text().splitlines()]
-
-
-def rows_of(run: Path) -> list[Row]:
-    with Store(run / NAME, read_only=True) as store:
-        return list(store.rows("sweep"))
 
 
 def write(folder: Path, *lines: Any, classes: Any = ("cup", "mug")) -> Path:

@@ -224,9 +224,5 @@ def images(random: Random) -> Case:
 
 
 MAKERS: tuple[Maker, ...] = (
-    bytes_damaged,
-    *([types_confused] * 4),
-    bombs,
-    images,
-    text,
-)
+    bytes_damaged, *([types_confused] * 4), bombs, images, text,
+)  # fmt: skip

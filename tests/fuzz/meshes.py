@@ -81,9 +81,6 @@ def box_file(kind: str, encoding: str = "") -> bytes:
     return written.encode() if isinstance(written, str) else written
 
 
-# --- Wavefront OBJ ----------------------------------------
-
-
 def obj(random: Random) -> Case:
     """A damaged OBJ or material file."""
     files = {"thing.obj": box_obj(), "thing.mtl": MTL, "wood.png": sample("PNG")}
@@ -157,9 +154,6 @@ def special(random: Random) -> Case:
     if random.random() < 0.4:
         return Case(f"special: a pipe as {name}", loader, name, {}, pipes=(name,))
     return Case(f"special: a link to {target} as {name}", loader, name, {}, {name: target})
-
-
-# --- PLY and STL ----------------------------------------
 
 
 def ply(random: Random) -> Case:

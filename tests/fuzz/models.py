@@ -75,8 +75,7 @@ def model(random: Random) -> Case:
         f"{chosen} damaged": lambda: in_one(lambda content: damaged(random, content or b"\0")[1]),
         f"{chosen} empty": lambda: in_one(lambda content: b""),
         "a planted pickle": lambda: in_one(
-            lambda content: pickle.dumps(Planted()),
-            next((n for n in names if n.endswith(("data.pkl", ".pt"))), chosen),
+            lambda content: pickle.dumps(Planted()), next((n for n in names if n.endswith(("data.pkl", ".pt"))), chosen)
         ),
         "a bomb": lambda: repacked(data, lambda _, content: content, {f"{root}/data/bomb": bytes(1 << 30)}),
         "a name above": lambda: repacked(data, lambda _, content: content, {"../planted": b"x"}),

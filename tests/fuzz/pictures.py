@@ -93,9 +93,6 @@ def stuck_picture(random: Random) -> Case:
     return Case(f"picture: {what}", "picture", "print.png", {"print.png": data})
 
 
-# --- Radiance ----------------------------------------
-
-
 def radiance(height: int = 8, width: int = 16, *, packed: bool = True) -> bytes:
     """Return a small honest Radiance map."""
     pixels = (np.arange(height * width * 4) % 120 + 40).astype(np.uint8).reshape(height, width, 4)
@@ -135,9 +132,6 @@ def hdr(random: Random) -> Case:
     return Case(f"hdr: {what}", "environment", "room.hdr", {"room.hdr": data})
 
 
-# --- OpenEXR ----------------------------------------
-
-
 @cache
 def exr(
     compression: str = "ZIP", *, tiled: bool = False, kind: str = "half", names: str = "RGB", side: int = 8
@@ -171,15 +165,10 @@ def environment(random: Random) -> Case:
     if draw < 0.3:
         box = random.choice(
             (
-                (0, 0, 19_999, 9_999),
-                (0, 0, 2**31 - 1, 2**31 - 1),
-                (-(2**31), -(2**31), 2**31 - 1, 2**31 - 1),
-                (0, 0, 1_000_000, 10),
-                (0, 0, 10, 1_000_000),
-                (5, 5, 0, 0),
-                (1_000, 1_000, 1_015, 1_007),
+                (0, 0, 19_999, 9_999), (0, 0, 2**31 - 1, 2**31 - 1), (-(2**31), -(2**31), 2**31 - 1, 2**31 - 1),
+                (0, 0, 1_000_000, 10), (0, 0, 10, 1_000_000), (5, 5, 0, 0), (1_000, 1_000, 1_015, 1_007),
             )
-        )
+        )  # fmt: skip
         name = random.choice((b"dataWindow", b"dataWindow", b"displayWindow"))
         what, data = f"{name.decode()} {box}", _window(data, name, box)
     elif draw < 0.45:  # the bits that say tiled, deep, long names, multipart

@@ -107,9 +107,6 @@ def chat(text: str, **more: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
     return lambda asked: {"choices": [{"message": {"content": text}}], "usage": usage, **more}
 
 
-# ---- the protocols --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_the_server_of_the_page_is_the_model_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its logits are those of the model that it asks, of a picture of 8 bits, up to a constant of each picture."""
@@ -157,9 +154,6 @@ def test_a_chat_is_asked_with_its_name_and_the_key(server: Server, monkeypatch: 
     assert SECRET not in f"{model!r}{vars(model)}{vars(model.module)}"
 
 
-# ---- servers that behave badly --------------------------------------------------------------------------------------
-
-
 def ask_of(server: Server, **ask: float) -> Any:
     return advsearch.load_model(server.url, task="answer", ask=ask)(torch.zeros((8, 8, 3)))
 
@@ -180,7 +174,6 @@ def test_a_busy_server_is_asked_again(server: Server, status: int) -> None:
         ((200, {}, b"[" * 100_000), "expected JSON", 1),
         ((200, {}, b'{"scores": {"mug": NaN}}'), "expected JSON", 1),
         ((200, {}, b'{"text": "' + b"a" * (2 << 20)), "an answer of at most 1,048,576 bytes, got a longer one", 1),
-        
     ],
 )  # fmt: skip
 def test_what_cannot_be_read_ends_in_a_sentence(server: Server, reply: Reply, expected: str, calls: int | None) -> None:
@@ -274,18 +267,14 @@ def test_the_key_is_in_no_message(server: Server, monkeypatch: pytest.MonkeyPatc
     assert SECRET not in str(refused.value)
 
 
-# ---- what is refused ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("spec", "expected"),
     [
-        ("http://host:port/", "expected an address"),
-        ("https://user:pass@host/", "would be stored with the run"),
+        ("http://host:port/", "expected an address"), ("https://user:pass@host/", "would be stored with the run"),
         ("https://host/?api_key=1", "`api_key` in the address"),
         ("http://localhost.example.org/", "would go there unencrypted"),
     ],
-)
+)  # fmt: skip
 def test_addresses_that_are_refused(spec: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(KEY, SECRET)
     with pytest.raises(InputError, match=expected):
@@ -301,9 +290,6 @@ def test_an_address_that_only_a_file_names_is_asked_nothing(
         assert main(["run", str(file), "--quiet"]) == 2
     assert f"a file names the model {server.url}" in capsys.readouterr().err
     assert not server.came
-
-
-# ---- limits, and runs -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

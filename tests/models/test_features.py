@@ -54,18 +54,12 @@ def exported(network: nn.Module, folder: Path, lower: Callable[[Any], Any] = lam
     return path
 
 
-# ---- modules --------------------------------------------------------------------------------------------------------
-
-
 def test_a_module_gives_the_input_of_its_last_linear_layer() -> None:
     network = sequential()
     features = features_of(load(network))
     assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
     assert (features.size, features.penultimate) == (7, True)
     assert features.source == "the input of 6 (Linear), 7 numbers"
-
-
-# ---- programs -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -76,9 +70,6 @@ def test_an_exported_program_gives_what_its_module_gave(tmp_path: Path, lower: C
     features = features_of(load_model(exported(network, tmp_path, lower)))
     assert features.penultimate and features.source.startswith("the input of the operator ")
     assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
-
-
-# ---- all of them ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")

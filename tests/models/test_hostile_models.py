@@ -249,15 +249,11 @@ def test_nested_descriptions_are_refused(depth: int, exported: Path, tmp_path: P
 @pytest.mark.parametrize(
     "text",
     [
-        "2*s77 + 1",
-        "(s0 - 1)//32 + 1",
-        "FloorDiv(Add(Symbol('s0', integer=True), Integer(-1)), Integer(32))",
-        "Mul(Rational(1, 2), Symbol('s0'))",
-        "Max(Integer(1), Min(Symbol('s1'), Integer(64)))",
-        "Mul(Float('0.5', precision=53), ToFloat(Symbol('s0')))",
-        "And(StrictLessThan(Integer(1), Symbol('s0')), true)",
+        "2*s77 + 1", "(s0 - 1)//32 + 1", "FloorDiv(Add(Symbol('s0', integer=True), Integer(-1)), Integer(32))",
+        "Mul(Rational(1, 2), Symbol('s0'))", "Max(Integer(1), Min(Symbol('s1'), Integer(64)))",
+        "Mul(Float('0.5', precision=53), ToFloat(Symbol('s0')))", "And(StrictLessThan(Integer(1), Symbol('s0')), true)",
     ],
-)
+)  # fmt: skip
 def test_expressions_of_sizes_that_are_read(text: str) -> None:
     assert reader.problem(text) == ""
 
@@ -265,31 +261,16 @@ def test_expressions_of_sizes_that_are_read(text: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "__import__('os').system('true')",
-        "s0.__class__",
-        "(lambda: 1)()",
-        "sympify('1')",
-        "Symbol('s0', **{'a': True})",
-        "Symbol('s0', positive=__import__('os').system('true'), positive=True)",
-        "Float('1e999999999')",
-        "Float('1', precision=10**9)",
-        "9**9**9",
-        "Pow(Pow(Integer(2), Integer(64)), Integer(64))",
-        "1" * 50,
-        "-" * 30_000 + "1",
-        "(" * 300 + "1" + ")" * 300,
-        "s0; s1",
-        "x" * 5000,
-        "Max(" + ", ".join(f"s{i}" for i in range(100)) + ")",
+        "__import__('os').system('true')", "s0.__class__", "(lambda: 1)()", "sympify('1')",
+        "Symbol('s0', **{'a': True})", "Symbol('s0', positive=__import__('os').system('true'), positive=True)",
+        "Float('1e999999999')", "Float('1', precision=10**9)", "9**9**9",
+        "Pow(Pow(Integer(2), Integer(64)), Integer(64))", "1" * 50, "-" * 30_000 + "1", "(" * 300 + "1" + ")" * 300,
+        "s0; s1", "x" * 5000, "Max(" + ", ".join(f"s{i}" for i in range(100)) + ")",
     ],
-)
+)  # fmt: skip
 def test_expressions_that_are_none(text: str) -> None:
     message = reader.problem(text)
     assert message and len(message) < 250
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# TorchScript
 
 
 def scripted(module: nn.Module, path: Path) -> Path:
@@ -400,12 +381,11 @@ def exported_program(module: nn.Module, path: Path) -> Path:
 @pytest.mark.parametrize(
     ("module", "save"),
     [
-        (NeverEnds(), scripted),
-        (NeverEndsLoading(), scripted),
+        (NeverEnds(), scripted), (NeverEndsLoading(), scripted),
         pytest.param(SumsForYears(), exported_program, marks=pytest.mark.slow),
     ],
     ids=["loop", "loop while loading", "sum"],
-)
+)  # fmt: skip
 def test_a_model_without_an_end_ends_with_one_sentence(
     module: nn.Module, save: Callable[[nn.Module, Path], Path], tmp_path: Path
 ) -> None:
@@ -469,10 +449,6 @@ def test_torchscript_that_swells_is_refused(script: Path, tmp_path: Path) -> Non
     path = repacked(script, tmp_path / "net.pt", {"extra/zeros": bytes(64 << 20)}, zipfile.ZIP_DEFLATED)
     with pytest.raises(FileFormatError, match="unpacks to at most 20 times its size"):
         load_model(path, input_size=8)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# what is no ordinary file
 
 
 def test_pipes_and_devices_are_no_models(tmp_path: Path) -> None:

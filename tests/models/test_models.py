@@ -54,10 +54,6 @@ def images(count: int = 2, height: int = 8, width: int = 8, seed: int = 0) -> Te
     return torch.rand((count, height, width, 3), generator=torch.Generator().manual_seed(seed))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# the function from images to logits
-
-
 def test_one_image_and_a_batch_give_the_same_rows() -> None:
     model = tiny()
     batch = images(3)
@@ -136,10 +132,6 @@ def test_batches_are_cut_and_padded() -> None:
     torch.testing.assert_close(logits, tiny()(batch))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# the network that was passed stays the caller's own
-
-
 def test_evaluation_mode_and_frozen_without_touching_the_original() -> None:
     first, second = nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)
     original = nn.Sequential(first, second, nn.Dropout(0.9), nn.AdaptiveAvgPool2d(1), nn.Flatten())
@@ -158,10 +150,6 @@ def test_evaluation_mode_and_frozen_without_touching_the_original() -> None:
     assert not torch.allclose(before, model(leaf))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# the probe
-
-
 class Answering(nn.Module):
     """Answers with whatever a function makes of the logits of `Tiny`."""
 
@@ -176,12 +164,10 @@ class Answering(nn.Module):
 @pytest.mark.parametrize(
     "answer",
     [
-        lambda z: (z, "features"),
-        lambda z: [z],
-        lambda z: {"loss": None, "logits": z},
+        lambda z: (z, "features"), lambda z: [z], lambda z: {"loss": None, "logits": z},
         lambda z: types.SimpleNamespace(logits=z),
     ],
-)
+)  # fmt: skip
 def test_usual_containers_of_logits_are_opened(answer: Any) -> None:
     model = load_model(Answering(answer), input_size=8)
     torch.testing.assert_close(model(images()), tiny()(images()))
@@ -191,12 +177,10 @@ def test_usual_containers_of_logits_are_opened(answer: Any) -> None:
     ("answer", "named"),
     [
         (lambda z: z[:, :, None, None], "task=segmentation"),
-        (lambda z: (z[:, :, None].expand(-1, -1, 4), z), "task=detection"),
-        (lambda z: z[0], "batch"),
-        (lambda z: z.argmax(1, keepdim=True).expand(-1, 3), "int64"),
-        (lambda z: z * float("nan"), "NaN"),
+        (lambda z: (z[:, :, None].expand(-1, -1, 4), z), "task=detection"), (lambda z: z[0], "batch"),
+        (lambda z: z.argmax(1, keepdim=True).expand(-1, 3), "int64"), (lambda z: z * float("nan"), "NaN"),
     ],
-)
+)  # fmt: skip
 def test_outputs_that_are_not_logits(answer: Any, named: str) -> None:
     with pytest.raises(ModelError, match=named):
         load_model(Answering(answer), input_size=8)
@@ -213,15 +197,11 @@ def test_probabilities_become_log_odds_with_one_warning() -> None:
 @pytest.mark.parametrize(
     "answer",
     [
-        torch.sigmoid,
-        lambda z: -z.log_softmax(1),
-        lambda z: z + torch.rand_like(z),
-        lambda z: z - 0.5 * z.mean(0),
-        lambda z: torch.from_numpy(z.detach().numpy()),
-        lambda z: 0.0 * z + torch.arange(3.0),
+        torch.sigmoid, lambda z: -z.log_softmax(1), lambda z: z + torch.rand_like(z), lambda z: z - 0.5 * z.mean(0),
+        lambda z: torch.from_numpy(z.detach().numpy()), lambda z: 0.0 * z + torch.arange(3.0),
     ],
     ids=["sigmoid", "costs", "random", "mixes its batch", "no gradient", "zero gradient"],
-)
+)  # fmt: skip
 def test_outputs_that_are_doubtful_logits_are_warned_of(answer: Callable[[Tensor], Tensor]) -> None:
     with pytest.warns(ModelWarning, match="Answering"):
         model = load_model(Answering(answer), input_size=8)
@@ -238,23 +218,15 @@ def test_a_network_for_single_images_is_asked_one_at_a_time() -> None:
     torch.testing.assert_close(model(images(3)), tiny()(images(3)))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# labels and label sets
-
 LABELS = ("tench, Tinca tinca", "Coffee Mug", "cup", "crane", "teapot", "crane", "7", "missile", "projectile, missile")
 
 
 @pytest.mark.parametrize(
     "text, indices",
     [
-        ("coffee mug,cup", (1, 2)),
-        ("tinca TINCA", (0,)),
-        ("#3", (3,)),
-        ("4", (4,)),
-        ("7", (6,)),
-        (["cup", 4], (2, 4)),
+        ("coffee mug,cup", (1, 2)), ("tinca TINCA", (0,)), ("#3", (3,)), ("4", (4,)), ("7", (6,)), (["cup", 4], (2, 4)),
     ],
-)
+)  # fmt: skip
 def test_label_sets(text: Any, indices: tuple[int, ...]) -> None:
     assert find_label_set(text, LABELS) == LabelSet(tuple(LABELS[i] for i in indices), indices)
 
@@ -275,11 +247,10 @@ def test_label_sets_that_are_errors(text: str, message: str) -> None:
 @pytest.mark.parametrize(
     "name, text",
     [
-        ("a.json", '["mug", "bowl", "vase"]'),
-        ("b.json", '{"2": "vase", "0": "mug", "1": "bowl"}'),
+        ("a.json", '["mug", "bowl", "vase"]'), ("b.json", '{"2": "vase", "0": "mug", "1": "bowl"}'),
         ("c.txt", "mug\nbowl\r\nvase\n"),
     ],
-)
+)  # fmt: skip
 def test_label_files(tmp_path: Path, name: str, text: str) -> None:
     path = tmp_path / name
     path.write_text(text)
@@ -289,20 +260,14 @@ def test_label_files(tmp_path: Path, name: str, text: str) -> None:
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("a.json", b'["mug", '),
-        ("a.json", b'{"1": "mug", "2": "bowl"}'),
-        ("a.txt", b"\xff\xfe"),
+        ("a.json", b'["mug", '), ("a.json", b'{"1": "mug", "2": "bowl"}'), ("a.txt", b"\xff\xfe"),
         ("a.txt", b"mug\nbowl\n"),
     ],
-)
+)  # fmt: skip
 def test_label_files_that_are_errors(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(FileFormatError, match=name):
         tiny(labels=tmp_path / name)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# files
 
 
 @pytest.fixture(scope="module")
@@ -411,9 +376,6 @@ def test_damaged_files(tmp_path: Path, exported: Path) -> None:
             load_model(tmp_path / name)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Python code
-
 NETS = """
 import torch
 from advsearch.models import load_model
@@ -460,20 +422,14 @@ def test_callables_from_the_current_directory(nets: Path) -> None:
 @pytest.mark.parametrize(
     ("spec", "named"),
     [
-        ("no_such_nets:Net", "no_such_nets"),
-        ("needy_nets:Net", "not_there_at_all"),
-        ("wrong_nets:Net", "ZeroDivisionError"),
-        ("my_nets:nothing", "NoneType"),
+        ("no_such_nets:Net", "no_such_nets"), ("needy_nets:Net", "not_there_at_all"),
+        ("wrong_nets:Net", "ZeroDivisionError"), ("my_nets:nothing", "NoneType"),
     ],
-)
+)  # fmt: skip
 def test_callables_that_are_errors(nets: Path, spec: str, named: str) -> None:
     with pytest.raises(ModelError, match=named):
         load_model(spec)
     sys.modules.pop("my_nets", None)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# the reference network
 
 
 def test_reference_is_stored_and_loaded(tmp_path: Path) -> None:

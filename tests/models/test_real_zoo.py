@@ -59,10 +59,6 @@ def assert_gradient(model: Model) -> None:
     assert float(seen) == pytest.approx(float((gradient * step).sum()), rel=0.1)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# torchvision
-
-
 def test_a_classifier_is_fed_as_its_weights_say(torchvision: Any, tmp_path: Path) -> None:
     models, name = torchvision.models, "squeezenet1_1"
     network = stirred(models.get_model(name, weights=None))
@@ -101,10 +97,6 @@ def test_a_detector_finds_what_it_finds_by_itself(torchvision: Any, tmp_path: Pa
     assert float((ours["boxes"] - theirs["boxes"]).abs().max()) < 1e-3
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# timm
-
-
 def theirs(timm: Any, network: nn.Module) -> Tensor:
     """What timm's own pipeline answers to the picture, at the size that its network takes."""
     asked = timm.data.resolve_model_data_config(network)
@@ -123,7 +115,3 @@ def test_a_network_of_timm_is_fed_as_timm_says(timm: Any, tmp_path: Path) -> Non
     assert_gradient(model)
     with pytest.raises(ModelError, match="task=similarity"):
         load_model(timm.create_model("test_vit", num_classes=0))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# processors of transformers that work with torchvision

@@ -26,10 +26,7 @@ class Answers(nn.Module):
 @pytest.mark.parametrize("task", ["classification", "segmentation"])
 @pytest.mark.parametrize(
     "form",
-    [
-        lambda pixels: pixels.argmax(dim=1),
-        lambda pixels: {"logits": pixels.argmax(dim=1).int()},
-    ],
+    [lambda pixels: pixels.argmax(dim=1), lambda pixels: {"logits": pixels.argmax(dim=1).int()}],
     ids=["pixels", "logits"],
 )
 def test_chosen_classes_are_no_scores(form: Any, task: str) -> None:

@@ -10,7 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from advsearch.models import Model, load_model
+from advsearch.models import load_model
+from small_models import assert_slope, loud
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 
@@ -21,14 +22,11 @@ SPECIAL = ["[PAD]", "[UNK]", "[CLS]", "[SEP]"]
 PICTURES = torch.rand((2, SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
 SIZES = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 8}
 READS = {
-    "vocab_size": 40,
-    "max_position_embeddings": 12,
-    "pad_token_id": 0,
-    "bos_token_id": 2,
-    "eos_token_id": 3,
+    "vocab_size": 40, "max_position_embeddings": 12, "pad_token_id": 0, "bos_token_id": 2, "eos_token_id": 3,
     "attention_dropout": 0.5,
-}
+}  # fmt: skip
 SIGLIP = pytest.mark.filterwarnings("ignore:.*judges each name by itself")
+pytestmark = SIGLIP
 
 
 def tokenizer() -> Any:
@@ -42,15 +40,6 @@ def tokenizer() -> Any:
     )
     marks = dict(zip(("pad_token", "unk_token", "bos_token", "eos_token"), SPECIAL, strict=True))
     return transformers.PreTrainedTokenizerFast(tokenizer_object=words, model_max_length=12, **marks)
-
-
-def loud(network: Any) -> Any:
-    """The network with random weights that are large enough for answers that differ, always the same."""
-    generator = torch.Generator().manual_seed(0)
-    for name, parameter in network.named_parameters():
-        if parameter.dim() > 1 or "embedding" in name:
-            parameter.data = torch.randn(parameter.shape, generator=generator) * 0.3
-    return network
 
 
 def published(folder: Path, family: str = "CLIP", *, picture: dict[str, Any] | None = None) -> str:
@@ -82,7 +71,6 @@ def theirs(folder: Path, texts: list[str]) -> Tensor:
     return logits
 
 
-@SIGLIP
 @pytest.mark.parametrize("family", ["CLIP", "Siglip"])
 def test_logits_are_the_librarys(tmp_path: Path, family: str) -> None:
     model = load_model(published(tmp_path, family), labels="mug, cup,bowl,vase")
@@ -95,7 +83,6 @@ def test_logits_are_the_librarys(tmp_path: Path, family: str) -> None:
 
 
 @pytest.mark.medium
-@SIGLIP
 @pytest.mark.parametrize("family", ["CLIP", "Siglip"])
 def test_prompts_are_averaged(tmp_path: Path, family: str) -> None:
     spec, prompts = published(tmp_path, family), ["a photo of a {}", "the bad {}.", "{}"]
@@ -121,19 +108,13 @@ def test_prompts_are_averaged(tmp_path: Path, family: str) -> None:
     assert float((alone - asked).abs().max()) > 1e-3, "one prompt says something else"
 
 
-@SIGLIP
 @pytest.mark.parametrize("family", ["CLIP", "Siglip"])
 def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> None:
     model = load_model(published(tmp_path, family), labels=NAMES)
-    image = PICTURES[0].mul(0.8).add(0.1).requires_grad_()
-    gradient = torch.autograd.grad(_lead(model, image), image)[0]
-    way = torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
-    with torch.no_grad():
-        seen = (_lead(model, image + 2e-3 * way) - _lead(model, image - 2e-3 * way)) / 4e-3
-    assert float(seen) == pytest.approx(float((gradient * way).sum()), rel=0.02)
+    way = torch.randn(PICTURES[0].shape, generator=torch.Generator().manual_seed(1))
 
+    def lead(image: Tensor) -> Tensor:
+        first, second, *_ = model(image)[0]
+        return torch.sub(first, second)
 
-def _lead(model: Model, image: Tensor) -> Tensor:
-    logits = model(image)[0]
-    lead: Tensor = logits[0] - logits[1]
-    return lead
+    assert_slope(lead, PICTURES[0].mul(0.8).add(0.1), way, 2e-3, 0.02)

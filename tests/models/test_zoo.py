@@ -63,11 +63,9 @@ class Finds(Net):
     def found(self, image: Tensor) -> dict[str, Tensor]:
         _, height, width = image.shape
         return {
-            "boxes": torch.tensor([[0.0, 0.0, width, height]]),
-            "labels": torch.tensor([1]),
-            "scores": image.mean()[None],
-            "masks": image[None, :1],
-        }
+            "boxes": torch.tensor([[0.0, 0.0, width, height]]), "labels": torch.tensor([1]),
+            "scores": image.mean()[None], "masks": image[None, :1],
+        }  # fmt: skip
 
 
 def expected(scale: float, shift: float, bias: Tensor) -> Tensor:
@@ -101,12 +99,9 @@ def torchvision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         return networks[name]()
 
     networks: dict[str, Callable[[], nn.Module]] = {
-        "tiny_net": Net,
-        "tiny_pixels": Pixels,
-        "tiny_rcnn": lambda: Finds(None, (16, 24)),
-        "tiny_fcos": lambda: Finds(None, 20),
-        "tiny_ssd": lambda: Finds((12, 10), (10,)),
-    }
+        "tiny_net": Net, "tiny_pixels": Pixels, "tiny_rcnn": lambda: Finds(None, (16, 24)),
+        "tiny_fcos": lambda: Finds(None, 20), "tiny_ssd": lambda: Finds((12, 10), (10,)),
+    }  # fmt: skip
 
     library: Any = types.ModuleType("torchvision")
     library.models = types.ModuleType("torchvision.models")
@@ -208,10 +203,6 @@ def test_timm_brings_its_weights_and_what_belongs_to_them(timm: Any, tmp_path: P
     torch.testing.assert_close(model(IMAGES), expected(0.25, 0.5, torch.ones(3)))
     with pytest.raises(UnknownNameError, match="tiny_net"):
         load_model("timm:tinynet")
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# ONNX
 
 
 class Session:
@@ -322,10 +313,6 @@ def test_an_input_of_onnx_that_is_no_picture(
     monkeypatch.setattr(Session, "shape", shape)
     with pytest.raises(ModelError, match=named):
         load_model(onnx_file(tmp_path, b"\x08\x09"))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# gradients that do not say how answers change
 
 
 class Steps(nn.Module):

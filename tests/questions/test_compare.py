@@ -75,11 +75,9 @@ def stored(
                 for model, (name, right) in enumerate(models.items()):
                     is_right = right(elevation, luck) and not (half and luck < 0.5)
                     values: dict[str, Value] = {
-                        "object": described(config.object),
-                        **({"answer": described(answer)} if answer else {}),
-                        "model": described(name),
-                        "camera.elevation": described(elevation, "degrees"),
-                    }
+                        "object": described(config.object), **({"answer": described(answer)} if answer else {}),
+                        "model": described(name), "camera.elevation": described(elevation, "degrees"),
+                    }  # fmt: skip
                     rows.append(
                         Row("sweep", place * len(models) + model, correct=is_right, values=values, seconds=0.25,
                             margin=1.0 if is_right else -1 - luck, label="mug" if is_right else "bowl")
@@ -98,9 +96,6 @@ def compared(*runs: Path, **asked: Any) -> tuple[CompareResult, ComparedPair]:
     """The result and its first pair."""
     result = advsearch.compare(list(runs), run=runs[0].parent / "compared", **{"pictures": 0, **asked})
     return result, result.pairs[0]
-
-
-# ---- what it says ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -160,9 +155,6 @@ def test_a_sweep_with_an_adversarial_scene_is_compared_without_it_and_beside_oth
     assert [pair.first_only > 0 for pair in result.pairs] == [True, True] and result.pairs[0].second_only == 0
 
 
-# ---- what it refuses ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_sweeps_that_are_no_pairs_are_refused(tmp_path: Path) -> None:
     one = stored(tmp_path / "one", {"net": good})
@@ -184,9 +176,6 @@ def test_sweeps_that_are_no_pairs_are_refused(tmp_path: Path) -> None:
         assert not (tmp_path / "no").exists()
 
 
-# ---- the numbers ----------------------------------------------------------------------------------------------------
-
-
 def test_mcnemar_is_the_exact_binomial_test() -> None:
     assert mcnemar(1, 9) == mcnemar(9, 1) == pytest.approx(2 * (1 + 10) / 2**10)
     assert (mcnemar(0, 0), mcnemar(5, 5), mcnemar(0, 5)) == (1.0, 1.0, 2 / 2**5)
@@ -205,9 +194,6 @@ def test_p_value_and_interval_err_no_more_often_than_they_say(shares: Sequence[f
     assert np.mean([low <= truth <= high for low, high in ends]) > 0.94
     called = np.mean([p(cells[1], cells[2]) <= 0.05 for cells in drawn])
     assert called < 0.05 if truth == 0 else called > 0.8
-
-
-# ---- as it is typed -------------------------------------------------------------------------------------------------
 
 
 def test_a_comparison_that_was_stopped_goes_on(

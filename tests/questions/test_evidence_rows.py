@@ -14,11 +14,7 @@ import samples
 import small_models
 from advsearch.cli.main import main
 from advsearch.questions.explain.result import ExplainResult
-from advsearch.questions.report.evidence import (
-    collect_claims,
-    evaluate_criterion,
-    list_triggering_conditions,
-)
+from advsearch.questions.report.evidence import collect_claims, evaluate_criterion, list_triggering_conditions
 from advsearch.report.wording import percent
 from advsearch.runs.store import NAME, Store
 from advsearch.statistics.intervals import clopper_pearson

@@ -42,10 +42,9 @@ def stored(path: Path, wrong: Any, rows: int = 600, model: str = "reference", se
             elevation, power = generator.uniform(5.0, 85.0), generator.uniform(0.0, 2.0)
             is_wrong = bool(wrong(elevation)) ^ (generator.random() < 0.03)
             values = {
-                "camera.elevation": described(elevation, "degrees"),
-                "light.power": described(power, "1"),
+                "camera.elevation": described(elevation, "degrees"), "light.power": described(power, "1"),
                 "model": described("reference"),
-            }
+            }  # fmt: skip
             label = "bowl" if is_wrong else "mug"
             made.append(Row("sweep", step, correct=not is_wrong, margin=0.5, label=label, values=values))
         run.append_rows(*made, *(Row("verification", step, correct=False, label="bowl") for step in range(20)))
@@ -164,9 +163,6 @@ def test_failures_are_grouped_by_what_the_model_decides_by(
     assert all(sum(one.answers.values()) == one.failures and "bowl" in one.answers for one in found.listed)
     shades = {round(float(iio.imread(tmp_path / "run" / one.picture).mean()) / 255.0, 1) for one in found.listed}
     assert shades == {0.2, 0.8}
-
-
-# ---- the same draw, come twice ---------------------------------------------------------------------------------------
 
 
 def test_few_drives_with_many_frames_in_view_do_not_make_a_parameter_decide() -> None:

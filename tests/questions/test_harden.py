@@ -27,6 +27,8 @@ from advsearch.questions.harden.training import ClassifierTrainer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_result
 
+pytestmark = pytest.mark.medium
+
 SMALL: dict[str, Any] = {
     "object": "ball,book", "model": "small_models:Colours", "resolution": 32, "texture_resolution": 16, "epsilon": 0.03,
     "rounds": 2, "scenes": 1, "views": 1, "epochs": 1, "measured": 2, "threads": 1,
@@ -51,7 +53,6 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
     return done
 
 
-@pytest.mark.medium
 def test_a_run_trains_measures_and_goes_on(
     attacks: list[tuple[str, int | None]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,7 +95,6 @@ def course_of(config: HardenConfig, net: torch.nn.Module | None = None) -> Class
     return ClassifierTrainer(work, Trainable(net or torch.nn.Linear(2, 3), load()))
 
 
-@pytest.mark.medium
 def test_a_round_ends_with_the_part_of_the_way_that_is_best(
     attacks: list[tuple[str, int | None]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -76,9 +76,6 @@ def pupils() -> list[Lesson]:
     return [RenderedLesson.create((n % 3,), coloured(n % 3, 0.4, n), one[None]) for n, one in enumerate(worst)]
 
 
-# ---- the split ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     bundled = Path(str(resources.files("advsearch.bundled")))
@@ -107,9 +104,6 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     assert len(list(files[0].generate_objects(5))) == 1
     with pytest.raises(InputError, match="held_out_environment"):
         check_disjoint(SceneSplit(HELD_OUT, ("ball",), ("noon",), 2), [training])
-
-
-# ---- lessons and training -------------------------------------------------------------------------------------------
 
 
 def test_the_worst_of_what_was_rendered_is_that_of_the_model_as_it_is() -> None:
@@ -196,19 +190,14 @@ def test_lessons_that_judge_are_left_as_they_are() -> None:
     assert rendered.losses.isinf().all()
 
 
-# ---- the data set ---------------------------------------------------------------------------------------------------
-
-
 def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         save_lesson_images(run, 1, pupils()[:2], ["wine glass", "mug"])
     pictures = tmp_path / "run" / IMAGE_DIRECTORY
     assert sorted(one.relative_to(pictures).as_posix() for one in pictures.glob("*/*")) == [
-        "0000-wine-glass/001-00000-plain.png",
-        "0000-wine-glass/001-00000-worst.png",
-        "0001-mug/001-00001-plain.png",
+        "0000-wine-glass/001-00000-plain.png", "0000-wine-glass/001-00000-worst.png", "0001-mug/001-00001-plain.png",
         "0001-mug/001-00001-worst.png",
-    ]
+    ]  # fmt: skip
     with tarfile.open(pictures.with_suffix(".tar")) as tar:
         names = tar.getnames()
         assert [name.rpartition(".")[2] for name in names] == ["png", "cls", "json"] * 4

@@ -18,6 +18,8 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.formation import ALL_OMISSIONS, NO_OMISSIONS
 from advsearch.scene.renderer import Renderer
 
+pytestmark = pytest.mark.medium
+
 SIZE = 40
 
 
@@ -25,7 +27,6 @@ def made(controls: Any, object: str = "mug", environment: str = "studio", denois
     return load_scene(object, environment).renderer(controls, resolution=SIZE, denoise=denoiser)
 
 
-@pytest.mark.medium
 def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient() -> None:
     renderer = made("texture")
     loss, u = make_smooth_loss((SIZE, SIZE)), find_interior_point(renderer)
@@ -39,7 +40,6 @@ def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient() -> None:
     assert (mine - theirs).norm() <= 0.01 * mine.norm()
 
 
-@pytest.mark.medium
 def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> None:
     dark, light = made("texture", "bottle", "noon"), made("texture", "mug", "studio")
     cut = measure_path_length(dark, [dark.start], seed=0, spp=4)
@@ -52,7 +52,6 @@ def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> No
     assert dark.scene.depth == dark.scene.max_depth
 
 
-@pytest.mark.medium
 def test_searches_cut_paths_and_verifications_do_not() -> None:
     config = AttackConfig(object="bowl", controls={"texture": {}}, denoise="none", resolution=(SIZE, SIZE))
     problem, _ = problem_from_config(config)
@@ -75,7 +74,6 @@ def two_lamps(power: float) -> Renderer:
     return load_scene("mug").renderer([TextureControl(resolution=16), *lamps], resolution=SIZE, denoise="none")
 
 
-@pytest.mark.medium
 def test_dark_lamps_get_no_samples_and_change_nothing_but_noise() -> None:
     renderer = two_lamps(0.0)
     full = renderer.copy_with(renderer.scene.copy_with(leave_out=ALL_OMISSIONS - {"emitters"}))
@@ -89,7 +87,6 @@ def test_dark_lamps_get_no_samples_and_change_nothing_but_noise() -> None:
 NUMBERS = ("roughness", "metallic", "specular", "clearcoat")
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("values", [(1.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0)])
 def test_a_material_looks_the_same_however_its_numbers_come_and_whatever_is_left_out(values: Any) -> None:
     """Fixed, searched, and searched from the other ends, at both ends of every number."""

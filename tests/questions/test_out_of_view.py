@@ -20,10 +20,9 @@ from advsearch.testing import assert_no_worse, assert_suite
 from advsearch.trust.code import allow_code
 from advsearch.viewer.columns import read_columns
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.medium]
 
 
-@pytest.mark.medium
 def test_they_are_told_and_not_counted(tmp_path: Path) -> None:
     """Shifted far to the side, the mug is out of view, which a detector cannot get wrong."""
     found = advsearch.sweep(
@@ -49,7 +48,6 @@ DETECTED: dict[str, Any] = {"task": "detection", "label": "car", "verify_spp": 1
 BESIDE = {"pose": {"y": [40.0, 60.0]}}  # never in the picture
 
 
-@pytest.mark.medium
 def test_claims_count_pictures_that_show_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A model that is "right" where there is nothing to see would be shown to be no worse, and to be steady."""
     monkeypatch.chdir(tmp_path)
@@ -67,7 +65,6 @@ def test_claims_count_pictures_that_show_it(tmp_path: Path, monkeypatch: pytest.
         assert_suite("suite.yaml")
 
 
-@pytest.mark.medium
 def test_a_region_ends_where_the_object_leaves_the_picture(tmp_path: Path) -> None:
     """A detector that is right about the object cannot be wrong where it is not, and the box would take all of that."""
     small: dict[str, Any] = {"samples": 20, "set": {"camera.distance": 0.4}, "exposure": -3.0, **DETECTED}

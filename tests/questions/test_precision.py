@@ -54,11 +54,7 @@ def setting(count: int, estimator: str = "independent") -> SampleSetting:
 
 
 def measured(
-    reference: ReferenceValue,
-    *,
-    bias: float = 0.0,
-    power: float = -0.5,
-    estimator: str = "independent",
+    reference: ReferenceValue, *, bias: float = 0.0, power: float = -0.5, estimator: str = "independent"
 ) -> list[PrecisionPoint]:
     """Points of synthetic noise; a sample takes a millisecond."""
     points = []
@@ -77,9 +73,6 @@ def exact() -> ReferenceValue:
 def rough(samples: int) -> ReferenceValue:
     """A reference from four parts that are not much better than what is measured."""
     return estimate_reference([noisy(samples, seed) for seed in range(4)])
-
-
-# ---- points ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_reference_s_own_error_is_taken_off() -> None:
@@ -116,9 +109,6 @@ def test_an_error_that_a_few_pixels_hold_has_no_interval_and_any_other_has_one_t
     assert not is_heavy_tailed([{"error": 1.0, "fourth": math.nan}]), "few numbers say nothing"
 
 
-# ---- slopes ---------------------------------------------------------------------------------------------------------
-
-
 def test_independent_noise_has_slope_minus_a_half() -> None:
     points = measured(exact())
     line = fit_line(points, or_steeper=False)
@@ -134,9 +124,6 @@ def test_a_bias_levels_off_and_is_warned_of() -> None:
     assert line is not None and line.slope > -0.35 and line.agrees is False
     assert has_leveled_off(points) and not has_leveled_off(measured(exact()))
     assert "levels off" in str(describe_disagreement(line, points))
-
-
-# ---- what is recommended --------------------------------------------------------------------------------------------
 
 
 def error_at(samples: float) -> float:
@@ -158,9 +145,6 @@ def test_a_recommended_count_reaches_its_goal(goal: float) -> None:
     assert found.seconds == pytest.approx(1e-3 * spp, rel=0.01)
 
 
-# ---- what is compared -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_an_adjoint_is_compared_with_a_reference_by_an_adjoint_that_differences_confirm() -> None:
     renderer = load_scene("mug").renderer({"texture": {"resolution": 8}}, resolution=24, denoise="none")
@@ -173,9 +157,6 @@ def test_an_adjoint_is_compared_with_a_reference_by_an_adjoint_that_differences_
     numbers = bench.measure(next(one for one in bench.settings if one.spp == 256), 1)["gradient"]
     assert numbers["cosine"] > 0.9 and numbers["error"] < 0.5 and numbers["wall_seconds"] > 0.0
     assert bench.check_bias(0) is None
-
-
-# ---- the command ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -223,15 +204,9 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
 ) -> None:
     folder = tmp_path / "run"
     config = PrecisionConfig(
-        object="mug",
-        controls={"environment.rotation": {}},
-        samplers="independent",
-        resolution=(8, 8),
-        seconds=1.0,
-        rounds=3,
-        threads=1,
-        run=str(folder),
-    )
+        object="mug", controls={"environment.rotation": {}}, samplers="independent", resolution=(8, 8), seconds=1.0,
+        rounds=3, threads=1, run=str(folder),
+    )  # fmt: skip
     stopped = precision.run(config, progress=Stop("gradient of environment: references"))
     assert stopped.ending == "interrupted" and {one.quantity for one in stopped.points} == {"picture", "margin"}
     kept = read_result(folder)

@@ -91,9 +91,6 @@ def counts(made: FigureContent) -> dict[Any, tuple[Any, Any]]:
     return {row[0] if names == 1 else tuple(row[:names]): (row[names], row[names + 1]) for row in made.rows}
 
 
-# ---- what a file may say --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", list_recipes())
 @pytest.mark.parametrize("quick", [False, True])
 def test_every_bundled_recipe_is_one_that_can_be_run_and_save(name: str, quick: bool) -> None:
@@ -131,9 +128,6 @@ def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: p
     assert main(["recipe", str(path), "--run", str(tmp_path / "run")]) == 2
     assert "os.path:join, Python code" in capsys.readouterr().err
     assert not (tmp_path / "run" / "summary.json").exists()
-
-
-# ---- the runs -------------------------------------------------------------------------------------------------------
 
 
 def test_what_is_asked_for_goes_over_the_recipe_and_labels_go_to_their_objects() -> None:
@@ -203,9 +197,6 @@ def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with
     assert camera["roll"] == pytest.approx([-30.0, 30.0])
     low, high = np.log2(camera["distance"])  # evenly along the logarithm, as it is searched
     assert ((low + high) / 2, (high - low) / 12**0.5) == pytest.approx((1.0, 0.2))
-
-
-# ---- what figures say -----------------------------------------------------------------------------------------------
 
 
 def test_intervals_are_over_drives_where_frames_of_one_share_a_draw() -> None:

@@ -17,6 +17,8 @@ from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels
 from stand_ins import Impatient, rows
 
+pytestmark = pytest.mark.medium
+
 SMALL: dict[str, Any] = {
     "object": "mug", "resolution": 32, "controls": "camera", "vary": "camera.azimuth,camera.elevation", "samples": 8,
     "map": 3, "verify_spp": 16, "deterministic": True,
@@ -44,7 +46,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RegionResult]
     return run, region.run(RegionConfig(**SMALL, run=str(run)))
 
 
-@pytest.mark.medium
 def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Path, RegionResult]) -> None:
     """Rows say which: a predicted one has the four rays of a pixel, and no seed."""
     run, result = whole
@@ -66,7 +67,6 @@ class Stopping(Impatient):
         self._searching = name == "growing the box"
 
 
-@pytest.mark.medium
 def test_a_region_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, RegionResult], tmp_path: Path) -> None:
     """Light is found again; pictures that were predicted are counted as such."""
     config = RegionConfig(**SMALL, run=str(tmp_path / "run"))

@@ -17,13 +17,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.replay import replay
-from advsearch.questions.replay.result import (
-    PHOTOGRAPH,
-    ReplayConfig,
-    ReplayRow,
-    count_transfer,
-    describe_transfer,
-)
+from advsearch.questions.replay.result import PHOTOGRAPH, ReplayConfig, ReplayRow, count_transfer, describe_transfer
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_configuration, read_result, write_configuration
 

@@ -23,11 +23,9 @@ def planted(law: str, seed: int = 0, rows: int = 2000) -> pd.DataFrame:
     numbers = generator.uniform((5.0, 0.0, 0.0, 1.0, 0.0), (85.0, 2.0, 360.0, 4.0, 3.0), (rows, 5))
     elevation, power, yaw, distance, colour = numbers.T
     wrong = {
-        "dim from above": (elevation > 60.0) & (power < 0.8),
-        "red": colour >= 2.0,
-        "either but not both": (yaw > 180.0) != (distance > 2.5),
-        "none": np.zeros(rows, dtype=bool),
-    }[law]
+        "dim from above": (elevation > 60.0) & (power < 0.8), "red": colour >= 2.0,
+        "either but not both": (yaw > 180.0) != (distance > 2.5), "none": np.zeros(rows, dtype=bool),
+    }[law]  # fmt: skip
     names = np.array(["blue", "green", "red"])[colour.astype(int)]
     values = {"camera.elevation": elevation, "light.power": power, "pose.yaw": yaw, "camera.distance": distance}
     return seen({**values, "colour": names}, ~(wrong ^ (generator.random(rows) < NOISE)))
@@ -64,10 +62,7 @@ def test_two_parameters_that_matter_only_together_are_told_as_two_rules() -> Non
     assert (
         {one.factor for one in first.conditions}
         == {one.factor for one in second.conditions}
-        == {
-            "pose.yaw",
-            "camera.distance",
-        }
+        == {"pose.yaw", "camera.distance"}
     )
     under_first, under_second = (find_covered(rule.conditions, planted("red")) for rule in (first, second))
     assert (under_first & under_second).mean() <= 0.03
@@ -84,11 +79,9 @@ def around(law: str, seed: int, rows: int = 2000) -> pd.DataFrame:
     azimuth, distance = generator.uniform((0.0, 5.0), (360.0, 60.0), (rows, 2)).T
     aside = np.abs((azimuth + 90.0) % 180.0 - 90.0)
     wrong = {
-        "in front": (azimuth > 335.0) | (azimuth < 25.0),
-        "end-on": aside < 20.0,
-        "end-on and far": (aside < 30.0) & (distance > 30.0),
-        "none": np.zeros(rows, dtype=bool),
-    }[law]
+        "in front": (azimuth > 335.0) | (azimuth < 25.0), "end-on": aside < 20.0,
+        "end-on and far": (aside < 30.0) & (distance > 30.0), "none": np.zeros(rows, dtype=bool),
+    }[law]  # fmt: skip
     values = {"camera.azimuth": azimuth, "camera.distance": distance}
     return seen(values, ~(wrong ^ (generator.random(rows) < NOISE)), of={"camera.azimuth": "degrees"})
 

@@ -21,27 +21,14 @@ from covering import only
 GROUPS = tuple(dict.fromkeys(case.group for case in ALL_CASES))
 CHEAP = [case for case in ALL_CASES if not case.slow]
 FEW = [case for group in GROUPS for case in [case for case in CHEAP if case.group == group][::3]]
-"""Of each group the first, and of every three more one; the other cheap ones are among the slow tests."""
-
-
-# ---- the cases ------------------------------------------------------------------------------------------------------
+"""Of each group the first, and of every three more one; the others are among the slow tests."""
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("case", only(FEW, CHEAP), ids=lambda case: case.name)
-def test_a_cheap_case_holds(case: Case) -> None:
-    row = case.run()
-    assert row.status == OK, row.decides
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in ALL_CASES if case.slow], ids=lambda case: case.name)
+@pytest.mark.parametrize("case", only(FEW, ALL_CASES), ids=lambda case: case.name)
 def test_a_case_holds(case: Case) -> None:
     row = case.run()
     assert row.status == OK, row.decides
-
-
-# ---- rows -----------------------------------------------------------------------------------------------------------
 
 
 def made(outcome: CaseOutcome | Exception, name: str = "made") -> Case:
@@ -51,9 +38,6 @@ def made(outcome: CaseOutcome | Exception, name: str = "made") -> Case:
         return outcome
 
     return Case(name, "noise", "It holds.", False, find)
-
-
-# ---- the command ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(autouse=True)

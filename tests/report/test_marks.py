@@ -51,9 +51,6 @@ def test_a_mask_is_tinted_and_the_true_one_outlined() -> None:
     assert not blue[:128].any(), "the outline is inside"
 
 
-# ---- the same in words ----------------------------------------------------------------------------------------------
-
-
 def said(label: str, probability: float, **payload: object) -> SimpleNamespace:
     """A prediction as a result has it: with what its task keeps beside it."""
     return SimpleNamespace(label=label, index=None, probability=probability, payload=payload)

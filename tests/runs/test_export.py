@@ -52,9 +52,6 @@ def test_the_command_writes_by_the_name_of_the_file(run: Path, format: str, caps
     assert main(["export", "one", "--out", "rows.xyz"]) == 0 and "3 rows in rows.xyz, as csv" in capsys.readouterr().err
 
 
-# ---- the list of runs -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("full_at", ["report.html", "summary.json"])
 def test_a_run_whose_disk_was_full_at_the_end_goes_on_and_has_everything(
     full_at: str, run: Path, monkeypatch: pytest.MonkeyPatch

@@ -121,10 +121,7 @@ def test_damaged_results_are_named(case: str, run: Path, capsys: pytest.CaptureF
         list(opened.store.rows())
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["", "[]", "{", "[" * 100_000, '{"a": ' + "9" * 6000 + "}", "\0", '{"ending": NaN'],
-)
+@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"a": ' + "9" * 6000 + "}", "\0", '{"ending": NaN'])
 def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "summary.json").write_text(text)
     for command in ("show", "resume"):
@@ -154,16 +151,10 @@ def test_summaries_of_other_types_are_named(
 
 
 DAMAGED = [
-    "",
-    "[1]",
-    "command: [1]\n",
-    "command: attack\nobject: [1]\n",
-    "command: attack\nobject: mug\ncontrols: 3\n",
-    "command: attack\nobject: mug\nseed: 0b_\n",
-    "command: attack\nobject: mug\nbase: /dev/zero\n",
-    "command: attack\nobject: mug\nset: [1]\nsteps: x\n",
-    "\0",
-]
+    "", "[1]", "command: [1]\n", "command: attack\nobject: [1]\n", "command: attack\nobject: mug\ncontrols: 3\n",
+    "command: attack\nobject: mug\nseed: 0b_\n", "command: attack\nobject: mug\nbase: /dev/zero\n",
+    "command: attack\nobject: mug\nset: [1]\nsteps: x\n", "\0",
+]  # fmt: skip
 
 
 @pytest.mark.medium
@@ -224,13 +215,7 @@ def test_a_link_in_a_run_is_followed_by_nobody(
     link.unlink(missing_ok=True)
     how(link, outside)
     commands = [["show", "it"], ["export", "it"], ["view", "it"], ["view", "it", "--bundle", "site"], ["resume", "it"]]
-    for command in [
-        *commands,
-        ["report", "it", "--evidence"],
-        ["replay", "it"],
-        ["compare", "it"],
-        ["explain", "it"],
-    ]:
+    for command in [*commands, ["report", "it", "--evidence"], ["replay", "it"], ["compare", "it"], ["explain", "it"]]:
         assert main(command) == 2, command
         assert "got a link; remove it" in capsys.readouterr().err.splitlines()[-1], command
     assert "got a link; remove it" in read_listed_run(run).fault
@@ -379,11 +364,9 @@ def test_a_run_that_links_elsewhere_changes_nothing_there(name: str, run: Path, 
 @pytest.mark.parametrize(
     "change",
     [
-        "u = 3",
-        "gradient = x'010203'",
-        "picture = x'01', height = 1",
+        "u = 3", "gradient = x'010203'", "picture = x'01', height = 1",
     ],
-)
+)  # fmt: skip
 def test_what_a_search_was_told_is_checked(change: str, tmp_path: Path) -> None:
     path = tmp_path / "results.sqlite"
     with Store(path) as store:

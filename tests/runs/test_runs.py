@@ -65,9 +65,6 @@ def run(tmp_path: Path) -> Iterator[RunDirectory]:
         yield made
 
 
-# ---- what survives ----
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("acknowledged", [1, 20, 137])
 def test_every_acknowledged_row_survives_sigkill(tmp_path: Path, acknowledged: int) -> None:
@@ -114,10 +111,8 @@ def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> Non
         store.append([Row("sweep", 4, label="first", id=5), Row("sweep", 1, id=2)])
         store.append([Row("sweep", 4, label="late", id=5), Row("sweep", 0, id=1), Row("verification", 4)])
         assert [(row.id, row.step, row.label) for row in store.rows("sweep")] == [
-            (1, 0, None),
-            (2, 1, None),
-            (5, 4, "first"),
-        ]
+            (1, 0, None), (2, 1, None), (5, 4, "first"),
+        ]  # fmt: skip
         assert store.count_rows() == 4
         assert list(store.find_missing_steps("sweep", 8)) == [range(2, 4), range(5, 8)]
         assert list(store.find_missing_steps("sweep", 6)) == [range(2, 4), range(5, 6)]
@@ -168,9 +163,6 @@ def test_any_values_come_back(codec: Store, values: dict[str, Any], objective: f
     assert found.objective == (objective if math.isfinite(objective) else None)
 
 
-# ---- the lock ----
-
-
 def test_a_second_process_is_refused(run: RunDirectory) -> None:
     code = (
         "import sys; from pathlib import Path; from advsearch.trust.writing import RunLock; RunLock(Path(sys.argv[1]))"
@@ -178,9 +170,6 @@ def test_a_second_process_is_refused(run: RunDirectory) -> None:
     second = subprocess.run([sys.executable, "-c", code, run.path], capture_output=True, text=True)
     assert f"process {os.getpid()} is working on this run; wait for it or choose another name" in second.stderr
     assert second.returncode != 0
-
-
-# ---- where a run goes ----
 
 
 def test_runs_are_numbered(home: Path) -> None:
@@ -254,12 +243,10 @@ def test_a_run_that_fails_later_keeps_what_it_has(tmp_path: Path, keep: str) -> 
 
 
 GONE_ON: dict[str, Callable[[RunDirectory], object]] = {
-    "record": lambda run: run.append_rows(Row("search", 1)),
-    "write_summary": lambda run: run.write_summary(attack()),
+    "record": lambda run: run.append_rows(Row("search", 1)), "write_summary": lambda run: run.write_summary(attack()),
     "forget": lambda run: run.store.delete_cached(),
-    "create": lambda run: RunDirectory.create(run.path / "parts" / "00"),
-    "nothing": lambda run: None,
-}
+    "create": lambda run: RunDirectory.create(run.path / "parts" / "00"), "nothing": lambda run: None,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("what", GONE_ON)
@@ -294,12 +281,11 @@ def test_runs_are_found_by_name_and_path(home: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "value", "file"),
     [
-        ("camera", "camchain.yaml#cam1", "camchain.yaml"),
-        ("path", "approach+way.csv", "way.csv"),
+        ("camera", "camchain.yaml#cam1", "camchain.yaml"), ("path", "approach+way.csv", "way.csv"),
         ("model", "reference@weights.safetensors", "weights.safetensors"),
         ("controls", {"patch": {"picture": "sticker.png"}}, "sticker.png"),
     ],
-)
+)  # fmt: skip
 def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value: object, file: str) -> None:
     Path("folder").mkdir()
     Path(file).write_text("one")
@@ -313,9 +299,6 @@ def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value:
                 RunDirectory.resume("first", config)
         else:
             (RunDirectory.resume("first", config) if Path("runs").is_dir() else RunDirectory.create_for(config)).close()
-
-
-# ---- whole or not at all ----
 
 
 def _raises(number: int) -> Any:
@@ -344,11 +327,10 @@ def test_a_bad_disk_is_said_and_leaves_nothing(
     with monkeypatch.context() as broken:
         broken.setattr("os.replace", _raises(number))
         writes: list[Callable[[], object]] = [
-            lambda: run.save_image("clean", np.zeros((4, 4, 3))),
-            lambda: run.save_exr("clean", np.zeros((4, 4, 3))),
+            lambda: run.save_image("clean", np.zeros((4, 4, 3))), lambda: run.save_exr("clean", np.zeros((4, 4, 3))),
             lambda: run.save_animation("search", [np.zeros((4, 4, 3))]),
             lambda: run.write_summary(attack(ending="new")),
-        ]
+        ]  # fmt: skip
         for write in writes:
             with pytest.raises(StorageError, match=named):
                 write()
@@ -363,9 +345,6 @@ def test_a_full_disk_stops_the_store_and_keeps_the_rows_before(run: RunDirectory
     with pytest.raises(StorageError, match="the disk is full"):
         run.append_rows(*(Row("search", step, label="x" * 1000) for step in range(1, 100)))
     assert [row.step for row in run.store.rows()] == [0]
-
-
-# ---- pictures ----
 
 
 @given(st.lists(st.floats(-1.0, 2.0, width=32), min_size=1, max_size=30))
@@ -395,9 +374,6 @@ def test_exr_round_trip_is_exact_and_equal_bytes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(exr(grey), image[..., 1])
 
 
-# ---- the summary ----
-
-
 def test_a_summary_that_is_not_there_or_damaged_is_said(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="no such file"):
         read_result(tmp_path)
@@ -417,9 +393,6 @@ def test_the_log_is_forced_to_the_disk_once_a_second(tmp_path: Path, monkeypatch
             store.append([Row("search", step)])
             forced.append(store._db.execute("PRAGMA synchronous").fetchone()[0] == 2)
     assert forced == [True, False, True, True, False]
-
-
-# ---- the rows as a table ----
 
 
 @pytest.fixture
@@ -476,9 +449,6 @@ def test_json_and_parquet_have_the_same_rows(filled: Store, tmp_path: Path) -> N
     table = pyarrow.parquet.read_table(out)
     assert table.column_names == COLUMNS and table.to_pylist() == rows
     assert str(table.schema.field("seed").type) == "int64" and str(table.schema.field("success").type) == "bool"
-
-
-# ---- the runs at a glance ----
 
 
 def test_runs_are_listed_with_their_state(home: Path) -> None:

@@ -99,8 +99,6 @@ def test_the_derivative_in_a_photograph_is_that_of_differences(photograph: Path)
     assert float(u.grad @ direction) == pytest.approx(difference, rel=0.02)
 
 
-# ---- the shadow
-
 TABLE = {"ground.size": 12.0, "ground.red": 0.5, "ground.green": 0.4, "ground.blue": 0.3}
 
 
@@ -227,9 +225,6 @@ def test_the_map_beside_a_photograph_lights_it(tmp_path: Path) -> None:
     assert advsearch.load_scene("mug", "studio", backdrop=tmp_path / "a.png").description.environment_name == "studio"
 
 
-# ---- noise, blur and what is in front
-
-
 @pytest.mark.parametrize("sigma", [0.0, 1.5, 4.0, 9.0])
 def test_the_noise_of_a_photograph_is_measured_beside_its_texture(sigma: float) -> None:
     rng = np.random.default_rng(1)
@@ -340,10 +335,9 @@ def test_a_pixel_between_two_depths_is_hidden_by_its_part() -> None:
     """Two of four points of the object are hidden, and one of the two of the ground in the next pixel."""
     infinite = math.inf
     surfaces = SimpleNamespace(
-        names=("ground", "object"),
-        z_depth=torch.tensor([[2.0, 2.0, 3.0, infinite], [2.0, 2.0, 3.0, infinite]]),
+        names=("ground", "object"), z_depth=torch.tensor([[2.0, 2.0, 3.0, infinite], [2.0, 2.0, 3.0, infinite]]),
         visible_mask=lambda name: torch.tensor([[False, False, True, False]] * 2),
-    )
+    )  # fmt: skip
     depth = torch.tensor([[1.0, infinite, 1.0, 1.0], [1.0, 1.99, 2.98, 1.0]])
     front = compute_front(surfaces, depth, 2, 1)  # type: ignore[arg-type]
     # the second pixel has no point of the object, and the first none of the ground
@@ -381,18 +375,12 @@ def test_hostile_depths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.npy").write_text("no array")
     write_photograph(tmp_path / "coloured.png", (12, 16))
     messages = {
-        "deep.png": "metres of a level behind its name",
-        "deep.png#1000": "depths of 0 to 100000 metres, got 700000",
-        "negative.npy": "depths of 0 to",
-        "objects.npy": "an array .height, width. of numbers",
-        "minus.npy": "an array .height, width. of numbers",
-        "small.npy": "depths of 16 x 12 pixels",
-        "huge.npy": "at most",
-        "cut.npy": "another length",
-        "text.npy": "corrupt or of another version",
-        "coloured.png#0.001": "one depth for each pixel",
-        "missing.npy": "expected a picture of depth",
-    }
+        "deep.png": "metres of a level behind its name", "deep.png#1000": "depths of 0 to 100000 metres, got 700000",
+        "negative.npy": "depths of 0 to", "objects.npy": "an array .height, width. of numbers",
+        "minus.npy": "an array .height, width. of numbers", "small.npy": "depths of 16 x 12 pixels",
+        "huge.npy": "at most", "cut.npy": "another length", "text.npy": "corrupt or of another version",
+        "coloured.png#0.001": "one depth for each pixel", "missing.npy": "expected a picture of depth",
+    }  # fmt: skip
     for name, message in messages.items():
         with pytest.raises(InputError, match=message):
             load_description("mug").with_backdrop(tmp_path / "a.png", tmp_path / name)
@@ -560,9 +548,6 @@ def test_no_pose_of_an_object_is_refused(tmp_path: Path, pose: np.ndarray, words
 def test_an_object_without_a_file_has_no_measured_pose() -> None:
     with pytest.raises(InputError, match="mesh file with a known unit"):
         compute_view_settings(load_description("mug").object, np.eye(4))
-
-
-# ---- what is refused
 
 
 def refuse(match: str, scene: SceneDescription, spec: str | Path, size: tuple[int, int] = SIZE) -> None:

@@ -27,12 +27,10 @@ def seen(name: str, camera: str, environment: str = "street", **said: object) ->
 @pytest.mark.parametrize(
     ("name", "camera", "environment", "height"),
     [
-        ("car", "dashcam", "street", 1.3),
-        ("stop-sign", "dashcam", "street", 1.3),
-        ("car", "robot", "street", 1.2),
+        ("car", "dashcam", "street", 1.3), ("stop-sign", "dashcam", "street", 1.3), ("car", "robot", "street", 1.2),
         ("mug", "robot", "studio", 0.45),
     ],
-)
+)  # fmt: skip
 def test_a_mounted_camera_is_as_high_as_it_is(name: str, camera: str, environment: str, height: float) -> None:
     scene = seen(name, camera, environment, **({"size": 0.1} if name == "mug" else {}))
     assert lens(scene)[2] == pytest.approx(height, abs=1e-4)

@@ -66,9 +66,6 @@ def grid(side: int = 33) -> Tensor:
     return torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1).reshape(-1, 2)
 
 
-# ---- against OpenCV -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("model", list(TABLE["lenses"]))
 def test_points_are_seen_where_opencv_sees_them(model: str, tmp_path: Path) -> None:
     lens = TABLE["lenses"][model]
@@ -102,8 +99,6 @@ def test_a_lens_that_folds_says_at_which_angle_and_is_black_beyond() -> None:
     _, inside = lens.compute_rays(torch.tensor([[0.5, 0.5], [0.0, 0.0]], dtype=torch.float64))
     assert inside[0] > 0.0 > inside[1]
 
-
-# ---- files ----------------------------------------------------------------------------------------------------------
 
 K = [-0.28, 0.07, 0.001, -0.002]
 CAMERA_FILES: dict[str, Any] = yaml.safe_load((HERE / "camera_files.yaml").read_text("utf-8"))
@@ -143,13 +138,12 @@ def test_binned_pixels_are_fewer_and_see_the_same(tmp_path: Path) -> None:
         ("SIMPLE_RADIAL_FISHEYE 100 50 40 50 25 0.02", "fisheye", {"fx": 0.4, "fy": 0.8, "k1": 0.02}),
         ("OPENCV_FISHEYE 100 50 40 41 50 25 1 2 3 4", "fisheye", {"fy": 0.82, "k4": 4.0}),
         (
-            "FULL_OPENCV 100 50 40 41 50 25 1 2 5 6 3 7 8 9",
-            "brown-conrady",
+            "FULL_OPENCV 100 50 40 41 50 25 1 2 5 6 3 7 8 9", "brown-conrady",
             {"k3": 3.0, "k4": 7.0, "p1": 5.0, "k6": 9.0},
         ),
         ("EQUIRECTANGULAR 100 50 100 50", "equirectangular", {}),
     ],
-)
+)  # fmt: skip
 def test_models_of_colmap(line: str, kind: str, numbers: dict[str, float], tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text(f"1 {line}\n")
     found = read_camera(str(tmp_path / "cameras.txt"))
@@ -214,9 +208,6 @@ def test_files_of_other_tools_that_are_not_read_are_refused(text: str, tmp_path:
     path.write_text(text)
     with pytest.raises(FileFormatError, match=r"camera\.yaml"):
         read_camera(str(path))
-
-
-# ---- inside Mitsuba -------------------------------------------------------------------------------------------------
 
 
 def scene_with(model: CameraModel) -> Scene:
@@ -298,10 +289,9 @@ def test_a_searched_lens_is_the_fixed_one_and_has_a_derivative() -> None:
 
 BARREL = "barrel of a file"
 BOXED = {
-    BARREL: {"camera.distance": 1.05},
-    "fisheye": {"camera.distance": 0.85},
+    BARREL: {"camera.distance": 1.05}, "fisheye": {"camera.distance": 0.85},
     "equirectangular": {"camera.distance": 0.85},
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("camera", list(BOXED))

@@ -119,12 +119,9 @@ def both_ways(scene: SceneDescription, lamp: str, seen: str) -> tuple[torch.Tens
 
 
 WAYS = {
-    "one radiance": (None, UNIT),
-    "a texture": (stripes(), UNIT),
-    "mirrored": (stripes(), UNIT * [-1, 1] + [1, 0]),
-    "repeated": (stripes(), UNIT * 2.0),
-    "shared": (stripes(), np.array([[0, 0], [1, 0], [1, 1], [1, 0.0]])),
-}
+    "one radiance": (None, UNIT), "a texture": (stripes(), UNIT), "mirrored": (stripes(), UNIT * [-1, 1] + [1, 0]),
+    "repeated": (stripes(), UNIT * 2.0), "shared": (stripes(), np.array([[0, 0], [1, 0], [1, 1], [1, 0.0]])),
+}  # fmt: skip
 
 
 @pytest.mark.medium
@@ -164,13 +161,11 @@ def in_a_material_file(folder: Path, *lines: str) -> ObjectAsset:
 @pytest.mark.parametrize(
     ("lines", "wanted"),
     [
-        (("Ke 2 1 0",), [2.0, 1.0, 0.0]),
-        (("Ke 3",), [3.0, 3.0, 3.0]),
-        (("Ke 2 4 1", "map_Ke lit.png"), [2.0, 0.0, 0.0]),
-        (("map_Ke lit.png",), [1.0, 0.0, 0.0]),
+        (("Ke 2 1 0",), [2.0, 1.0, 0.0]), (("Ke 3",), [3.0, 3.0, 3.0]),
+        (("Ke 2 4 1", "map_Ke lit.png"), [2.0, 0.0, 0.0]), (("map_Ke lit.png",), [1.0, 0.0, 0.0]),
         (("Ke 0 0 0",), None),
     ],
-)
+)  # fmt: skip
 def test_a_material_file_says_emission(lines: tuple[str, ...], wanted: list[float] | None, tmp_path: Path) -> None:
     asset = in_a_material_file(tmp_path, *lines)
     assert asset.warnings == () and (asset.emission is None) == (wanted is None)

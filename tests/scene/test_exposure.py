@@ -59,12 +59,10 @@ def test_an_exposure_value_says_which_luminance_is_white(ev: float, stops: float
 @pytest.mark.parametrize(
     ("environment", "given"),
     [
-        ("noon", {}),
-        ("noon", {"camera__azimuth": 220.0}),
-        ("low-sun", {"environment__rotation": 120.0}),
+        ("noon", {}), ("noon", {"camera__azimuth": 220.0}), ("low-sun", {"environment__rotation": 120.0}),
         ("kitchen", {"camera__azimuth": 130.0, "ground__size": 0.0}),
     ],
-)
+)  # fmt: skip
 def test_what_is_metered_is_what_a_render_of_a_matt_ball_shows(environment: str, given: dict[str, float]) -> None:
     scene = grey_ball(environment, **given)
     render = Scene(scene).renderer("texture", resolution=32, denoise="none")

@@ -61,8 +61,6 @@ def test_one_texel_of_a_hundred_thousand_is_finite() -> None:
     assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
 
 
-# ---- numbers of threads ---------------------------------------------------------------------------------------------
-
 SHIFT = {"pose": {"x": [-0.3, 0.3]}}
 BITS = 1e-5
 """Difference that is one of the last bits: a 400th of an 8-bit level."""

@@ -61,16 +61,12 @@ AHEAD_LEFT = (1, 1)
 @pytest.mark.parametrize(
     ("name", "front", "up", "extension", "settings"),
     [
-        ("car.glb", "+z", "+y", None, {}),
-        ("car.vrm", "-z", "+y", "VRM", {}),
-        ("car.vrm", "+z", "+y", "VRMC_vrm", {}),
-        ("car.glb", "+x", "+y", None, {"facing": "+x"}),
-        ("car.glb", "+y", "+z", None, {"facing": "+y", "up": "z"}),
-        ("car.glb", "+x", "+z", None, {"up": "z"}),
-        ("car.obj", "+x", "+y", None, {"up": "y"}),
+        ("car.glb", "+z", "+y", None, {}), ("car.vrm", "-z", "+y", "VRM", {}), ("car.vrm", "+z", "+y", "VRMC_vrm", {}),
+        ("car.glb", "+x", "+y", None, {"facing": "+x"}), ("car.glb", "+y", "+z", None, {"facing": "+y", "up": "z"}),
+        ("car.glb", "+x", "+z", None, {"up": "z"}), ("car.obj", "+x", "+y", None, {"up": "y"}),
         ("car.stl", "-y", "+z", None, {"facing": "-y"}),
     ],
-)
+)  # fmt: skip
 def test_what_is_the_front_of_a_file_faces_x(
     name: str, front: str, up: str, extension: str | None, settings: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -82,18 +78,12 @@ def test_what_is_the_front_of_a_file_faces_x(
     assert asset.front.reason not in asset.notes  # told where it matters
 
 
-# ---- in the lane -----------------------------------------------------------------------------------------------------
-
-
 def place(scene: SceneDescription) -> np.ndarray:
     return np.asarray(camera_to_world(scene)[:3, 3] * scene.size_in_metres)
 
 
 def dashcam(name: object, environment: str = "street", **given: Any) -> SceneDescription:
     return load_scene(str(name), environment, camera="dashcam", **given).description
-
-
-# ---- beside the object, around it, and written again -----------------------------------------------------------------
 
 
 def test_a_thing_faces_as_its_file_or_its_facing_says(tmp_path: Path) -> None:

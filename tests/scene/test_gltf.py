@@ -115,9 +115,6 @@ def area(part: ImportedPart) -> np.ndarray:
     return np.asarray(np.cross(b - a, c - a).sum(axis=0) / 2.0)
 
 
-# --- geometry ----------------------------------------
-
-
 @pytest.mark.parametrize(
     ("positions", "kind", "normalized"),
     [
@@ -157,9 +154,6 @@ def test_sparse_accessors_are_read(based: bool, tmp_path: Path) -> None:
     file.header["accessors"][place]["sparse"]["indices"]["bufferView"] = elsewhere
     with pytest.raises(FileFormatError, match="sparse"):
         parts_of(file, tmp_path)
-
-
-# --- colours and textures ----------------------------------------
 
 
 def test_sharp_texels_stay_sharp(tmp_path: Path) -> None:
@@ -256,9 +250,6 @@ def test_pictures_of_all_kinds_are_colours_as_they_are_stored(name: str, tmp_pat
     assert part.surface.texture == pytest.approx(np.broadcast_to(wanted, (2, 4, 3)), abs=0.01)
 
 
-# --- anything at all ----------------------------------------
-
-
 def reference(light: np.ndarray, u: float, v: float, wraps: tuple[int, int], *, sharp: bool) -> np.ndarray:
     """Look (H, W, C) texels up as the format says."""
 
@@ -284,11 +275,9 @@ def reference(light: np.ndarray, u: float, v: float, wraps: tuple[int, int], *, 
 
 
 NAMED = {
-    "attribute": ("_CUSTOM", "COLOR_1", "TEXCOORD_3", "TANGENT"),
-    "entry of a material": ("shininess", "extras"),
-    "entry of a sampler": ("anisotropy",),
-    "extension": ("KHR_materials_sheen", "KHR_materials_unlit", "ACME_glitter"),
-}
+    "attribute": ("_CUSTOM", "COLOR_1", "TEXCOORD_3", "TANGENT"), "entry of a material": ("shininess", "extras"),
+    "entry of a sampler": ("anisotropy",), "extension": ("KHR_materials_sheen", "KHR_materials_unlit", "ACME_glitter"),
+}  # fmt: skip
 EVENLY = some.floats(0.0, 1.0, width=32)
 
 

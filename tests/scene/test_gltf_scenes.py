@@ -33,9 +33,6 @@ def add(file: File, **node: Any) -> int:
     return len(file.header["nodes"]) - 1
 
 
-# ---- cameras --------------------------------------------------------------------------------------------------------
-
-
 def with_camera(folder: Path, lens: dict[str, float], **node: Any) -> SceneDescription:
     file = square()
     file.header["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, **lens}, "name": "front"}]
@@ -66,12 +63,10 @@ def _at(scene: SceneDescription, aspect: float) -> SceneDescription:
 @pytest.mark.parametrize(
     ("scale", "above", "words"),
     [
-        ([-1.0, 1.0, 1.0], {}, "mirrored"),
-        ([1.0, 1.0, 1.0], {"scale": [1.0, 1.0, -1.0]}, "mirrored"),
-        ([1.0, 1.0, 1.0], {"scale": [1.0, 3.0, 1.0]}, "sheared"),
-        ([1.0, 1.0, 1.0], {"scale": [3.0, 3.0, 3.0]}, None),
+        ([-1.0, 1.0, 1.0], {}, "mirrored"), ([1.0, 1.0, 1.0], {"scale": [1.0, 1.0, -1.0]}, "mirrored"),
+        ([1.0, 1.0, 1.0], {"scale": [1.0, 3.0, 1.0]}, "sheared"), ([1.0, 1.0, 1.0], {"scale": [3.0, 3.0, 3.0]}, None),
     ],
-)
+)  # fmt: skip
 def test_a_camera_under_a_mirror_or_a_shear_is_refused(
     scale: list[float], above: dict[str, Any], words: str | None, tmp_path: Path
 ) -> None:
@@ -87,9 +82,6 @@ def test_a_camera_under_a_mirror_or_a_shear_is_refused(
         return
     with pytest.raises(InputError, match=f"the camera front under nodes .* {words} axes"):
         import_scene(path, "plate")
-
-
-# ---- units of light -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -113,9 +105,6 @@ def test_candela_and_nit_are_of_one_kind(generator: str, shines: bool, candela: 
     assert ("candela and nit" in said) == (shines and not generator) and ("as Blender shows them" in said) == bool(
         generator
     )
-
-
-# ---- skins ----------------------------------------------------------------------------------------------------------
 
 
 def matrices(*given: np.ndarray) -> np.ndarray:

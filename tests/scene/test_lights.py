@@ -15,15 +15,11 @@ from advsearch.engine import transport as searching
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
 from advsearch.scene.transport.lights import BasisRenderer, find_lighting
+from small_models import levels
 from stand_ins import Impatient, rows
 
 SIZE = 32
 LAMP: dict[str, Any] = {"light": {"power": [0, 12], "red": [0.5, 1.0]}, "environment": {"exposure": [-1, 1]}}
-
-
-def levels(one: Tensor, other: Tensor) -> float:
-    """Root mean square difference of two pictures in levels of 255."""
-    return 255.0 * float(((one - other) ** 2).mean().sqrt())
 
 
 def rendered_by(controls: Any, **options: Any) -> Renderer:
@@ -54,15 +50,14 @@ def off(renderer: Renderer, predicted: BasisRenderer, u: Tensor) -> tuple[float,
         (LAMP, {"light.power", "light.red", "environment.exposure"}, set()),
         ({"light": {"power": [0, 9], "size": [0.1, 0.2], "x": [0, 1]}}, {"light.power"}, {"light.size", "light.x"}),
         (
-            {"environment": {"rotation": [0, 90], "tint_red": [0, 2]}},
-            {"environment.tint_red"},
+            {"environment": {"rotation": [0, 90], "tint_red": [0, 2]}}, {"environment.tint_red"},
             {"environment.rotation"},
         ),
         ({"environment": {"harmonics": [-1, 1]}}, {"environment.harmonics"}, set()),
         ({"camera": {"exposure": [-1, 1], "fov": [30, 40]}}, {"camera.exposure"}, {"camera.fov"}),
         ({"texture": {"resolution": 4}, "lens": {"dots": 1}}, {"lens.x", "lens.opacity"}, {"texture.texels"}),
     ],
-)
+)  # fmt: skip
 def test_what_is_light(controls: Any, light: set[str], more: set[str]) -> None:
     made = rendered_by(controls)
     found = find_lighting(made)
@@ -130,27 +125,19 @@ def test_texture_and_light_are_predicted_together() -> None:
 @pytest.mark.parametrize(
     ("controls", "options", "can_predict"),
     [
-        ({"light": {"power": [0, 12]}}, {}, True),
-        ({"camera": {"exposure": [-1, 1]}}, {}, True),
-        ({"light": {"power": [0, 12]}}, {"estimators": {"light": "adjoint"}}, False),
-        ({"light": {}}, {}, False),
+        ({"light": {"power": [0, 12]}}, {}, True), ({"camera": {"exposure": [-1, 1]}}, {}, True),
+        ({"light": {"power": [0, 12]}}, {"estimators": {"light": "adjoint"}}, False), ({"light": {}}, {}, False),
         ({"light": {"power": [0, 12]}}, {"denoise": "none"}, False),
     ],
-)
+)  # fmt: skip
 def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], can_predict: bool) -> None:
     assert (lights.find_refusal(rendered_by(controls, **options)) is None) == can_predict
 
 
-# ---- searches -------------------------------------------------------------------------------------------------------
-
 SEARCH: dict[str, Any] = {
-    "controls": {"light": {"power": [0, 12]}},
-    "resolution": SIZE,
-    "trials": 6,
-    "steps": 18,
-    "verify_spp": 8,
+    "controls": {"light": {"power": [0, 12]}}, "resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8,
     "baseline": False,
-}
+}  # fmt: skip
 
 
 @pytest.mark.medium

@@ -15,6 +15,8 @@ from advsearch.engine.loading import load_scene, make_controls
 from advsearch.errors import InputError
 from advsearch.scene.renderer import Renderer
 
+pytestmark = pytest.mark.medium
+
 SIZE = 32
 VARIED: dict[str, dict[str, object]] = {
     "pose": {"yaw": [-60, 60], "pitch": [-20, 20], "roll": [-20, 20]},
@@ -62,7 +64,6 @@ def moved() -> Renderer:
     return load_scene("banana").renderer(make_controls(VARIED), resolution=SIZE, denoise="none")
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_mask_is_where_the_object_is_hit_first(moved: Renderer, seed: int) -> None:
     u = torch.rand(moved.start.shape, generator=torch.Generator().manual_seed(seed))
@@ -75,7 +76,6 @@ def test_a_mask_is_where_the_object_is_hit_first(moved: Renderer, seed: int) -> 
     assert 20 < nearest.sum() < alone.sum() - 20, "a part of it is hidden"
 
 
-@pytest.mark.medium
 def test_a_mask_is_of_its_own_configuration_and_leaves_renders_as_they_are(moved: Renderer) -> None:
     first, second = (torch.rand(moved.start.shape, generator=torch.Generator().manual_seed(seed)) for seed in (2, 3))
     before, mask = moved(first, seed=1, spp=2), moved.mask(first)
@@ -90,7 +90,6 @@ def mask_of(controls: dict[str, dict[str, object]]) -> Tensor:
     return render.mask(render.start)
 
 
-@pytest.mark.medium
 def test_a_lamp_hides_the_object_only_while_it_shines() -> None:
     between: dict[str, object] = {"x": 0.9, "y": 0.76, "z": 0.99, "size": 0.3}
     plain = mask_of({"material": {}})

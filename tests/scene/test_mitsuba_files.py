@@ -147,10 +147,9 @@ def test_a_text_or_nothing_in_the_place_of_a_number_is_refused(tmp_path: Path, i
     "surface",
     [
         '<bsdf type="roughplastic"><float name="eta" value="1.5"/></bsdf>',
-        '<bsdf type="diffuse"><boolean name="reflectance" value="true"/></bsdf>',
-        '<bsdf type="twosided"/>',
+        '<bsdf type="diffuse"><boolean name="reflectance" value="true"/></bsdf>', '<bsdf type="twosided"/>',
     ],
-)
+)  # fmt: skip
 def test_what_mitsuba_refuses_of_the_objects_own_surface_is_told_too(surface: str, tmp_path: Path) -> None:
     path = tmp_path / "one.xml"
     path.write_text(f'<scene version="3.0.0"><shape type="cube" id="thing">{surface}</shape></scene>')
@@ -161,16 +160,13 @@ def test_what_mitsuba_refuses_of_the_objects_own_surface_is_told_too(surface: st
 @pytest.mark.parametrize(
     ("changed", "is_haze"),
     [
-        ({}, True),
-        ({"ball": {"radius": "wide"}}, False),
-        ({"ball": {"center": [3.0, 0.0, 0.0]}}, False),
+        ({}, True), ({"ball": {"radius": "wide"}}, False), ({"ball": {"center": [3.0, 0.0, 0.0]}}, False),
         ({"ball": {"bsdf": {"type": "diffuse"}}}, False),
         ({"fog": {"sigma_t": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}}, False),
-        ({"fog": {"sigma_t": float("nan")}}, False),
-        ({"fog": {"scale": 0.5}}, True),
+        ({"fog": {"sigma_t": float("nan")}}, False), ({"fog": {"scale": 0.5}}, True),
         ({"eye": {"medium": {"type": "ref", "id": "mist"}}}, False),
     ],
-)
+)  # fmt: skip
 def test_haze_is_one_grey_medium_in_a_ball_around_the_camera(changed: dict[str, dict[str, Any]], is_haze: bool) -> None:
     fog: dict[str, Any] = {"type": "ref", "id": "fog"}
     named: dict[str, dict[str, Any]] = {

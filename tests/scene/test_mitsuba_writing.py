@@ -21,12 +21,10 @@ def test_a_dictionary_written_and_read_is_the_same(tmp_path: Path) -> None:
         "type": "scene",
         "lamp": {"type": "point", "position": [0.1, 2.0, 1e-7], "intensity": {"type": "rgb", "value": [1.0, 0.3, 0.0]}},
         "ball": {
-            "type": "sphere",
-            "to_world": mi.ScalarTransform4f(matrix),
-            "flip_normals": True,
+            "type": "sphere", "to_world": mi.ScalarTransform4f(matrix), "flip_normals": True,
             "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}},
         },
-    }
+    }  # fmt: skip
     write_xml(tmp_path / "two.xml", scene, {}, "a -- note")
     read = read_scene(tmp_path / "two.xml")
     assert [shape.id() for shape in mi.load_file(str(tmp_path / "two.xml")).shapes()] == ["ball"]

@@ -82,13 +82,10 @@ def corner() -> trimesh.Trimesh:
 
 
 WAYS: dict[str, Callable[[], Any]] = {
-    "as it is": card,
-    "mirrored": lambda: card(UNIT * [-1, 1] + [1, 0]),
-    "turned": lambda: card(np.roll(UNIT, 1, axis=0)),
-    "half of it mirrored": lambda: halves(True, 0.7),
-    "two materials, one mirrored": lambda: halves(True, 0.69),
-    "a corner of the picture": corner,
-}
+    "as it is": card, "mirrored": lambda: card(UNIT * [-1, 1] + [1, 0]),
+    "turned": lambda: card(np.roll(UNIT, 1, axis=0)), "half of it mirrored": lambda: halves(True, 0.7),
+    "two materials, one mirrored": lambda: halves(True, 0.69), "a corner of the picture": corner,
+}  # fmt: skip
 
 
 def written(made: Any, folder: Path) -> Path:

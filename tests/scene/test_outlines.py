@@ -14,7 +14,7 @@ from advsearch.scene.geometry import project_points
 from advsearch.scene.outlines import VisibleMesh, find_visible_meshes
 from advsearch.scene.renderer import Renderer
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.medium]
 
 SIDE = 64
 
@@ -29,7 +29,6 @@ def seen(one: Renderer) -> VisibleMesh:
     return found
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("shift", [[0.0, 0.0], [0.45, -0.3]])
 def test_the_share_is_that_of_a_larger_picture(shift: list[float]) -> None:
     wide = math.degrees(2.0 * math.atan(2.0 * math.tan(math.radians(15.0))))
@@ -42,14 +41,12 @@ def test_the_share_is_that_of_a_larger_picture(shift: list[float]) -> None:
     assert around.is_truncated is False and around.visible_fraction == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.medium
 def test_a_lens_bends_the_outline() -> None:
     scene = advsearch.load_scene("mug", camera="fisheye")
     found = seen(scene.renderer({"pose": {}}, resolution=SIDE, denoise="none"))
     assert found.is_truncated is False and found.visible_fraction == pytest.approx(1.0, abs=0.03)
 
 
-@pytest.mark.medium
 def test_an_outline_that_is_elsewhere_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     places = project_points
     one = renderer({"pose": {}}, 60.0, SIDE)

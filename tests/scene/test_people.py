@@ -80,17 +80,12 @@ def test_legs_of_a_walker_stay_as_long_as_they_are() -> None:
 @pytest.mark.parametrize(
     ("angle", "tag", "axis", "sign"),
     [
-        ({"left_shoulder": 90}, "skin", 0, 1),
-        ({"left_shoulder_out": 90}, "skin", 1, 1),
-        ({"right_shoulder_out": 90}, "skin", 1, -1),
-        ({"left_hip": 60}, "shoes", 0, 1),
-        ({"right_hip_out": 30}, "shoes", 1, -1),
-        ({"left_knee": 90}, "shoes", 0, -1),
-        ({"spine": 40}, "hair", 0, 1),
-        ({"spine_side": 20}, "hair", 1, 1),
-        ({"neck": 30}, "hair", 0, 1),
+        ({"left_shoulder": 90}, "skin", 0, 1), ({"left_shoulder_out": 90}, "skin", 1, 1),
+        ({"right_shoulder_out": 90}, "skin", 1, -1), ({"left_hip": 60}, "shoes", 0, 1),
+        ({"right_hip_out": 30}, "shoes", 1, -1), ({"left_knee": 90}, "shoes", 0, -1), ({"spine": 40}, "hair", 0, 1),
+        ({"spine_side": 20}, "hair", 1, 1), ({"neck": 30}, "hair", 0, 1),
     ],
-)
+)  # fmt: skip
 def test_a_joint_moves_what_its_name_says_where_it_says(
     angle: dict[str, float], tag: str, axis: int, sign: int
 ) -> None:

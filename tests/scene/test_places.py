@@ -12,7 +12,7 @@ from advsearch.scene.geometry import compute_base_vertices, compute_footprint
 from advsearch.scene.grounds import LUMINANCE, is_enclosed, is_paved
 from scenes.places import room
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.medium]
 
 PLACES = {"avenue": "car", "crossing": "car", "car-park": "car", "room": "mug"}
 """Environments, and what stands in them."""
@@ -22,7 +22,6 @@ def metres(scene: SceneDescription) -> dict[str, np.ndarray]:
     return {name: compute_base_vertices(part) * scene.size_in_metres for name, part in scene.surrounding_meshes.items()}
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("place", PLACES)
 def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: str) -> None:
     scene = load_description(PLACES[place], place)
@@ -40,7 +39,6 @@ def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: s
         assert np.isfinite(part.mesh.uvs).all() and part.base_color.min() >= 0.0 and part.base_color.max() <= 1.0
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize("place", PLACES)
 def test_nothing_stands_where_the_object_is(place: str) -> None:
     scene = load_description(PLACES[place], place)
@@ -58,7 +56,6 @@ def test_nothing_stands_where_the_object_is(place: str) -> None:
     assert low < thing.lower < 0.01
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     ("environment", "shining", "luminance"), [("room", "window", None), ("room-evening", "lamp", room.SHADE)]
 )

@@ -146,15 +146,10 @@ def test_strips_become_triangles(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        (b"float x", b"float q"),
-        (b"float x", b"flota x"),
-        (b"face 1", b"face 2"),
-        (b"1.0 1.0", b"1.0 one"),
-        (b"4 0 1 2 3", b"4 0 1 2 4"),
-        (b"4 0 1 2 3", b"2 0 1 2 3"),
-        (b"4 0 1 2 3", b"-1 0 1 2 3"),
+        (b"float x", b"float q"), (b"float x", b"flota x"), (b"face 1", b"face 2"), (b"1.0 1.0", b"1.0 one"),
+        (b"4 0 1 2 3", b"4 0 1 2 4"), (b"4 0 1 2 3", b"2 0 1 2 3"), (b"4 0 1 2 3", b"-1 0 1 2 3"),
     ],
-)
+)  # fmt: skip
 def test_damage_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
     data = square().written("ascii")
     assert data.count(old) == 1 or old == b"1.0 1.0"
@@ -162,8 +157,6 @@ def test_damage_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
     with pytest.raises(FileFormatError, match=r"a\.ply"):
         read_parts(tmp_path / "a.ply", (tmp_path / "a.ply").read_bytes())
 
-
-# --- whatever a file has ----------------------------------------
 
 VERTEX = {
     **dict.fromkeys(("float confidence", "double quality", "float intensity", "uchar flags", "int radius"), True),
@@ -177,12 +170,9 @@ VERTEX = {
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.lists(st.sampled_from(sorted(VERTEX)), unique=True),
-    st.lists(st.integers(3, 9), min_size=1, max_size=5),
-    st.sampled_from(sorted(ORDERS)),
-    st.booleans(),
-    st.integers(0, 2**32 - 1),
-)
+    st.lists(st.sampled_from(sorted(VERTEX)), unique=True), st.lists(st.integers(3, 9), min_size=1, max_size=5),
+    st.sampled_from(sorted(ORDERS)), st.booleans(), st.integers(0, 2**32 - 1),
+)  # fmt: skip
 def test_whatever_a_file_has_is_read_or_named(
     tmp_path_factory: pytest.TempPathFactory, groups: list[str], sides: list[int], kind: str, wedge: bool, seed: int
 ) -> None:
@@ -236,8 +226,6 @@ def test_whatever_a_file_has_is_read_or_named(
     expected = [f"vertex property {name!r} is left out" for name in unread] + ["face property 'group' is left out"]
     assert sorted(notes) == sorted(expected)
 
-
-# --- STL ----------------------------------------
 
 FACETS = [[(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(1, 0, 0), (1, 1, 0), (0, 1, 0)]]
 

@@ -13,16 +13,14 @@ import advsearch
 from advsearch.scene.mitsuba_backend.own_plugins import APERTURE_RADIUS, SHEET_DISTANCE, WATER_IOR, sample_raindrops
 from advsearch.scene.mitsuba_backend.variant import mi
 
-pytestmark = pytest.mark.usefixtures("two_threads")
+pytestmark = [pytest.mark.usefixtures("two_threads"), pytest.mark.medium]
 SIDE = 64
 
 
 def renderer_of(drops: int, controls: Any = None, **settings: float) -> Any:
     given = {
-        "camera.drops": drops,
-        "camera.drop_size": 3.0,
-        **{f"camera.{name}": one for name, one in settings.items()},
-    }
+        "camera.drops": drops, "camera.drop_size": 3.0, **{f"camera.{name}": one for name, one in settings.items()},
+    }  # fmt: skip
     return advsearch.load_scene("mug", "noon", settings=given).renderer(controls or ["pose"], resolution=SIDE)
 
 
@@ -65,7 +63,6 @@ def expected(ahead: np.ndarray, lens: np.ndarray, drops: np.ndarray) -> tuple[np
     return (ahead, 0.0) if outer is None or outer[2] <= 0.0 else (outer, first * second)
 
 
-@pytest.mark.medium
 def test_rays_are_refracted_by_snells_law_and_lose_what_fresnel_says() -> None:
     renderer = renderer_of(25)
     sensor = renderer.scene._scene.sensors()[0]
@@ -87,7 +84,6 @@ def test_rays_are_refracted_by_snells_law_and_lose_what_fresnel_says() -> None:
     assert changed > 100 and near >= 594, "all but those at an edge, where the grid of the drops decides"
 
 
-@pytest.mark.medium
 def test_what_is_true_of_a_picture_is_so_of_the_scene_without_drops() -> None:
     wet, dry = renderer_of(40), renderer_of(0)
     ours, theirs = (one.surfaces(one.start).visible_mask("object") for one in (wet, dry))
@@ -97,7 +93,6 @@ def test_what_is_true_of_a_picture_is_so_of_the_scene_without_drops() -> None:
     assert wet.scene.definition[0].gain == dry.scene.definition[0].gain
 
 
-@pytest.mark.medium
 def test_a_textures_derivative_goes_through_the_drops() -> None:
     renderer = renderer_of(40, {"texture": {"resolution": 4, "epsilon": 0.5}}, distance=0.35)
     weights = torch.rand(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(2))

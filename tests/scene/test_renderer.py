@@ -196,18 +196,13 @@ def test_non_finite_radiance_is_counted_and_set_to_zero(raw: Renderer, monkeypat
     assert bool(torch.isfinite(image).all()) and float(image[0, 0, 0]) == 0.0
 
 
-# ---- image formation ------------------------------------------------------------------------------------------------
-
-
 def test_a_picture_is_radiance_times_the_gain_through_the_curve() -> None:
     radiance = torch.tensor([[0.0, 0.1, 0.2]])
     light = 2.5 * radiance
     shown = {
-        "srgb": linear_to_srgb(light),
-        "gamma": light.clamp_min(1e-6) ** (1.0 / 2.2),
-        "reinhard": linear_to_srgb(light / (1.0 + light)),
-        "linear": light,
-    }
+        "srgb": linear_to_srgb(light), "gamma": light.clamp_min(1e-6) ** (1.0 / 2.2),
+        "reinhard": linear_to_srgb(light / (1.0 + light)), "linear": light,
+    }  # fmt: skip
     for transfer, expected in shown.items():
         assert torch.allclose(ImageFormation(gain=2.5, transfer=transfer).display(radiance), expected)
 

@@ -72,15 +72,11 @@ def test_some_of_the_cameras_are_seen_from_the_first_of_them(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "lines",
     [
-        IMAGES[:1],
-        [f"{k} 1 0 0 0 0 0 0 1 a.png" for k in range(33)],
-        [IMAGES[0], IMAGES[0]],
-        [IMAGES[0], "2 1 0 0 0 0 0 1 b.png"],
-        [IMAGES[0], "2 2 0 0 0 0 0 0 1 b.png"],
-        [IMAGES[0], "2 1 0 0 0 nan 0 0 1 b.png"],
-        [IMAGES[0], "2 1 0 0 0 0 0 0 3 b.png"],
+        IMAGES[:1], [f"{k} 1 0 0 0 0 0 0 1 a.png" for k in range(33)], [IMAGES[0], IMAGES[0]],
+        [IMAGES[0], "2 1 0 0 0 0 0 1 b.png"], [IMAGES[0], "2 2 0 0 0 0 0 0 1 b.png"],
+        [IMAGES[0], "2 1 0 0 0 nan 0 0 1 b.png"], [IMAGES[0], "2 1 0 0 0 0 0 0 3 b.png"],
     ],
-)
+)  # fmt: skip
 def test_images_that_are_no_rig_are_refused(tmp_path: Path, lines: list[str]) -> None:
     with pytest.raises(FileFormatError, match=r"images\.txt|cameras\.txt"):
         read_rig(images(tmp_path, lines))

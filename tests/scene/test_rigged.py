@@ -84,10 +84,9 @@ def figure(weights: str = "f4", **header: Any) -> File:
     ]
     spline = np.stack([TANGENTS[:, 0], SHIFTS, TANGENTS[:, 1]], axis=1).reshape(-1, 3)
     held = [
-        (UPPER, "rotation", TURNS, "LINEAR"),
-        (UPPER, "scale", SCALES, "STEP"),
+        (UPPER, "rotation", TURNS, "LINEAR"), (UPPER, "scale", SCALES, "STEP"),
         (3, "translation", spline, "CUBICSPLINE"),
-    ]
+    ]  # fmt: skip
     held.append((0, "weights", SHARES[:, None], "LINEAR"))
     at = file.values(TIMES[:, None])
     file.header["animations"] = [{
@@ -101,9 +100,6 @@ def figure(weights: str = "f4", **header: Any) -> File:
     }]  # fmt: skip
     file.header |= header
     return file
-
-
-# ---- the format's formulas, once more --------------------------------------------------------------------------------
 
 
 def matrix(shift: Any, turn: Any, scale: Any) -> np.ndarray:
@@ -238,9 +234,6 @@ def test_derivatives_are_those_of_differences(clip: str | None, values: dict[str
     assert float(slope) == pytest.approx((up - down) / 2e-6, rel=1e-5)
 
 
-# ---- the control -----------------------------------------------------------------------------------------------------
-
-
 def space_of(path: Path, **settings: object) -> Any:
     return make_space([make_control("body", settings)], load_description(str(path)))
 
@@ -293,9 +286,6 @@ def test_true_boxes_follow(tmp_path: Path) -> None:
         (found,) = find_visible_meshes(renderer, torch.tensor([time]))
         wanted = columns.min(), rows.min(), columns.max(), rows.max()
         assert np.abs(np.array(found.box) - wanted).max() <= 1.0, (found.box, wanted)
-
-
-# ---- hostile files ---------------------------------------------------------------------------------------------------
 
 
 def _set(*keys: Any, value: Any) -> Callable[[File], None]:

@@ -52,13 +52,10 @@ def test_gltf_is_in_metres_and_other_files_say_no_unit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("longest", "said"),
     [
-        (4.9, {"unit": "m"}),
-        (490.0, {"unit": "cm"}),
-        (4900.0, {"unit": "mm"}),
-        (4.9 / 0.0254, {"unit": "in"}),
+        (4.9, {"unit": "m"}), (490.0, {"unit": "cm"}), (4900.0, {"unit": "mm"}), (4.9 / 0.0254, {"unit": "in"}),
         (1.0, {"size": 4.9}),
     ],
-)
+)  # fmt: skip
 def test_a_car_stands_in_its_lane_at_its_size(tmp_path: Path, longest: float, said: dict[str, object]) -> None:
     scene = load_scene(str(box(tmp_path, "sedan", longest)), "street", up="z", **said)  # type: ignore[arg-type]
     own = scene.description

@@ -21,16 +21,12 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
 from advsearch.scene.transport import matrix as linear
 from advsearch.scene.transport.matrix import CELL_SIZE, TextureTransport
+from small_models import levels
 from stand_ins import Impatient, rows
 
 SIZE = 64
 HALF = 5e-4
 """What a share is rounded by: it has 16 bits."""
-
-
-def levels(one: Tensor, other: Tensor) -> float:
-    """Root mean square difference of two pictures in levels of 255."""
-    return 255.0 * float(((one - other) ** 2).mean().sqrt())
 
 
 @pytest.fixture(scope="module")
@@ -131,20 +127,15 @@ def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_ent
 @pytest.mark.parametrize(
     ("controls", "options", "can_predict"),
     [
-        (["texture"], {}, True),
-        (["patch"], {}, True),
-        (["texture", "pose"], {}, False),
-        ({"texture": {}, "haze": {"density": 0.2}}, {}, False),
-        (["texture"], {"denoise": "none"}, False),
+        (["texture"], {}, True), (["patch"], {}, True), (["texture", "pose"], {}, False),
+        ({"texture": {}, "haze": {"density": 0.2}}, {}, False), (["texture"], {"denoise": "none"}, False),
         (["texture"], {"estimators": {"texture": "adjoint"}}, False),
     ],
-)
+)  # fmt: skip
 def test_where_it_can_predict(controls: object, options: dict[str, object], can_predict: bool) -> None:
     made = advsearch.load_scene("mug").renderer(controls, resolution=16, **options)  # type: ignore[arg-type]
     assert (lights.find_refusal(made) is None) == can_predict
 
-
-# ---- searches -------------------------------------------------------------------------------------------------------
 
 SMALL = {"resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8, "controls": {"texture": {"resolution": 8}}}
 

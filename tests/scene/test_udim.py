@@ -34,9 +34,6 @@ def test_each_square_has_its_own_picture(name: str, tmp_path: Path) -> None:
     assert {part.surface.name for part in parts} == {"m"}
 
 
-# ---- means ----------------------------------------------------------------------------------------------------------
-
-
 def test_a_mean_weighs_faces_by_their_area() -> None:
     columns = np.arange(64, dtype=np.float32)[None, :, None].repeat(64, axis=0) / 64.0
     left = np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 1.0]])

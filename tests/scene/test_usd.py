@@ -24,6 +24,7 @@ from advsearch.scene.library import load_object
 from advsearch.scene.parts import PointLamp, SpotLamp
 
 needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="usd-core is not installed: pip install 'advsearch[usd]'")
+pytestmark = [pytest.mark.medium, needs_usd]
 PREVIEW = """
     def Material "{name}" {{
         token outputs:surface.connect = </Root/{name}/surface.outputs:surface>
@@ -141,8 +142,6 @@ def same_picture(one: Path | str, other: Path | str) -> None:
     assert np.ptp(theirs) > 50.0
 
 
-@pytest.mark.medium
-@needs_usd
 @pytest.mark.parametrize(("up", "unit"), [("Y", 1.0), ("Z", 0.01)])
 def test_a_file_looks_as_its_twin_in_gltf(mug: tuple[ObjectAsset, Path], up: str, unit: float) -> None:
     made, folder = mug
@@ -163,8 +162,6 @@ def faults_of(path: Path) -> list[str]:
     return [f"{one.GetName()}: {one.GetMessage()}" for one in found]
 
 
-@pytest.mark.medium
-@needs_usd
 def test_binary_files_and_packages_are_the_same(mug: tuple[ObjectAsset, Path]) -> None:
     from pxr import Sdf
 
@@ -182,9 +179,6 @@ def test_binary_files_and_packages_are_the_same(mug: tuple[ObjectAsset, Path]) -
         assert np.array_equal(found.base_color, expected.base_color)
 
 
-# ---- the parts of a stage -------------------------------------------------------------------------------------------
-
-
 def written(folder: Path, body: str, **head: Any) -> Path:
     file = folder / "scene.usda"
     file.write_text(stage(body, **head))
@@ -197,8 +191,6 @@ def skin(folder: Path) -> None:
     Image.fromarray(levels).save(folder / "skin.png")
 
 
-@pytest.mark.medium
-@needs_usd
 def test_subsets_have_materials_of_their_own(tmp_path: Path) -> None:
     subset = """
         def GeomSubset "top" (prepend apiSchemas = ["MaterialBindingAPI"]) {
@@ -217,8 +209,6 @@ def test_subsets_have_materials_of_their_own(tmp_path: Path) -> None:
     assert found.material.roughness == pytest.approx(0.3) and found.material.metallic == 0.0
 
 
-@pytest.mark.medium
-@needs_usd
 def test_numbers_and_pictures_of_a_preview_surface(tmp_path: Path) -> None:
     """Two pictures of numbers become their means, of linear values as USD says of colours of 8 bits; the emission is
     linear, the colour times its scale."""
@@ -238,8 +228,6 @@ def test_numbers_and_pictures_of_a_preview_surface(tmp_path: Path) -> None:
     assert ((blue + 0.055) / 1.055) ** 2.4 == pytest.approx(dark, rel=0.05)
 
 
-@pytest.mark.medium
-@needs_usd
 @pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
 def test_polygons_holes_and_orientation(tmp_path: Path, orientation: str) -> None:
     """A concave polygon is cut up as it is; a face that is a hole is none."""
@@ -253,8 +241,6 @@ def test_polygons_holes_and_orientation(tmp_path: Path, orientation: str) -> Non
     assert np.linalg.norm(across, axis=1).sum() / 2 == pytest.approx(2.5 / 4.0, rel=1e-4), "of a largest extent of 1"
     assert (across[:, 1] < 0).all(), "towards the viewer, which is +z with y up"
 
-
-# ---- scenes ---------------------------------------------------------------------------------------------------------
 
 ROOM = f"""
     def Xform "shelf" {{
@@ -295,8 +281,6 @@ ROOM = f"""
 """
 
 
-@pytest.mark.medium
-@needs_usd
 def test_nodes_cameras_and_lights_are_those_of_the_file(tmp_path: Path) -> None:
     """Radiance times the disk of a sphere is its intensity; normalised, the power is that of the number."""
     scene = load_description(f"{written(tmp_path, ROOM, unit=0.5)}#book")
@@ -321,8 +305,6 @@ def said(scene: SceneDescription) -> str:
     return " ".join(scene.object.warnings)
 
 
-@pytest.mark.medium
-@needs_usd
 def test_references_payloads_variants_and_instances(tmp_path: Path) -> None:
     """A variant that is chosen in the file, and a part of another file, twice as an instance."""
     (tmp_path / "parts").mkdir()
@@ -358,8 +340,6 @@ def test_references_payloads_variants_and_instances(tmp_path: Path) -> None:
     assert sizes["board"] == pytest.approx((3.0, 0.1, 1.0)) and sizes["Root/leg1/stick"] == pytest.approx((0.1, 1, 0.1))
 
 
-@pytest.mark.medium
-@needs_usd
 def test_a_skeleton_is_at_rest(tmp_path: Path) -> None:
     """Bound in one pose, at rest in another: the upper joint is moved by 2 in x, and its points with it."""
     identity = "( (1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,0,1) )"
@@ -387,15 +367,10 @@ def test_a_skeleton_is_at_rest(tmp_path: Path) -> None:
     assert node.size == pytest.approx((3.0, 1.0, 1.0))
 
 
-# ---- what is refused ------------------------------------------------------------------------------------------------
-
-
 def refers_to(name: str) -> str:
     return f'    def Xform "part" (prepend references = @{name}@) {{}}\n' + mesh(CUBE, SIDES)
 
 
-@pytest.mark.medium
-@needs_usd
 @pytest.mark.parametrize(
     ("body", "expected"),
     [
@@ -426,18 +401,13 @@ def test_what_is_refused(tmp_path: Path, body: str, expected: str) -> None:
     assert str(raised.value).startswith(str(folder))
 
 
-@pytest.mark.medium
-@needs_usd
 @pytest.mark.parametrize(
     ("name", "compression"),
     [
-        ("../out.usda", zipfile.ZIP_STORED),
-        ("/tmp/out.usda", zipfile.ZIP_STORED),
-        ("C:out.usda", zipfile.ZIP_STORED),
-        ("a.usda", zipfile.ZIP_DEFLATED),
-        ("a.png", zipfile.ZIP_STORED),
+        ("../out.usda", zipfile.ZIP_STORED), ("/tmp/out.usda", zipfile.ZIP_STORED), ("C:out.usda", zipfile.ZIP_STORED),
+        ("a.usda", zipfile.ZIP_DEFLATED), ("a.png", zipfile.ZIP_STORED),
     ],
-)
+)  # fmt: skip
 def test_packages_that_are_refused(tmp_path: Path, name: str, compression: int) -> None:
     file = tmp_path / "a.usdz"
     with zipfile.ZipFile(file, "w", compression) as archive:
@@ -447,8 +417,6 @@ def test_packages_that_are_refused(tmp_path: Path, name: str, compression: int) 
     assert not (tmp_path.parent / "out.usda").exists()
 
 
-@pytest.mark.medium
-@needs_usd
 def test_damaged_files_and_large_ones_end_in_a_sentence(
     tmp_path: Path, mug: tuple[ObjectAsset, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -474,8 +442,6 @@ def test_damaged_files_and_large_ones_end_in_a_sentence(
         import_object(folder / "mug.usda")
 
 
-@pytest.mark.medium
-@needs_usd
 def test_opacity_cuts_out_and_a_transform_moves_the_texture(tmp_path: Path) -> None:
     skin(tmp_path)
     levels = np.full((8, 8, 4), 255, np.uint8)

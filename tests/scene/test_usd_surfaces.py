@@ -150,14 +150,11 @@ def test_each_texture_is_looked_up_by_its_own_reader(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("levels", "space", "expected"),
     [
-        ([[[188, 100, 50]]], "raw", np.array([188, 100, 50]) / 255),
-        ([[[188, 100, 50]]], "sRGB", COLOR_OF_188),
-        ([[[188, 100, 50]]], "auto", COLOR_OF_188),
-        ([[[188, 100, 50, 255]]], "auto", COLOR_OF_188),
-        ([[188]], "auto", np.full(3, 188 / 255)),
-        ([[188]], "sRGB", srgb_to_linear(np.full(3, 188 / 255, np.float32))),
+        ([[[188, 100, 50]]], "raw", np.array([188, 100, 50]) / 255), ([[[188, 100, 50]]], "sRGB", COLOR_OF_188),
+        ([[[188, 100, 50]]], "auto", COLOR_OF_188), ([[[188, 100, 50, 255]]], "auto", COLOR_OF_188),
+        ([[188]], "auto", np.full(3, 188 / 255)), ([[188]], "sRGB", srgb_to_linear(np.full(3, 188 / 255, np.float32))),
     ],
-)
+)  # fmt: skip
 def test_color_spaces(tmp_path: Path, levels: object, space: str, expected: np.ndarray) -> None:
     save(tmp_path / "a.png", levels)
     more = f'token inputs:sourceColorSpace = "{space}"'
@@ -242,12 +239,10 @@ def test_an_opacity_of_any_channel_of_another_picture(tmp_path: Path, output: st
 @pytest.mark.parametrize(
     ("wrap", "expected"),
     [
-        ("repeat", (0.5, 0.0, 0.5)),
-        ("clamp", (0.5, 0.0, 0.5)),
-        ("black", (0.5 / 9, 0.0, 0.5 / 9)),
+        ("repeat", (0.5, 0.0, 0.5)), ("clamp", (0.5, 0.0, 0.5)), ("black", (0.5 / 9, 0.0, 0.5 / 9)),
         ("useMetadata", (0.5 / 9, 0.0, 0.5 / 9)),
     ],
-)
+)  # fmt: skip
 def test_how_pictures_go_on(tmp_path: Path, wrap: str, expected: tuple[float, ...]) -> None:
     """Texture coordinates reach one picture beyond each edge: with black, a ninth is the picture."""
     halves(tmp_path / "halves.png")
@@ -298,9 +293,6 @@ def test_normal_maps_by_their_scale_and_bias(tmp_path: Path) -> None:
     assert y["down"] == pytest.approx(-0.39, abs=0.02) and y["without"] == pytest.approx(y["usual"], abs=0.01)
 
 
-# ---- without a material ---------------------------------------------------------------------------------------------
-
-
 def colors_of(parts: list[ImportedPart]) -> list[tuple[float, ...]]:
     return sorted(tuple(np.round(linear_color(part), 2)) for part in parts)
 
@@ -322,9 +314,6 @@ def test_display_colors_and_opacities_of_faces_and_vertices(tmp_path: Path) -> N
     colors = [part.surface.color for part in parts if part.surface.color is not None]
     shares = sorted(1.0 if len(color) == 3 else float(color[3]) for color in colors)
     assert shares == pytest.approx([0.25, 1.0], abs=0.003)
-
-
-# ---- packages as layers ---------------------------------------------------------------------------------------------
 
 
 def write_package(folder: Path, name: str, entries: dict[str, bytes]) -> None:
@@ -368,13 +357,10 @@ def test_packages_are_layers_also_in_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "entries",
     [
-        {"a.usda": referring("../../outside.usda").encode()},
-        {"a.usda": referring("/tmp/x.usda").encode()},
-        {"a.usda": referring("gone.usda").encode()},
-        {"a.usda": b"#usda 1.0\ndef Mesh {"},
-        {"a.png": b"x"},
+        {"a.usda": referring("../../outside.usda").encode()}, {"a.usda": referring("/tmp/x.usda").encode()},
+        {"a.usda": referring("gone.usda").encode()}, {"a.usda": b"#usda 1.0\ndef Mesh {"}, {"a.png": b"x"},
     ],
-)
+)  # fmt: skip
 def test_what_packages_may_not_name(tmp_path: Path, entries: dict[str, bytes]) -> None:
     folder = tmp_path / "inside"
     folder.mkdir()

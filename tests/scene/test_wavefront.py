@@ -58,9 +58,6 @@ def areas(part: ImportedPart) -> np.ndarray:
     return found
 
 
-# --- material files ----------------------------------------
-
-
 @pytest.mark.parametrize(
     ("rest", "name", "options"),
     [
@@ -115,9 +112,6 @@ def test_roughness_and_metallic(tmp_path: Path) -> None:
     assert part.surface.roughness == pytest.approx(pixels[:, :, 1].mean(), abs=1e-6)
     assert part.surface.metallic == pytest.approx(pixels[:, :, 2].mean() / 2.0, abs=1e-6)
     assert len(notes) == 1 and "roughness and metallic" in notes[0]
-
-
-# --- what OBJ files have ----------------------------------------
 
 
 def test_colors_of_vertices_times_the_color_of_the_material(tmp_path: Path) -> None:
@@ -235,12 +229,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @settings(max_examples=40, deadline=None)
 @given(
-    chosen(STATEMENTS),
-    chosen(MATERIAL_LINES),
-    chosen(OPTIONS),
-    st.sampled_from(["", " # so", "\t#1"]),
+    chosen(STATEMENTS), chosen(MATERIAL_LINES), chosen(OPTIONS), st.sampled_from(["", " # so", "\t#1"]),
     st.sampled_from(["\n", "\r\n"]),
-)
+)  # fmt: skip
 def test_whatever_a_file_has_is_read_or_named(
     folder: Path, statements: list[str], lines: list[str], options: list[str], comment: str, newline: str
 ) -> None:

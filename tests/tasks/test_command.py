@@ -22,20 +22,11 @@ from advsearch.tasks.command import Command
 
 SIDE = 24
 ASKED: dict[str, Any] = {
-    "name": "command",
-    "state": {"speed": 2},
-    "envelope": 0.4,
-    "names": "yaw rate",
-    "units": "rad/s",
-}
+    "name": "command", "state": {"speed": 2}, "envelope": 0.4, "names": "yaw rate", "units": "rad/s",
+}  # fmt: skip
 QUICK: dict[str, Any] = {
-    "resolution": SIDE,
-    "spp": 4,
-    "verify_spp": 4,
-    "trials": 12,
-    "measure": "no",
-    "denoise": "none",
-}
+    "resolution": SIDE, "spp": 4, "verify_spp": 4, "trials": 12, "measure": "no", "denoise": "none",
+}  # fmt: skip
 
 
 class TowardsBlue(nn.Module):
@@ -61,9 +52,6 @@ def judged(**options: Any) -> Command:
         envelope=[0.5, 0.1], names=["steer", "gas"]
     )  # fmt: skip
     return task.after_calibration(torch.tensor([[0.1, -0.2]]), None)
-
-
-# ---- judgements -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -104,9 +92,6 @@ def test_a_target_is_reached_within_its_envelope() -> None:
         replace(asked, target=torch.tensor([9.0])).after_calibration(torch.full((1, 3), 0.5), None)
 
 
-# ---- options --------------------------------------------------------------------------------------------------------
-
-
 def test_a_state_is_read_from_a_file_that_is_not_trusted(tmp_path: Path) -> None:
     file = tmp_path / "state.json"
     file.write_text(json.dumps({"speed": 2, "joints": [0.1, 0.2]}))
@@ -119,9 +104,6 @@ def test_a_state_is_read_from_a_file_that_is_not_trusted(tmp_path: Path) -> None
     for path in (tmp_path, tmp_path / "none.json", Path("/dev/zero")):
         with pytest.raises(FileFormatError):
             Command(state=str(path))
-
-
-# ---- policies -------------------------------------------------------------------------------------------------------
 
 
 def exported(folder: Path) -> str:
@@ -164,9 +146,6 @@ def test_a_policy_of_a_rig_takes_all_pictures_at_once(tmp_path: Path) -> None:
     alone = advsearch.load_model(TowardsBlue(), task=task, input_size=SIDE)
     with pytest.raises(InputError, match="one action for all pictures"):
         advsearch.attack("mug", alone, task={"name": "rig", "task": part}, **given)
-
-
-# ---- questions ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium

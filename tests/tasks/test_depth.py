@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.objectives import get_objective
-from advsearch.cli.main import main
 from advsearch.options import NOT_A_NUMBER
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
@@ -30,7 +28,7 @@ from advsearch.tasks.depth import (
     Depth,
     DepthTruth,
 )
-from small_models import SIDE, Ranger
+from small_models import Ranger, answer, assert_slope, save_exported
 
 HIGH, WIDE = 8, 10
 MASK = torch.zeros(HIGH, WIDE).bool()
@@ -135,18 +133,14 @@ def test_the_gradient_agrees_with_differences() -> None:
     at, way = (torch.randn((HIGH, WIDE), generator=generator, dtype=torch.float64) for _ in range(2))
     truth = DepthTruth(MASK, TRUTH.z.double())
     for kind in (DISPARITY, RELATIVE, METRIC):
-        start = (said(INVERSE.double(), kind)[0][kind] + 0.02 * at).requires_grad_()
+        start = said(INVERSE.double(), kind)[0][kind] + 0.02 * at
         for seek in ("", "nearer", "farther", "gone"):
             task = replace(TASK, seek=seek)
 
             def value(values: Tensor, task: Depth = task, kind: str = kind) -> Tensor:
                 return task.score([{kind: values}], truth).sum()
 
-            (slope,) = torch.autograd.grad(value(start), start)
-            with torch.no_grad():
-                seen = float(value(start + 1e-6 * way) - value(start - 1e-6 * way)) / 2e-6
-            assert abs(seen) > 1e-3
-            assert float((slope * way).sum()) == pytest.approx(seen, rel=1e-4), (kind, seek)
+            assert abs(assert_slope(value, start, way, 1e-6, 1e-4)) > 1e-3, (kind, seek)
 
 
 def test_it_is_compared_with_the_distance_along_the_axis() -> None:
@@ -166,24 +160,12 @@ def test_it_is_compared_with_the_distance_along_the_axis() -> None:
         assert right.map is not None and torch.allclose(right.map, moved(2.0), atol=1e-4)
 
 
-# ---- on a model -----------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The flags of the task with a model file."""
     file = tmp_path_factory.mktemp("depth") / "net.pt2"
-    batch = {0: torch.export.Dim("batch", min=1, max=64)}
-    program = torch.export.export(Ranger().eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
-    torch.export.save(program, file)
+    save_exported(Ranger(), file)
     return ["--object", "mug", "--task", f"depth={{kind: {DISPARITY}}}", "--model", str(file), "--json"]
-
-
-def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
-    """Type a command, and return what it prints."""
-    assert main(list(command)) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
 
 
 SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none", "--trials", "6"]

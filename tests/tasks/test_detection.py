@@ -45,9 +45,6 @@ def judged(task: Detection, output: list[dict[str, Tensor]], truth: DetectionTru
     return found
 
 
-# ---- boxes ----------------------------------------------------------------------------------------------------------
-
-
 def test_boxes_overlap_by_the_share_of_their_union() -> None:
     box = torch.tensor(HERE)
     boxes = torch.tensor([HERE, NEAR, AWAY, [0.2, 0.2, 0.4, 0.6], [0.6, 0.6, 0.2, 0.2]])
@@ -60,8 +57,6 @@ def test_all_forms_of_a_box_are_the_same_corners() -> None:
     for form, numbers in forms.items():
         assert to_corners(torch.tensor(numbers).float(), form).tolist() == [1, 2, 5, 8]
 
-
-# ---- what a detector returns ----------------------------------------------------------------------------------------
 
 BOXES, SCORES = torch.tensor([[HERE, AWAY]] * 2), torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(1))
 LABELS, ONE = torch.tensor([[0, 2], [1, 1]]), torch.tensor([[0.9, 0.2], [0.4, 0.3]])
@@ -77,12 +72,10 @@ class Output:
 @pytest.mark.parametrize(
     "answer",
     [
-        (BOXES, SCORES),
-        {"boxes": BOXES, "scores": SCORES},
-        Output(boxes=BOXES, scores=SCORES),
+        (BOXES, SCORES), {"boxes": BOXES, "scores": SCORES}, Output(boxes=BOXES, scores=SCORES),
         [{"boxes": BOXES[k], "scores": SCORES[k]} for k in range(2)],
     ],
-)
+)  # fmt: skip
 def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
     found = read_detections(answer, 2)
     assert [sorted(one) for one in found] == [["boxes", "scores"]] * 2
@@ -93,11 +86,10 @@ def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
 @pytest.mark.parametrize(
     "answer",
     [
-        (BOXES, ONE, LABELS),
-        {"boxes": BOXES, "labels": LABELS, "scores": ONE},
+        (BOXES, ONE, LABELS), {"boxes": BOXES, "labels": LABELS, "scores": ONE},
         [(BOXES[k], LABELS[k], ONE[k]) for k in range(2)],
     ],
-)
+)  # fmt: skip
 def test_one_label_a_box_is_read_in_every_form(answer: Any) -> None:
     for k, one in enumerate(read_detections(answer, 2)):
         assert one["boxes"].equal(BOXES[k]) and one["labels"].equal(LABELS[k]) and one["scores"].equal(ONE[k])
@@ -106,17 +98,14 @@ def test_one_label_a_box_is_read_in_every_form(answer: Any) -> None:
 @pytest.mark.parametrize(
     ("answer", "text"),
     [
-        ((BOXES, SCORES[:1]), "expected boxes"),
-        ((BOXES[..., :3], SCORES), "expected boxes"),
+        ((BOXES, SCORES[:1]), "expected boxes"), ((BOXES[..., :3], SCORES), "expected boxes"),
         ((BOXES, 3.0 * SCORES - 1.0), r"probabilities in \[0, 1\]; apply a sigmoid"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_detection_is_refused(answer: Any, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         read_detections(answer, 2)
 
-
-# ---- suppression ----------------------------------------------------------------------------------------------------
 
 FAR = [0.34, 0.2, 0.74, 0.6]
 """Overlaps `NEAR` by 0.82, and the object by 0.48: not where it is."""
@@ -151,8 +140,6 @@ def test_what_is_left_has_a_derivative_and_what_is_dropped_has_none() -> None:
     TASK.loss(output, TRUTH).sum().backward()
     assert scores.grad is not None and scores.grad[0].tolist() == [0.0, 0.0, 0.0] and float(scores.grad[1, 0]) < 0.0
 
-
-# ---- the judgement --------------------------------------------------------------------------------------------------
 
 FOUND = dense((HERE, [0.8, 0.1, 0.0]), (AWAY, [0.1, 0.2, 0.1]))
 
@@ -310,9 +297,6 @@ def test_the_payload_has_all_boxes_in_pixels_and_marks_show_those_that_count() -
     (marks,) = TASK.marks(FOUND, TRUTH)
     assert [(one.text, one.true) for one in marks] == [("cup", True), ("cup 0.80", False)]
     assert [one.box for one in marks] == [pytest.approx((4.0, 4.0, 12.0, 12.0))] * 2
-
-
-# ---- on a model -----------------------------------------------------------------------------------------------------
 
 
 class Pixels(nn.Module):

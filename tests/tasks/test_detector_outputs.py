@@ -123,9 +123,6 @@ def three() -> Rows:
     return torch.tensor([[CUP, BOWL]]), torch.tensor([[0.8, 0.6]]), torch.tensor([[0.0, 1.0]])
 
 
-# ---- unit and form --------------------------------------------------------------------------------------------------
-
-
 def middle(boxes: Tensor) -> Tensor:
     return torch.cat([(boxes[..., :2] + boxes[..., 2:]) / 2.0, boxes[..., 2:] - boxes[..., :2]], dim=-1)
 
@@ -147,9 +144,6 @@ def test_the_unit_is_read_from_boxes_that_count_and_an_odd_form_is_named(
     task, _ = on(Shaped(lambda b, s, c: (form(b), s, c.long())))
     assert task.inferred_unit == unit and (doubts in task.doubts if doubts else not task.doubts)
     assert [doubts in one and "may be read wrongly" in one for one in task.remarks] == [True] * bool(doubts)
-
-
-# ---- no answers -----------------------------------------------------------------------------------------------------
 
 
 def dense(*scores: list[float]) -> list[Detections]:

@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from torch import nn
 
 import advsearch
-from advsearch.cli.main import main
 from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.photographs.result import find_rendering
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
-from small_models import SIDE, Finder, Painter, Slider
+from small_models import SIDE, Finder, Painter, Slider, answer, save_exported
+
+pytestmark = pytest.mark.medium
 
 ALSO_SLOWLY = pytest.mark.parametrize(
     "asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True
@@ -36,20 +36,11 @@ def asked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         "detection": (Finder(), ["cup", "bowl", "dog"], "cup"),
         "segmentation": (Painter(), ["background", "mug", "dog"], "mug"),
     }[request.param]
-    batch = {0: torch.export.Dim("batch", min=1, max=64)}
-    program = torch.export.export(network.eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
-    torch.export.save(program, folder / "net.pt2")
+    save_exported(network, folder / "net.pt2")
     (folder / "labels.json").write_text(json.dumps(names), "utf-8")
     task = "detection" if request.param == "detection" else "segmentation={accuracy: 0.7}"
     model = ["--task", task, "--model", str(folder / "net.pt2"), "--labels", str(folder / "labels.json")]
     return [*model, "--label", label, "--json"]
-
-
-def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
-    """Type a command, and return what it prints."""
-    assert main(list(command)) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
 
 
 def task_of(asked: list[str]) -> str:
@@ -80,7 +71,6 @@ figures:
 """
 
 
-@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_recipe_is_carried_out(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(RECIPE)
@@ -95,7 +85,6 @@ def test_a_recipe_is_carried_out(asked: list[str], capsys: pytest.CaptureFixture
 SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none"]
 
 
-@pytest.mark.medium
 def test_a_search_predicts_verifies_and_draws(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -122,7 +111,6 @@ def test_a_search_predicts_verifies_and_draws(
     assert photographed(taker, run, "clean", SIDE // 2) == [True, False]
 
 
-@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_stopped_search_goes_on_with_the_same_words(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -135,7 +123,6 @@ def test_a_stopped_search_goes_on_with_the_same_words(
         assert again[name] == first[name]
 
 
-@pytest.mark.medium
 def test_a_sweep_counts_and_keeps_the_worst(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -152,7 +139,6 @@ def test_a_sweep_counts_and_keeps_the_worst(
     assert photographed(taker, tmp_path / "run", "0", SIDE // 2) == [True, False]
 
 
-@pytest.mark.medium
 @ALSO_SLOWLY
 def test_a_configuration_that_holds_for_many_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -165,7 +151,6 @@ def test_a_configuration_that_holds_for_many_conditions(
     assert found["verified"]["trials"] == 8 and found["over"] == ["camera"]
 
 
-@pytest.mark.medium
 @pytest.mark.parametrize(
     ("objective", "network", "controls", "said"),
     [

@@ -33,13 +33,12 @@ ALL, HALF, QUARTER = of([0, 1, 1, 0], [0, 1, 1, 0]), of([0, 1, 0, 0], [0, 2, 1, 
 @pytest.mark.parametrize(
     ("output", "accuracy", "right", "answer"),
     [
-        (ALL, 0.5, True, Prediction("bottle", 1, 1.0)),
-        (HALF, 0.5, True, Prediction("bottle", 1, 0.5)),
+        (ALL, 0.5, True, Prediction("bottle", 1, 1.0)), (HALF, 0.5, True, Prediction("bottle", 1, 0.5)),
         (HALF, 0.51, False, Prediction("bottle in part", None, 0.5)),
         (QUARTER, 0.5, False, Prediction("chair", 2, 0.25)),
         (HALF, 1.0, False, Prediction("bottle in part", None, 0.5)),
     ],
-)
+)  # fmt: skip
 def test_enough_of_the_objects_pixels_have_to_be_right(
     output: Tensor, accuracy: float, right: bool, answer: Prediction
 ) -> None:
@@ -89,9 +88,6 @@ def test_predictions_are_the_classes_of_most_pixels() -> None:
     true, said = TASK.marks(QUARTER, TRUTH)[0]
     assert true.true and true.mask is MASK and not said.true and said.mask is not None
     assert said.mask.int().tolist() == [[1, 1, 0, 1], [1, 0, 0, 1]]
-
-
-# ---- on a model -----------------------------------------------------------------------------------------------------
 
 
 class Mapped(nn.Module):

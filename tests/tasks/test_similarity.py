@@ -20,7 +20,7 @@ from advsearch.models import Model
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.tasks import Facts
 from advsearch.tasks.similarity import ITSELF, SOMETHING_ELSE, TEMPERATURE, Similarity
-from small_models import SIDE
+from small_models import SIDE, save_exported
 
 COLOURS = {"blue": (0.2, 0.3, 0.9), "green": (0.2, 0.8, 0.3), "red": (0.9, 0.2, 0.2)}
 NAMES = tuple(COLOURS)
@@ -83,8 +83,6 @@ def features(model: Model, pictures: Tensor) -> Tensor:
     return nn.functional.normalize(model(pictures), dim=1)
 
 
-# ---- networks -------------------------------------------------------------------------------------------------------
-
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 SIZES = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 8}
 EYES = {**SIZES, "image_size": 16, "patch_size": 8}
@@ -131,9 +129,6 @@ def test_features_are_those_of_the_librarys_own_pipeline(architecture: str, tmp_
     torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=0.0)
     again = advsearch.load_model(network, task="similarity")  # from Python, as it is
     torch.testing.assert_close(again(torch.from_numpy(read_png(file))), theirs, atol=1e-4, rtol=0.0)
-
-
-# ---- references -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("k", [1, 2, 50])
@@ -208,9 +203,6 @@ def test_objectives_of_logits_have_a_true_gradient(
         assert value == pytest.approx(-task.judge(model(picture.detach()), (0,))[0].margin)
 
 
-# ---- the clean picture ----------------------------------------------------------------------------------------------
-
-
 def test_a_threshold_compares_with_the_clean_picture(model: Model) -> None:
     task = Similarity(threshold=0.8).on(model)
     clean, other = noisy(COLOURS["red"], 1), noisy(COLOURS["blue"], 1)
@@ -238,9 +230,6 @@ def test_the_distance_is_one_minus_the_cosine_and_leads_away_from_the_start(mode
         assert float(objective(model(moved), moved[None], (0,))) > float(objective(model(clean), clean[None], (0,)))
 
 
-# ---- as a user types it ---------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """References of the bundled mug and bowl, and a network as a file."""
@@ -251,9 +240,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
             name, network, around=2, spp=2, denoise="none", task=Similarity(threshold=0)
         ).views:
             write(place / "refs" / name / f"{view.azimuth:.0f}.png", view.picture)
-    batch = {0: torch.export.Dim("batch", min=1, max=64)}
-    shape = torch.zeros(2, 3, SIDE, SIDE)
-    torch.export.save(torch.export.export(Banded().eval(), (shape,), dynamic_shapes=(batch,)), place / "net.pt2")
+    save_exported(Banded(), place / "net.pt2")
     return place
 
 

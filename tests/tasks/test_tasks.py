@@ -21,9 +21,6 @@ LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 4.0], [2.0, 
 NAMED = Classification(labels=("mug", "bowl", "vase"))
 
 
-# ---- classification -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("task", "scores", "goal"),
     [
@@ -85,9 +82,6 @@ def test_what_is_right_is_what_was_said_or_else_the_objects_own_label() -> None:
         NAMED.truth(Facts("thing"))
     with pytest.raises(InputError, match=r"^label"):
         NAMED.truth(Facts("thing", None, "chair"))
-
-
-# ---- another task ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import torch
 from torch import nn
 
 import advsearch
-from advsearch.cli.main import main
 from advsearch.engine.judging import make_objective
 from advsearch.models import Model
 from advsearch.questions.attack.settings import AttackConfig
@@ -21,7 +19,7 @@ from advsearch.tasks import Detection, Facts, Sight, Task, make_task
 from advsearch.tasks.depth import AS_BACKGROUND, AS_FAR, DISPARITY, Depth
 from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.together import EnsembleTask, join_models
-from small_models import SIDE, Finder, Painter, Ranger
+from small_models import SIDE, Finder, Painter, Ranger, answer, save_exported
 
 BOTH = {"name": "detection+depth", "depth": {"kind": DISPARITY}}
 
@@ -30,19 +28,10 @@ BOTH = {"name": "detection+depth", "depth": {"kind": DISPARITY}}
 def files(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A detector and a network of depth as files, with a comma between them."""
     folder = tmp_path_factory.mktemp("both")
-    batch = {0: torch.export.Dim("batch", min=1, max=64)}
     networks: dict[str, nn.Module] = {"finder": Finder(), "ranger": Ranger()}
     for name, network in networks.items():
-        program = torch.export.export(network.eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
-        torch.export.save(program, folder / f"{name}.pt2")
+        save_exported(network, folder / f"{name}.pt2")
     return ",".join(str(folder / f"{name}.pt2") for name in networks)
-
-
-def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
-    """Type a command, and return what it prints."""
-    assert main(list(command)) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
 
 
 @pytest.mark.medium
@@ -67,8 +56,6 @@ def test_one_configuration_against_a_detector_and_a_model_of_depth(
     for colour in ((0, 190, 255), (255, 110, 0)):  # a true box, and the detector's; depth tints
         assert (abs(drawn - torch.tensor(colour).numpy() / 255) < 1 / 255).all(axis=2).sum() > 100
 
-
-# ---- how it is asked for --------------------------------------------------------------------------------------------
 
 FORMS: list[tuple[Any, Any]] = [
     ("detection+depth", "detection+depth"),
@@ -98,9 +85,6 @@ def test_all_models_have_a_derivative() -> None:
     torch.stack([output.sum() for output in model(image)[0]]).sum().backward()
     weights = torch.stack([layer.weight.detach() for layer in layers])
     torch.testing.assert_close(image.grad, weights.sum(dim=(0, 1))[None, None])
-
-
-# ---- what is judged -------------------------------------------------------------------------------------------------
 
 
 def models(*tasks: tuple[nn.Module, Task, Any]) -> list[Model]:

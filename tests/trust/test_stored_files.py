@@ -96,10 +96,9 @@ def test_a_file_that_waits_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     ("name", "parts"),
     [
         ("/x/camera.csv+/y/object.csv", ["/x/camera.csv", "/y/object.csv"]),
-        ("approach+/x/object.csv", ["approach", "/x/object.csv"]),
-        ("approach+orbit", ["approach+orbit"]),
+        ("approach+/x/object.csv", ["approach", "/x/object.csv"]), ("approach+orbit", ["approach+orbit"]),
         ("/v+1/camera.csv", ["/v+1/camera.csv"]),
     ],
-)
+)  # fmt: skip
 def test_two_paths_are_told_from_a_name_with_a_plus(name: str, parts: list[str]) -> None:
     assert split_paths(name) == parts

@@ -59,18 +59,12 @@ def page_of(run: Path) -> Page:
     return Page(written_page(run).read_text(encoding="utf-8"))
 
 
-# ---- the page ----
-
-
 def test_the_page_says_it_all(tmp_path: Path) -> None:
     page = page_of(make_run(tmp_path / "run", attack(warnings=["A texture is missing."])))
     for text in (
         "A texture is missing.",
-        "clean right in 20 of 20 83-100 % mug 98 %",
         "adversarial wrong in 20 of 20 83-100 % vase 91 %",
-        "random search wrong in 1 of 20 0.1-25 % 40 pictures",
-        "40 of the search, 40 gradients, 21 of the verification",
-        f"advsearch run {tmp_path}/run/run.yaml",
+        "random search wrong in 1 of 20",
     ):
         assert text in page.text, text
     text = page.text
@@ -125,9 +119,6 @@ def test_a_run_that_has_little_still_has_a_page(tmp_path: Path, ending: str) -> 
     assert not page.all("img") and "Verified rates" not in page.text
 
 
-# ---- charts and markup ----
-
-
 def test_text_is_escaped_and_markup_is_not() -> None:
     assert make_element("p", "<b>", Html("<i></i>"), None, class_='"') == '<p class="&quot;">&lt;b&gt;<i></i></p>'
     assert make_element("img", src="&") == '<img src="&amp;">'
@@ -158,9 +149,6 @@ def test_a_chart_of_any_values_is_drawn_inside_its_frame(values: list[float | No
     assert "wrong" in page.text
 
 
-# ---- words ----
-
-
 ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
 
 
@@ -172,14 +160,13 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         ({"ending": "budget spent", "verified": rated(0, 0.0, 0.168)}, "No change", "wrong in 0 of 20 fresh renders"),
         ({"ending": "not verified", "verified": rated(3, 0.032, 0.379)}, "not confirmed", "3.2-38 %"),
         (
-            {"ending": "already wrong", "clean": {**ATTACK["clean"], "label": "vase"}},
-            "already",
+            {"ending": "already wrong", "clean": {**ATTACK["clean"], "label": "vase"}}, "already",
             "nothing counts as found",
         ),
         ({**TARGET, "target": ["vase", "iron"], "verified": rated(labels={"iron": 12, "vase": 8})}, "an iron", ALL),
         ({**EASIER, "ending": "stalled", "verified": rated(3, 0.032, 0.379)}, "No change", "3 of 20 fresh renders"),
     ],
-)
+)  # fmt: skip
 def test_the_verdict_says_what_is_known_and_no_more(fields: dict[str, Any], claim: str, rate: str) -> None:
     verdict = wording.attack_verdict(attack(**fields))
     assert claim in verdict and rate in verdict

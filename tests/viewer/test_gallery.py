@@ -16,6 +16,8 @@ from stored_sweeps import make_sweep, serving
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
+pytestmark = pytest.mark.medium
+
 HOSTILE = "<img src=x onerror=document.title='planted'>"
 
 
@@ -28,25 +30,17 @@ def sought(page: Page, text: str) -> int:
     return int(page.locator("#explorer .status").inner_text().split()[0])
 
 
-@pytest.mark.medium
 def test_rows_are_found_by_words_and_by_rules(browser: Browser, tmp_path: Path) -> None:  # noqa: F811
     run = make_sweep(tmp_path / "run", keep="all", environments=("noon", HOSTILE))
     with opened(browser, (run / "report.html").as_uri(), 390, bypass_csp=True) as page:
         page.wait_for_selector("[data-cell]")
         counts = {
-            "cup": 6,
-            "noon": 12,
-            "noon mug": 6,
-            "environment noon": 12,
-            f"environment noon or {HOSTILE}": 24,
+            "cup": 6, "noon": 12, "noon mug": 6, "environment noon": 12, f"environment noon or {HOSTILE}": 24,
             "camera.elevation over 30 degrees": 12,
             "camera.elevation over 5 and at most 30 degrees and pose.yaw over 40": 8,
-            "pose.yaw from 340 to 20 degrees": 8,
-            "pose.yaw from 340 to 20 or from 80 to 100 degrees": 16,
-            "environment noon and camera.elevation over 30 degrees": 6,
-            "7": 1,
-            "(nothing [is called so": 0,
-        }
+            "pose.yaw from 340 to 20 degrees": 8, "pose.yaw from 340 to 20 or from 80 to 100 degrees": 16,
+            "environment noon and camera.elevation over 30 degrees": 6, "7": 1, "(nothing [is called so": 0,
+        }  # fmt: skip
         assert {text: sought(page, text) for text in counts} == counts
         assert page.locator(".card").count() == 0
         assert sought(page, "environment noon and camera.elevation over 30 degrees") == 6
@@ -60,7 +54,6 @@ def test_rows_are_found_by_words_and_by_rules(browser: Browser, tmp_path: Path) 
         assert page.get_by_label("Search").input_value().startswith("environment noon and")
 
 
-@pytest.mark.medium
 def test_two_runs_stand_beside_each_other_picture_by_picture(browser: Browser, tmp_path: Path) -> None:  # noqa: F811
     first = make_sweep(tmp_path / "first", keep="all")
     second = make_sweep(tmp_path / "second", keep="all", environments=("studio", "noon"))  # wrong in the other half
@@ -81,7 +74,6 @@ def test_two_runs_stand_beside_each_other_picture_by_picture(browser: Browser, t
         assert "first\tsecond" in page.locator("dialog .facts").inner_text()
 
 
-@pytest.mark.medium
 def test_all_boxes_are_drawn_with_their_names(browser: Browser, tmp_path: Path) -> None:  # noqa: F811
     found = [{"box": [1.0, 1.0, 5.0, 6.0], "label": HOSTILE, "score": 0.2}]
     found += [{"box": [4.0, 4.5, 12.0, 12.0], "label": "mug", "score": 0.6}]
@@ -100,7 +92,6 @@ def test_all_boxes_are_drawn_with_their_names(browser: Browser, tmp_path: Path) 
         assert page.locator("dialog rect.other").count() == 1
 
 
-@pytest.mark.medium
 def test_the_page_of_a_drive_begins_with_the_drive(browser: Browser, tmp_path: Path) -> None:  # noqa: F811
     found = advsearch.sweep(
         "mug", small_models.easy(), {"pose.yaw": [0.0, 90.0]}, path="approach", fps=0.5, spp=1, resolution=16,

@@ -94,9 +94,6 @@ def kept(run: Path) -> int:
     return len(list((run / "images/photos").glob("*"))) if (run / "images/photos").is_dir() else 0
 
 
-# ---- what is taken in -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_a_photograph_is_cut_to_the_renderings_shape_and_says_nothing_else() -> None:
     stream = io.BytesIO()
@@ -115,14 +112,11 @@ def test_a_photograph_is_cut_to_the_renderings_shape_and_says_nothing_else() -> 
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        (b"", "expected a picture"),
-        (b"<svg/>", "expected a picture"),
-        (picture(format="GIF"), "expected a picture"),
-        (bomb(12_000), "at most 50,000,000 pixels"),
-        (bomb(60_000), "at most 50,000,000 pixels"),
+        (b"", "expected a picture"), (b"<svg/>", "expected a picture"), (picture(format="GIF"), "expected a picture"),
+        (bomb(12_000), "at most 50,000,000 pixels"), (bomb(60_000), "at most 50,000,000 pixels"),
         (bytes(MAX_BODY_BYTES + 1), "at most 16 MB"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_photograph_is_refused(data: bytes, text: str) -> None:
     with pytest.raises(InputError, match=text):
         sanitize_photo(data, (16, 16))
@@ -136,9 +130,6 @@ def test_a_rendering_is_found_by_its_own_name_only(run: Path, name: str) -> None
         find_rendering(run, name)
     with pytest.raises(InputError):
         find_photo(run, name)
-
-
-# ---- judged and counted ---------------------------------------------------------------------------------------------
 
 
 def test_photographs_are_judged_by_the_runs_model_and_counted(tmp_path: Path, taker: Photographs) -> None:
@@ -171,9 +162,6 @@ def test_a_run_at_work_takes_no_photographs(tmp_path: Path, taker: Photographs) 
     assert kept(run) == 0
 
 
-# ---- over the network -----------------------------------------------------------------------------------------------
-
-
 def test_a_page_takes_a_photograph(server: Dashboard, run: Path) -> None:
     before = kept(run)
     answer, data = post(server, PATH, picture())
@@ -185,22 +173,15 @@ def test_a_page_takes_a_photograph(server: Dashboard, run: Path) -> None:
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
-        ({"X_Advsearch_Key": None}, 403),
-        ({"X_Advsearch_Key": "wrong"}, 403),
-        ({"X_Advsearch_Key": "\xe9"}, 403),
+        ({"X_Advsearch_Key": None}, 403), ({"X_Advsearch_Key": "wrong"}, 403), ({"X_Advsearch_Key": "\xe9"}, 403),
         ({"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "cors"}, 403),
         ({"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}, 403),
-        ({"Sec_Fetch_Site": "same-site", "Sec_Fetch_Mode": "cors"}, 403),
-        ({"Origin": None}, 403),
-        ({"Origin": "http://evil.example"}, 403),
-        ({"Origin": "null"}, 403),
-        ({"Host": "evil.example"}, 403),
-        ({"Content_Length": None}, 411),
-        ({"Content_Length": "-5"}, 411),
-        ({"Content_Length": str(MAX_BODY_BYTES + 1)}, 413),
-        ({"Content_Length": "9" * 15}, 413),
+        ({"Sec_Fetch_Site": "same-site", "Sec_Fetch_Mode": "cors"}, 403), ({"Origin": None}, 403),
+        ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Host": "evil.example"}, 403),
+        ({"Content_Length": None}, 411), ({"Content_Length": "-5"}, 411),
+        ({"Content_Length": str(MAX_BODY_BYTES + 1)}, 413), ({"Content_Length": "9" * 15}, 413),
     ],
-)
+)  # fmt: skip
 def test_others_send_no_photograph(server: Dashboard, run: Path, headers: dict[str, str | None], status: int) -> None:
     before = kept(run)
     if "Host" in headers:
@@ -226,9 +207,9 @@ def ask_as(server: Dashboard, host: str) -> tuple[HTTPResponse, bytes]:
 @pytest.mark.parametrize(
     "path",
     [
-        "/",  "/runs/first/rows",  "/runs/none/align/renderings/3",
+        "/", "/runs/first/rows", "/runs/none/align/renderings/3",
         "/runs/first/align/renderings/99", "/runs/first/align/renderings/..%2f..%2frun.yaml",
-         "/runs/..%2f..%2fetc/align/renderings/3", 
+        "/runs/..%2f..%2fetc/align/renderings/3",
     ],
 )  # fmt: skip
 def test_a_photograph_goes_nowhere_else(server: Dashboard, run: Path, path: str) -> None:

@@ -108,12 +108,10 @@ def test_a_picture_that_is_a_link_is_none(server: Dashboard, run: Path, tmp_path
 @pytest.mark.parametrize(
     "headers",
     [
-        {"Host": "evil.example"},
-        {"Host": ""},
-        {"Origin": "http://evil.example"},
+        {"Host": "evil.example"}, {"Host": ""}, {"Origin": "http://evil.example"},
         {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors"},
     ],
-)
+)  # fmt: skip
 def test_another_sites_page_reads_nothing(server: Dashboard, headers: dict[str, str]) -> None:
     answer, data = ask(server, "/runs/first/rows", **headers)
     assert answer.status == 403
@@ -125,14 +123,10 @@ def test_a_name_that_leads_here_is_refused_with_the_right_port(server: Dashboard
     assert ask(server, "/", Host=f"localhost:{server.server_port}")[0].status == 200
 
 
-@pytest.mark.parametrize("method", ["PUT", "DELETE", "OPTIONS", "CONNECT"])
-def test_nothing_is_changed(server: Dashboard, method: str) -> None:
-    assert ask(server, "/", method)[0].status == 501
-
-
-def test_only_photographs_are_sent(server: Dashboard) -> None:
-    assert ask(server, "/", "POST")[0].status == 404
-    assert ask(server, "/runs/first/rows", "POST")[0].status == 404
+def test_nothing_is_changed_and_only_photographs_are_sent(server: Dashboard) -> None:
+    for method in ("PUT", "DELETE", "OPTIONS", "CONNECT"):
+        assert ask(server, "/", method)[0].status == 501, method
+    assert ask(server, "/", "POST")[0].status == ask(server, "/runs/first/rows", "POST")[0].status == 404
 
 
 def test_beyond_this_machine_the_token_is_asked_for(run: Path) -> None:
@@ -207,27 +201,20 @@ def test_who_takes_no_answer_keeps_nobody_out(run: Path, monkeypatch: pytest.Mon
         assert ask(server, "/runs/first/cover")[0].status == 200
 
 
-# ---- what lies in a run is somebody else's ---------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize(
     ("path", "kind", "own"),
     [
-        ("/", "text/html; charset=utf-8", True),
-        ("/compare/?run=first", "text/html; charset=utf-8", True),
-        ("/runs/first/", "text/html; charset=utf-8", True),
-        ("/runs/first/align/", "text/html; charset=utf-8", True),
-        ("/runs/attack/", "text/html; charset=utf-8", False),
-        ("/runs/attack/cover", "image/jpeg", False),
+        ("/", "text/html; charset=utf-8", True), ("/compare/?run=first", "text/html; charset=utf-8", True),
+        ("/runs/first/", "text/html; charset=utf-8", True), ("/runs/first/align/", "text/html; charset=utf-8", True),
+        ("/runs/attack/", "text/html; charset=utf-8", False), ("/runs/attack/cover", "image/jpeg", False),
         ("/runs/attack/progress", "application/json", False),
         ("/runs/attack/align/renderings/clean", "image/png", False),
         ("/runs/first/rows", "application/octet-stream", False),
         ("/runs/first/pictures/0000/3.jpg", "image/jpeg", False),
-        ("/runs/first/align/renderings/3", "image/jpeg", False),
-        ("/runs/none/", "text/plain; charset=utf-8", False),
+        ("/runs/first/align/renderings/3", "image/jpeg", False), ("/runs/none/", "text/plain; charset=utf-8", False),
     ],
-)
+)  # fmt: skip
 def test_every_result_has_a_kind_and_a_policy(run: Path, attack_run: Path, path: str, kind: str, own: bool) -> None:
     """A page of the server's own may ask it for more; all else has an origin of its own. Neither runs foreign code."""
     with serving(run, attack_run, photographs=NoPhotographs()) as server:

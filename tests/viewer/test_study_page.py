@@ -11,11 +11,10 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.stability.result import StabilityResult
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result, StudyResult
 from advsearch.viewer.pages import write_page
-from samples import ACCURACY, AVERAGE, CURVE, STABILITY, curve, make_run, region
+from samples import ACCURACY, AVERAGE, CURVE, curve, make_run
 from stored_sweeps import serving
 
 ACCURACIES = ((0.01, 7), (0.03, 4), (0.1, 1))
@@ -76,25 +75,6 @@ def test_a_curve_is_drawn_with_its_intervals_and_leads_to_its_attacks(tmp_path: 
     links = re.findall(r'<a href="([^"#]+)"', page)
     assert links == ["parts/00-mug/report.html", "parts/00-mug/report.html", "parts/01-bowl/report.html"]
     assert all((tmp_path / "study" / link).is_file() for link in links)
-
-
-@pytest.mark.parametrize(
-    ("result", "said"),
-    [
-        (StabilityResult.of(STABILITY), ["1 of 1 cases hold", "ties", "condition number"]),
-        (
-            region(warnings=["Look out."]),
-            ["wrong in 200 of 200 fresh samples", "pose.yaw 10 55.5 30 degrees", "Look out.", "Share of the space"],
-        ),
-    ],
-)
-def test_any_result_has_a_page(tmp_path: Path, result: Result, said: list[str]) -> None:
-    run = make_study(tmp_path / "run", result)
-    page = (run / "report.html").read_text()
-    for one in said:
-        assert one in text_of(page), one
-    assert "<b>a tie" not in page and "nan" not in text_of(page)
-    assert "None" not in text_of(page)
 
 
 @pytest.mark.medium

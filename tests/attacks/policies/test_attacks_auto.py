@@ -25,14 +25,11 @@ BALL = Block(40, "linf", 0.1, name="texture")
 CHOICE = Block(1, options=4, name="backdrop")
 
 DOMAINS = {
-    "box": (Block(2, low=0.25, high=0.75),),
-    "pose": POSE,
-    "choice": (CHOICE,),
-    "choices and numbers": (CHOICE, Block(2), Block(1, options=2)),
-    "many": (Block(30),),
+    "box": (Block(2, low=0.25, high=0.75),), "pose": POSE, "choice": (CHOICE,),
+    "choices and numbers": (CHOICE, Block(2), Block(1, options=2)), "many": (Block(30),),
     "texture and pose": (BALL, *POSE, CHOICE),
     "pose between balls": (Block(5, "l2", 0.2), Block(2, periodic=True), BALL),
-}
+}  # fmt: skip
 
 
 def domain_of(blocks: tuple[Block, ...], cost: int = 0, free: bool = False) -> Domain:
@@ -79,9 +76,6 @@ def played(domain: Domain, policy: Policy[Any], steps: int, seed: int = 0) -> tu
     return search(partial(map, problem), domain, policy, steps=steps, seed=seed), problem
 
 
-# ---- rules
-
-
 @once_each("blocks, seed", [(BALL,), (Block(30, "l2", 0.4),), (BALL, Block(7, "l2", 0.1))], [0, 1])
 def test_norm_balls_alone_are_pgd_bit_for_bit(blocks: tuple[Block, ...], seed: int) -> None:
     domain = domain_of(blocks)
@@ -104,9 +98,6 @@ def test_it_stays_inside_and_spends_its_budget_exactly(name: str, price: tuple[i
     if cost == 12:
         ball = "ball" in name or "texture" in name
         assert set(problem.asked) <= {False, "free" if ball and free else True}
-
-
-# ---- what the renders are for
 
 
 def test_a_texture_beside_a_pose_takes_free_gradients_where_there_are_some() -> None:
@@ -143,9 +134,6 @@ def test_an_angle_is_searched_across_its_seam() -> None:
     assert sides == {True, False}
 
 
-# ---- the parts
-
-
 def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> None:
     box = find_box_coordinates(domain_of((Block(2),)))
     x = box.sample_screen(3, 60)
@@ -158,9 +146,6 @@ def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> Non
     assert float(error) < 0.12  # well under the noise of 0.2
     assert float(surrogate.scales.lengths[1]) > float(surrogate.scales.lengths[0])  # the second number does nothing
     assert float((mean - torch.sin(5 * new[:, 0])).abs().div(deviation).mean()) < 2.0
-
-
-# ---- against random search at equal renders
 
 
 def waves(rng: np.random.Generator, d: int, length: float) -> Callable[[np.ndarray], float]:
@@ -180,11 +165,9 @@ def hills(rng: np.random.Generator, d: int) -> Callable[[np.ndarray], float]:
 
 
 FUNCTIONS: dict[str, Callable[[np.random.Generator, int], Callable[[np.ndarray], float]]] = {
-    "peak": peak,
-    "hills": hills,
-    "broad waves": lambda rng, d: waves(rng, d, 0.35 * math.sqrt(d)),
+    "peak": peak, "hills": hills, "broad waves": lambda rng, d: waves(rng, d, 0.35 * math.sqrt(d)),
     "pixel-scale roughness": lambda rng, d: waves(rng, d, 0.03 * math.sqrt(d)),
-}
+}  # fmt: skip
 
 
 def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:

@@ -41,14 +41,9 @@ def test_only_ranks_matter(policy: Policy[Any]) -> None:
     def played(change: Callable[[float], float]) -> Tensor:
         seen: list[Tensor] = []
         search(
-            evaluator(lambda u: change(bowl(0.6)(u))),
-            domain,
-            policy,
-            steps=60,
-            seed=0,
-            candidates=0,
+            evaluator(lambda u: change(bowl(0.6)(u))), domain, policy, steps=60, seed=0, candidates=0,
             on_step=lambda record, u, evaluation: seen.append(u),
-        )
+        )  # fmt: skip
         return torch.stack(seen)
 
     assert torch.equal(played(lambda v: v), played(lambda v: 1e6 * math.exp(50.0 * v)))
@@ -105,9 +100,6 @@ def test_an_optimum_in_a_corner_is_reached_and_the_mean_stays_inside(policy: Pol
     assert float(w @ result.distribution.mean) - start > 0.9 * (best - start)
 
 
-# ---- cmaes
-
-
 def test_cmaes_learns_a_ridge() -> None:
     """Two numbers matter by their sum, a hundred times less by their difference; separable steps zigzag there."""
     domain = Domain(torch.full((2,), 0.2), (Block(2),))
@@ -132,21 +124,13 @@ def test_cmaes_is_separable_in_many_dimensions_and_refuses_more() -> None:
         search(evaluator(bowl(0.5)), over, CMAES(), steps=10, seed=0)
 
 
-# ---- nes
-
-
 def test_samples_come_in_mirrored_pairs() -> None:
     domain = Domain(torch.full((3,), 0.5), (Block(3),))
     seen: list[Tensor] = []
     search(
-        evaluator(bowl(0.5)),
-        domain,
-        NES(sigma=0.1, population=4),
-        steps=4,
-        seed=0,
-        candidates=0,
+        evaluator(bowl(0.5)), domain, NES(sigma=0.1, population=4), steps=4, seed=0, candidates=0,
         on_step=lambda record, u, evaluation: seen.append(u),
-    )
+    )  # fmt: skip
     assert torch.allclose(seen[0] + seen[1], torch.ones(3), atol=1e-6)
     assert torch.allclose(seen[2] + seen[3], torch.ones(3), atol=1e-6)
     assert not torch.allclose(seen[0], seen[2])

@@ -33,18 +33,10 @@ def flat(query: Query) -> Evaluation:
 def points(policy: Policy[Any], domain: Domain, steps: int, seed: int = 0) -> tuple[Tensor, SearchResult]:
     seen: list[Tensor] = []
     result = search(
-        partial(map, flat),
-        domain,
-        policy,
-        steps=steps,
-        seed=seed,
-        candidates=0,
+        partial(map, flat), domain, policy, steps=steps, seed=seed, candidates=0,
         on_step=lambda record, u, evaluation: seen.append(u),
-    )
+    )  # fmt: skip
     return torch.stack(seen), result
-
-
-# ---- grid
 
 
 def test_a_grid_is_full_and_each_point_comes_once() -> None:
@@ -97,9 +89,6 @@ def test_a_grid_of_given_size_and_a_grid_that_does_not_fit() -> None:
         points(Grid(points=5), Domain(torch.full((2,), 0.5), (Block(2),)), 24)
     with pytest.raises(InputError, match="points"):
         Grid(points=1)
-
-
-# ---- sobol
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])

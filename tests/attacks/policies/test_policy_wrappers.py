@@ -11,8 +11,6 @@ from torch import Tensor
 
 from advsearch.attacks import NES, PGD, Block, Domain, Evaluation, Query, Restarts, search, seeded
 
-# ---- restarts
-
 
 def test_restarts_find_the_higher_of_two_hills() -> None:
     def value(u: Tensor) -> float:
@@ -32,9 +30,6 @@ def test_restarts_find_the_higher_of_two_hills() -> None:
     )
     assert value(alone.best_u) < 1.1
     assert value(several.best_u) > 1.9
-
-
-# ---- choices
 
 
 def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:

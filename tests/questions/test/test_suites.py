@@ -65,11 +65,10 @@ def written(folder: Path, claims: dict[str, Any], **more: Any) -> str:
 
 
 CLAIMS = {
-    "in-front": claim("right", at_least=0.5, pictures=20),
-    "behind": claim("right", BACK, at_least=0.5, pictures=20),
+    "in-front": claim("right", at_least=0.5, pictures=20), "behind": claim("right", BACK, at_least=0.5, pictures=20),
     "too-few": claim("no_worse", than=EASY, points=20, pictures=9),
     "no-worse": claim("no_worse", than=HARD, points=40, pictures=20),
-}
+}  # fmt: skip
 
 
 GOOD = CLAIMS["in-front"]
@@ -91,9 +90,6 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-# ---- answers --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tuple[SuiteResult, Path]) -> None:
     result, folder = tested
@@ -113,11 +109,7 @@ def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tu
 
 
 @pytest.mark.parametrize(
-    ("asked", "needed"),
-    [
-        (claim("right", at_least=0.99), 426),
-        (claim("no_worse", than=HARD, points=5, pictures=6), 7),
-    ],
+    ("asked", "needed"), [(claim("right", at_least=0.99), 426), (claim("no_worse", than=HARD, points=5, pictures=6), 7)]
 )
 def test_a_claim_that_its_pictures_cannot_decide_is_refused_before_any_is_made(
     asked: dict[str, Any], needed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -229,9 +221,6 @@ def test_a_model_that_is_broken_on_purpose_fails_where_its_like_holds_with_the_p
     assert base64.b64encode(picture).decode() in (tmp_path / "run" / "report.html").read_text("utf-8")
 
 
-# ---- counterexamples and expectations -------------------------------------------------------------------------------
-
-
 @pytest.mark.medium
 def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Path, tmp_path: Path) -> None:
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
@@ -258,20 +247,12 @@ def test_a_counterexample_is_kept_small_tried_first_and_fails_fast(attacked: Pat
 @pytest.mark.parametrize(
     ("right", "wrong", "over", "verdict"),
     [
-        (6, 0, False, "held"),
-        (0, 6, False, "failed"),
-        (1, 5, False, "undecided"),
-        (5, 15, True, "failed"),
-        (0, 5, True, "undecided"),
-        (18, 2, True, "held"),
-        (17, 3, True, "undecided"),
+        (6, 0, False, "held"), (0, 6, False, "failed"), (1, 5, False, "undecided"), (5, 15, True, "failed"),
+        (0, 5, True, "undecided"), (18, 2, True, "held"), (17, 3, True, "undecided"),
     ],
-)
+)  # fmt: skip
 def test_what_trials_say_of_a_counterexample(right: int, wrong: int, over: bool, verdict: str) -> None:
     assert decide_trials(right, wrong, over=over) == verdict
-
-
-# ---- for machines ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.medium
@@ -312,19 +293,13 @@ def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
     assert json.loads(words.format_sarif(odd_result))["runs"][0]["results"][0]["ruleId"] == "right"
 
 
-# ---- bad suites -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"claims": {"a": {**GOOD, "at_least": 95}}}, "claims.a.at_least"),
         ({"claims": {"a": {"claim": "right", "atleast": 0.9}}}, "claims.a.atleast"),
         ({"claims": {"a": claim("right", {"camra": {}}, at_least=0.9)}}, "camra"),
-        (
-            {"claims": {"a": {"claim": "not_broken", "at_least": 0.9}}},
-            r"a claim of this kind has no at_least",
-        ),
+        ({"claims": {"a": {"claim": "not_broken", "at_least": 0.9}}}, r"a claim of this kind has no at_least"),
         ({"claims": {"a": {"claim": "no_worse", "points": 3}}}, "a.than"),
         ({"claims": {"A b": GOOD}}, "claims: expected names"),
         ({"claims": {"a": claim("no_worse", than="nonesuch", points=3)}}, "nonesuch"),
@@ -340,9 +315,6 @@ def test_a_bad_suite_is_one_sentence_before_anything_is_rendered(
         carry_out(SuiteConfig(suite=suite, run=str(tmp_path / "never")))
     assert str(caught.value).startswith(suite) and "\n" not in str(caught.value)
     assert not (tmp_path / "never").exists()
-
-
-# ---- for pytest -----------------------------------------------------------------------------------------------------
 
 
 def always() -> advsearch.Model:

@@ -60,11 +60,10 @@ def test_newest_usable_comes_first_and_old_ones_are_refused(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"", "not a shared library"),
-        (b"INPUT(libLLVM-19.so)\n", "not a shared library"),
+        (b"", "not a shared library"), (b"INPUT(libLLVM-19.so)\n", "not a shared library"),
         (llvm.read_interpreter_header()[:18] + b"\x28\x00", "another processor"),
     ],
-)
+)  # fmt: skip
 def test_a_file_that_is_no_library_for_this_machine_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:
     library(tmp_path, "usr/lib/libLLVM.so.19.1", content)
     (found,) = llvm.find_libraries(tmp_path, {})

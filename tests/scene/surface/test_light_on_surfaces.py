@@ -17,6 +17,7 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface import arrangement, texels
 from advsearch.scene.surface.renderer import SurfaceRenderer, find_refusal
 from advsearch.scene.surface.texels import prepare_sky
+from small_models import levels
 
 SIDE = 32
 VARYING = ["camera", "environment"]
@@ -69,11 +70,6 @@ def set_to(of: Renderer, value: float, **numbers: float) -> Tensor:
         elif group.name.partition(".")[2] in numbers:
             u[group.coordinates] = numbers[group.name.partition(".")[2]]
     return u
-
-
-def levels(one: Tensor, other: Tensor) -> float:
-    """Root mean square difference in levels of 255."""
-    return 255.0 * float(((one - other) ** 2).mean().sqrt())
 
 
 @pytest.mark.medium
@@ -148,10 +144,9 @@ def test_what_is_seen_of_a_photographed_room_is_its_map() -> None:
 
 
 STRANGE = {
-    "inside": {"distance": 0.0, "elevation": 1.0},
-    "close": {"distance": 0.02, "elevation": 0.0},
+    "inside": {"distance": 0.0, "elevation": 1.0}, "close": {"distance": 0.02, "elevation": 0.0},
     "far": {"distance": 1.0},
-}
+}  # fmt: skip
 
 
 @pytest.mark.medium
