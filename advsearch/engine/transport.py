@@ -394,7 +394,9 @@ class Transport(PredictedSearch):
         if query.phase != "search" or number >= self.count_predicted(kind, self.steps):
             return None
         predictor = self._current.setdefault(kind, self.start)
-        if number == 0 or number % COMPARISON_INTERVAL or not kind.startswith("search"):
+        is_due = number > 0 and number % COMPARISON_INTERVAL == 0
+        # a baseline draws configurations by chance: there is nothing to keep up with
+        if not is_due or not kind.startswith("search"):
             return predictor
         seed = seeds.stream(self.problem.seed, "transport check", number)
         renderer = self.problem.renderer
@@ -412,8 +414,10 @@ class Transport(PredictedSearch):
         has_same_surroundings, current = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
-        # Basis images of lights do not depend on u: nothing can be linearised again.
-        if self.start.n_entries == 0:
+        # Basis images of lights (no matrix, hence no entries) do not depend on u:
+        # nothing can be linearised again.
+        has_basis_images = self.start.n_entries == 0
+        if has_basis_images:
             self.trace_from(kind, number, f" of the {kind}")
             return None
         self._current[kind] = self._make_predictor(query.u, kind, number)

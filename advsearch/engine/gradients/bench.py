@@ -129,12 +129,14 @@ class Bench:
                 measurement = measure()
             else:
                 measurement = self.store(f"{label} gradient {index}", measure)
-            # as `_measure_gradient` has written it
+            # base64 of float32, the groups' derivatives one after the other, as
+            # `_measure_gradient` writes them; frombuffer wants writable memory
             buffer = bytearray(base64.b64decode(measurement["numbers"]))
             derivatives = torch.frombuffer(buffer, dtype=torch.float32).split(sizes)
             for coordinates, values in zip(slices, derivatives, strict=True):
                 gradients[index, coordinates] = values
             seconds.append(measurement["seconds"])
+            # gradients that are not stored are counted by the caller
             if label is not None:
                 self.tick(self.spp)
         return gradients, statistics.median(seconds)
