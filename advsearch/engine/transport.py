@@ -88,11 +88,13 @@ def find_matrix_refusal(
         )
     condition_names = []
     if problem.conditions is not None:
+        # the controls that vary by chance come after the searched ones
         conditions = problem.space.controls[problem.n_searched :]
         condition_names = [control.name for control in conditions]
     refusal = find_refusal(problem.renderer, condition_names)
     if refusal is not None or problem.conditions is not None or steps is None:
         return refusal
+    # one image for each light is rendered before the first prediction
     min_steps = MIN_STEPS_PER_LIGHT * count_lights(problem.renderer)
     if steps < min_steps:
         return Refusal(
