@@ -143,10 +143,11 @@ def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     views = [compare_view(index) for index in range(N_FIRST_VIEWS)]
     first = Deviation.from_views(views)
     margin_limit = CLEARLY_GOOD * first.allowed_margin_bias
-    is_good = (
+    is_clearly_good = (
         first.levels_fraction <= CLEARLY_GOOD and abs(first.logits) <= margin_limit
     )
-    if not is_good and first.levels_fraction < CLEARLY_BAD:
+    may_be_good = first.levels_fraction < CLEARLY_BAD
+    if not is_clearly_good and may_be_good:
         views += [compare_view(index) for index in range(N_FIRST_VIEWS, N_VIEWS)]
     return Deviation.from_views(views)
 

@@ -256,6 +256,7 @@ class Bank(PredictedSearch):
         """
         # no growth in the second half
         index = min(index, self.steps // 2 - 1)
+        # evaluations so far at which the bank grew
         n_growing_steps = 0
         for begin in (0, *self.growth_steps):
             n_growing_steps += min(max(index - begin + 1, 0), COMPARISON_INTERVAL)
@@ -331,7 +332,8 @@ class Bank(PredictedSearch):
         self.n_traced += 1
         with torch.no_grad():
             searched_inputs = self.problem.searched_space.inputs(query.u[:dim])
-        # whether the searched controls alone set all inputs of the matrix
+        # Whether the searched controls alone set all inputs of the matrix: then they
+        # have the same values without the condition's controls.
         depends_on_searched_only = True
         for name, value in renderer.linearized_at.items():
             if name not in searched_inputs or not torch.equal(

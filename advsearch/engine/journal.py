@@ -234,6 +234,7 @@ def compute_weights_digest(model: Model) -> str | None:
             name: tensor for name, tensor in state.items() if isinstance(tensor, Tensor)
         }
         digest = hashlib.sha256()
+        # by name, since a network may list them in any order
         for name, tensor in sorted(tensors.items()):
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
             flat = tensor.detach().cpu().contiguous().flatten()
@@ -304,6 +305,7 @@ def _simplify(value: Any) -> Any:
             return None
     if isinstance(value, (tuple, list)):
         return [_simplify(item) for item in value]
+    # sorted, since the order differs from process to process
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
     if isinstance(value, (np.ndarray, Tensor)):
@@ -540,7 +542,8 @@ class Journal:
         row = make_trial_row(
             query.kind,
             query.index,
-            # A predicted image has no noise of its own.
+            # A predicted image has no noise of its own, and in place of the samples
+            # per pixel the count by which it was predicted.
             None if evaluation.predicted else query.seed,
             evaluation.predicted or query.spp,
             evaluation.required_judgement,

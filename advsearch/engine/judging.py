@@ -110,6 +110,7 @@ def _import_name(function: Metric) -> str:
     """
     module_name = str(getattr(function, "__module__", None))
     qualified_name = str(getattr(function, "__qualname__", None))
+    # what an import by this name would give
     imported: Any = sys.modules.get(module_name)
     for attribute in qualified_name.split("."):
         imported = getattr(imported, attribute, None)
@@ -297,7 +298,7 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
         ]
         outputs, truths = zip(*pairs, strict=True) if pairs else ((), ())
         return outputs, truths
-    labels = truth_to_labels(truth, output, 1)
+    labels = truth_to_labels(truth, output, 1)  # for a batch of one
     first_label = labels[0] if isinstance(labels, Tensor) else labels
     return first_output, first_label
 
@@ -645,8 +646,11 @@ def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
             over 0 count.
         palette: (P, 3) sRGB of printable colors; None for the grid of 125 colors.
     """
-    if colors.shape[-1] != 3:
+    is_masked = colors.shape[-1] != 3
+    if is_masked:
+        # (N, 1, 3): an image of one column
         colors = colors[colors[..., 3] > 0][:, None, :3]
+    # which color is nearest has no derivative
     fixed_colors = colors.detach()
     if palette is None:
         # of the grid: rounded to its steps

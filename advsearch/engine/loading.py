@@ -222,6 +222,7 @@ class Scene:
         if description.camera_model is not None:
             description.camera_model.check_no_fov(overrides)
         values = {**description.values, **{name: resolved[name] for name in overrides}}
+        # the height of the camera would set another elevation
         if "camera.elevation" in overrides:
             values["camera.height"] = None
         changed = with_requested_ground(

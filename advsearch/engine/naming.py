@@ -515,14 +515,15 @@ def _list_active_choices(
     searched: it is set to a number, another choice fixes it, or it has no default range
     and none is set.
     """
+    # parameters by name
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
+    fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
     searched |= {name for name, value in settings.items() if value is not None}
-    fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
     searched -= fixed
     return [
         choice

@@ -482,7 +482,7 @@ class Problem:
         if not group.step_reason or group.size != 1:
             return None, ""
         u = self.add_conditions(self.domain.start).clone()
-        half_step = min(group.step, 0.5)
+        half_step = min(group.step, 0.5)  # within the range, from its middle
         u[group.coordinates] = 0.5 - half_step
         lower = self.space.describe(u).get(group.name)
         u[group.coordinates] = 0.5 + half_step
@@ -529,10 +529,15 @@ class Problem:
         non_finite_before = self.renderer.non_finite
         if query.product == "light":
             linear = self.make_linear_renderer(query.u, query.seed, query.spp)
-            evaluation = Evaluation(math.nan, None, False, light=linear.collected)
+            # neither light nor an image has an objective
+            evaluation = Evaluation(
+                math.nan, gradient=None, success=False, light=linear.collected
+            )
         elif query.product == "picture":
             image = self.picture(query.u, query.seed, query.spp)
-            evaluation = Evaluation(math.nan, None, False, picture=image)
+            evaluation = Evaluation(
+                math.nan, gradient=None, success=False, picture=image
+            )
         elif query.phase is None:
             evaluation = self._evaluate_trial(query)
         elif self.conditions is None:
@@ -862,10 +867,12 @@ class Problem:
         the outputs.
         """
         if self.task.varies:
-            usual = most_frequent_judgement(judged)
+            most_frequent = most_frequent_judgement(judged)
             score = mean([judgement.score for judgement in judged])
             margin = mean([judgement.margin for judgement in judged])
-            return Judgement.of(score, margin, usual.prediction, usual.payload)
+            return Judgement.of(
+                score, margin, most_frequent.prediction, most_frequent.payload
+            )
         with torch.no_grad():
             output = self.task.average(list(outputs))
             return self.task.judge(output, self.find_truth())[0]

@@ -281,6 +281,7 @@ class SurfaceLight(PredictedSearch):
                 yield from trace(queries[position:])
                 return
             can_batch = self.problem.conditions is None and not self._searches_colors
+            # the last batch is used up
             if can_batch and position not in predicted_images:
                 batch = queries[position : position + self.renderer.batch_size]
                 images = self.renderer.predict_images([batched.u for batched in batch])

@@ -352,7 +352,14 @@ class Transport(PredictedSearch):
         number: int,
         tick: ProgressCallback = lambda samples: None,
     ) -> Predictor:
-        """Compute the matrix at u (d,)."""
+        """Compute the predictor at a configuration, in the window if there is one.
+
+        Args:
+            u: (d,) the configuration.
+            kind: kind of the search.
+            number: index of its query, for the seed.
+            tick: called with the samples that were traced.
+        """
         with self.count_time():
             seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
             renderer = self.problem.renderer

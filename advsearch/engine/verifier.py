@@ -557,7 +557,8 @@ class Retrials:
         formation of the image from it differs.
         """
         problem = condition.problem
-        if self._n_conditions_of_light[condition.radiance_key] < 2:
+        is_light_shared = self._n_conditions_of_light[condition.radiance_key] >= 2
+        if not is_light_shared:
             return problem.picture(u, seed, condition.spp)
         renderer = problem.renderer
         full_u = problem.add_conditions(u, seed)

@@ -136,7 +136,11 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
 
 
 def _find_searched_refusal(problem: Problem) -> Refusal | None:
-    """Return why what is searched shows in more than a part of the image."""
+    """Return why what is searched shows in more than a part of the image.
+
+    None if it shows in a part only: it changes the surface of a mesh, which stays where
+    it is.
+    """
     light_inputs = find_light_inputs(problem.renderer)
     names = _find_searched_inputs(problem)
     if not names:

@@ -25,6 +25,7 @@ from advsearch.scene.gradients import STEP_RANGE, Group, select_compared
 # least
 MIN_SIZE_FRACTION = 0.1
 MAX_SINGLE_PROBES = 8  # groups of at most this many coordinates are probed one by one
+MIXED_STEP = 0.03  # along a direction through more than 64 coordinates
 # relative error that the mean of an estimator may have beyond the noise
 MAX_BIAS = 0.05
 MAX_NOISE = (
@@ -212,12 +213,14 @@ def list_attempts(group: Group) -> list[tuple[str, float]]:
     else:
         names = select_compared(group.valid, group.size)
         attempts = [(name, 1.0) for name in names]
+    # of those that are tried with the planned step
     difference_estimators = [
         name for name in ("differences", "secant") if (name, 1.0) in attempts
     ]
     steps = {group.step}
     for factor in FACTORS[1:]:
         step = min(factor * group.step, STEP_RANGE[1])
+        # beyond the largest step, wider ones are all the same
         if step not in steps:
             steps.add(step)
             attempts += [(name, factor) for name in difference_estimators[:1]]
@@ -236,7 +239,8 @@ def find_probes(bench: Bench) -> list[Probe]:
         if group.estimator == "none":
             continue
         if group.size > MAX_SINGLE_PROBES:
-            step = group.step if group.size <= 64 else 0.03
+            # the planned step of a large group is not one along all coordinates at once
+            step = group.step if group.size <= 64 else MIXED_STEP
             probes.append(
                 Probe(group, group.name, _make_mixed_direction(bench, group), step)
             )
@@ -266,6 +270,7 @@ def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
         * 2.0
         - 1.0
     )
+    # where the gradient is 0, the random sign is left
     mixed = gradient.sign() + 0.5 * random_signs
     direction = torch.zeros_like(bench.u)
     direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
@@ -361,11 +366,11 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
             # less than two steps if a bound of the range has cut one off
             width = float((above - below) @ probe.direction)
     with torch.no_grad():
-        high, low = (
-            float(bench.loss(bench.renderer(at, seed, bench.spp)))
-            for at in (above, below)
+        loss_above, loss_below = (
+            float(bench.loss(bench.renderer(u, seed, bench.spp)))
+            for u in (above, below)
         )
-    return (high - low) / width
+    return (loss_above - loss_below) / width
 
 
 def measure_estimates(
