@@ -5,6 +5,7 @@ names and files in a shell.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any
 
 from advsearch.cli import output
@@ -53,34 +54,25 @@ def completion(args: argparse.Namespace) -> int:
         raise InputError(
             "completion needs the package shtab; install it with: pip install shtab"
         ) from error
-    # a parser with all commands and flags, whose values are then completed: names of a
-    # kind where a flag takes only those, else files, or both
+    # a parser with all commands and flags
     parser, commands = without_commands()
-    names = {
+    # names of each kind of thing, such as models, that a flag may take
+    names_of_kind = {
         kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES
     }
     for name in list_commands():
         for action in add_command(commands, name)._actions:
             flag = action.option_strings[-1] if action.option_strings else ""
-            named = names.get(NAMED.get(flag, ""))
-            if action.nargs == 0 or action.choices is not None:
+            names = names_of_kind.get(NAMED.get(flag, ""))
+            takes_no_value = action.nargs == 0
+            if takes_no_value or action.choices is not None:
                 continue
-            if named and flag not in OR_A_FILE:
-                action.choices = named
+            if names and flag not in OR_A_FILE:
+                action.choices = names
                 continue
             completer: dict[str, Any] = shtab.FILE
-            if named:  # or a file
-                function = f"_advsearch{flag.replace('-', '_')}"
-                words = " ".join(named)
-                completer = {
-                    "preamble": {
-                        "bash": f'{function}() {{ compgen -W "{words}" -- '
-                        f'"$1"; compgen -f -- "$1"; }}'
-                    },
-                    "bash": function,
-                    "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
-                    "tcsh": "f",
-                }
+            if names:
+                completer = _complete_name_or_file(flag, names)
             action.complete = completer  # type: ignore[attr-defined]  # where shtab looks for it
     script = shtab.complete(parser, shell=args.shell)
     return output.print_answer(
@@ -88,3 +80,21 @@ def completion(args: argparse.Namespace) -> int:
         {"command": "completion", "shell": args.shell, "script": script},
         script,
     )
+
+
+def _complete_name_or_file(flag: str, names: Sequence[str]) -> dict[str, Any]:
+    """Return what shtab writes for a flag whose value is a name or a file.
+
+    Each shell has code of its own; tcsh completes files only.
+    """
+    function = f"_advsearch{flag.replace('-', '_')}"
+    words = " ".join(names)
+    return {
+        "preamble": {
+            "bash": f'{function}() {{ compgen -W "{words}" -- '
+            f'"$1"; compgen -f -- "$1"; }}'
+        },
+        "bash": function,
+        "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
+        "tcsh": "f",
+    }

@@ -68,8 +68,9 @@ PRIVACY_NOTE = (
 def dashboard(args: argparse.Namespace) -> int:
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
-    # not checked here: the page with the list says what is wrong with a run
+    # damaged runs are allowed: the page with the list says what is wrong with each
     runs = [find_run(name, checked=False) for name in args.runs]
+    # "module:function" of a part of the package that may be left out
     has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])
     photographs = load_attribute(PHOTOGRAPH_PAGES)() if has_photographs else None
     server = Dashboard(
@@ -83,14 +84,14 @@ def dashboard(args: argparse.Namespace) -> int:
     output.print_answer(args.json, {"command": "dashboard", **facts}, server.address)
     # a program that waits for the address gets it now
     sys.stdout.flush()
-    if server.fingerprint:
+    if server.fingerprint:  # it speaks HTTPS
         print(
             "The browser will warn of the certificate, which was made for this server "
             "alone. Its SHA-256 is "
             f"{server.fingerprint}.",
             file=sys.stderr,
         )
-    if server.token:
+    if server.token:  # others in the network can reach it
         print(PRIVACY_NOTE, file=sys.stderr)
         print(
             format_qr_code(server.address)
@@ -130,11 +131,10 @@ def view(args: argparse.Namespace) -> int:
             "--bundle: pages of several runs go into a folder; name one, "
             "or give one run"
         )
-    out = (
-        write_page(folders[0])
-        if args.bundle is None
-        else write_bundle(folders, Path(args.bundle))
-    )
+    if args.bundle is None:
+        out = write_page(folders[0])
+    else:
+        out = write_bundle(folders, Path(args.bundle))
     return output.print_answer(
         args.json,
         {"command": "view", "runs": list(map(str, folders)), "out": str(out)},

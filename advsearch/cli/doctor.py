@@ -151,43 +151,50 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
             check=False,
             cwd=SUBPROCESS_DIRECTORY,
         )
-        printed = process.stdout
-        status = process.returncode
-        good = process.returncode == 0
-        error_lines = [
-            line.strip()
-            for line in process.stderr.splitlines()
-            if "ERROR" in line or "Error" in line
-        ]
-        status_text = (
-            f"signal {signal.Signals(-status).name}"
-            # a negative status is minus the number of a signal
-            if status < 0
-            else f"status {status}"
-        )
-        ending = (
-            f"the trial ended with {status_text}"
-            + (f" ({error_lines[0][:120]})" if error_lines else "")
-            if status
-            else ""
-        )
+        output_text = process.stdout
+        ended_well = process.returncode == 0
+        ending = _describe_ending(process.returncode, process.stderr)
     except subprocess.TimeoutExpired as expired:
-        partial = expired.stdout
-        printed = (
-            partial.decode("utf-8", "replace")
-            if isinstance(partial, bytes)
-            else partial or ""
+        # then the output is not decoded, whatever `text` says, and may be missing
+        output_bytes = expired.stdout
+        output_text = (
+            output_bytes.decode("utf-8", "replace")
+            if isinstance(output_bytes, bytes)
+            else output_bytes or ""
         )
-        good = False
+        ended_well = False
         ending = f"the trial took longer than {SECONDS_ALLOWED} s"
     tried = {}
-    for line in printed.splitlines():
+    for line in output_text.splitlines():
         try:
             outcome = json.loads(line)
             tried[outcome["name"]] = (bool(outcome["ok"]), str(outcome["detail"]))
-        except (ValueError, KeyError, TypeError):  # a library's own words
+        # a line that a library printed
+        except (ValueError, KeyError, TypeError):
             continue
-    return {**tried, "": (good, ending)}
+    return {**tried, "": (ended_well, ending)}
+
+
+def _describe_ending(status: int, error_text: str) -> str:
+    """Return how a process ended, as a clause; "" if it ended well.
+
+    Args:
+        status: its exit status; if negative, minus the number of the signal that ended
+            it.
+        error_text: what it wrote to standard error.
+    """
+    if status == 0:
+        return ""
+    error_lines = [
+        line.strip()
+        for line in error_text.splitlines()
+        if "ERROR" in line or "Error" in line
+    ]
+    status_text = f"status {status}"
+    if status < 0:
+        status_text = f"signal {signal.Signals(-status).name}"
+    ending = f"the trial ended with {status_text}"
+    return ending + (f" ({error_lines[0][:120]})" if error_lines else "")
 
 
 def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
@@ -207,6 +214,7 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         "mitsuba-oidn",
         *_SMALL_PACKAGES,
     ):
+        # "render" is a trial and no package
         version = "" if name == "render" else find_installed_version(name)
         if version is None:
             status, why = (
@@ -216,6 +224,7 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         elif name in ("mitsuba", "drjit"):
             yield Component(name, version, OK, "tried by the render below")
         elif name not in tried:
+            # a part before it ended the process
             yield Component(
                 name,
                 version,
@@ -226,8 +235,9 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         elif tried[name][0]:
             yield Component(name, version, OK, tried[name][1])
         else:
-            mend = "see libLLVM below, then mend mitsuba and drjit: make setup"
-            mend = mend if name == "render" else _reinstall(name)
+            mend = _reinstall(name)
+            if name == "render":
+                mend = "see libLLVM below, then mend mitsuba and drjit: make setup"
             yield Component(
                 name,
                 version,
@@ -244,20 +254,19 @@ def check_other_packages(requirements: Sequence[str] | None = None) -> Component
         requirements: as in a package's metadata, for example "rich>=13"; None takes
             those of advsearch.
     """
-    wanted = (
-        (metadata.requires("advsearch") or []) if requirements is None else requirements
-    )
+    if requirements is None:
+        requirements = metadata.requires("advsearch") or []
     names = {
         # the name: all before a version or a condition
-        re.split(r"[^\w.-]", wish, maxsplit=1)[0]
-        for wish in wanted
-        if "extra ==" not in wish
+        re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
+        for requirement in requirements
+        if "extra ==" not in requirement  # not of an optional extra
     }
-    rest = sorted(
+    untried_names = sorted(
         names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES},
         key=str.lower,
     )
-    versions = {name: find_installed_version(name) for name in rest}
+    versions = {name: find_installed_version(name) for name in untried_names}
     if absent := [name for name, version in versions.items() if version is None]:
         why = f"not installed: {', '.join(absent)}"
         return Component(

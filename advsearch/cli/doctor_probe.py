@@ -58,6 +58,7 @@ def probe_renderer() -> str:
     )
     sensor = {"type": "perspective", "fov": 30, "to_world": view, "film": film}
     light = {"type": "constant"}
+    # depth 2: light that is reflected once
     integrator = {"type": "prb", "max_depth": 2}
     scene = mi.load_dict(
         {

@@ -104,6 +104,7 @@ def export(args: argparse.Namespace) -> int:
     if format in FORMATS or format not in EXPORTERS:
         return _write_table(args, out, by_name)
     exporter = EXPORTERS[format]()
+    # other formats are files or folders, which nothing can print
     if out is None:
         raise InputError(f"--out: {format} writes {exporter.writes}; give its name")
     if args.kind is not None and "kind" not in exporter.options:

@@ -81,7 +81,7 @@ def make_config(
     Args:
         args: arguments of the command line.
         config: the class of the configuration.
-        otherwise: values of settings that were not given as flags.
+        otherwise: values that settings without a flag on the command line have.
 
     Raises:
         InputError: a value is not allowed.
@@ -91,7 +91,7 @@ def make_config(
         for setting in settings(config)
         if setting.field in args
     }
-    data = {**otherwise, **typed}
+    data = {**otherwise, **typed}  # a flag wins
     if "scene" in args and data.get("object") is None:
         raise InputError(
             f"object: expected something in {args.scene}, got nothing; "
@@ -103,6 +103,7 @@ def make_config(
             f"{args.scene}#{name}" for name in split_names(data["object"])
         )
     read = config(**data)
+    # code that a person typed may run; what a file named needs --code
     allow_named({name: getattr(read, name) for name in typed})
     return read
 
@@ -173,18 +174,18 @@ def format_as_flags(message: str) -> str:
     flags = {**_NO_SETTINGS, **{setting.name: setting.flag for setting in known}}
     switches = {setting.name for setting in known if setting.is_switch}
 
-    def written(match: re.Match[str]) -> str:
+    def write_flag(match: re.Match[str]) -> str:
         name = match["name"]
         value = match["value"]
-        return (
-            flags[name]
-            if value is None or name in switches
-            else f"{flags[name]} {value}"
-        )
+        if value is None or name in switches:  # a switch takes no value
+            return flags[name]
+        return f"{flags[name]} {value}"
 
-    # any known setting
+    # a pattern for any known setting
     names = f"(?P<name>{'|'.join(flags)})"
-    message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", written, message)
+    # in backticks, perhaps with a value
+    message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", write_flag, message)
+    # before a colon, at the beginning of the message or of a clause
     return re.sub(
         rf"(?P<before>^|; ){names}(?=: )",
         lambda match: match["before"] + flags[match["name"]],

@@ -212,6 +212,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     inside = read_contents(Path(file))
     warnings: tuple[str, ...] = ()
     if inside.objects:
+        # a shape that is no light, or else the first one
         object_name = next(
             (name for name in inside.objects if name not in inside.lights),
             inside.objects[0],
@@ -219,6 +220,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
         scene = advsearch.load_scene(object_name, scene=file)
         warnings = scene.description.object.warnings
         if out is not None:
+            # one view, as large as the four of a mesh file together
             advsearch.render(scene, resolution=2 * SIDE).save(out)
     elif out is not None:
         raise InputError(

@@ -147,12 +147,14 @@ class ExperimentCommand:
                 {f"{self.name}s": listed},
                 output.align_columns([*lines.items()]),
             )
-        if self.experiment.positional and subject in (None, []):
+        is_missing = subject in (None, [])
+        if self.experiment.positional and is_missing:
             command = f"advsearch {self.name}"
             raise InputError(
                 f"{command}: expected {self.experiment.positional.expected}; see "
                 f"{command} --help"
             )
+        # a setting has several names in one text
         if isinstance(subject, list):
             setattr(args, about, ",".join(subject))
         return self.run_config(
@@ -177,6 +179,7 @@ class ExperimentCommand:
             return make_config(args, config_type)
         if about in args:
             run_name = getattr(args, about)
+            # of several runs the first
             if self.experiment.positional and self.experiment.positional.is_repeatable:
                 run_name = next(iter(split_names(run_name)), run_name)
             return make_config(
@@ -474,6 +477,7 @@ def without_commands() -> tuple[
     The help of the parser lists all commands.
     """
     groups = group_commands()
+    # width of the column of names, with two spaces on each side
     column = 4 + max(len(name) for group in groups.values() for name in group)
     # wide enough for the texts beside the column of names
     width = max(shutil.get_terminal_size().columns - 2, 2 * column)
@@ -552,6 +556,7 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
     from advsearch.settings import settings
 
     name = argument.partition("=")[0]
+    # the flags of the command, as its help writes them
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
     if not name.startswith("--"):
         hint = ""

@@ -247,11 +247,12 @@ def make_resume_command(run: str | Path) -> str:
 
     words = ["advsearch", "resume", format_run_name(run)]
     file = Path(run) / CONFIG
-    # where the file cannot be read, the command says so itself
+    # where the file cannot be read, the printed command will say so when it is run
     with suppress(AdvsearchError):
         config = read_file_config(read_command(file), file, {})
         metrics = getattr(config, "metrics", {}).values()
-        # a colon is in each name of code
+        # Names of code are "module:name". The exact list takes seconds, so it is made
+        # only where there is a colon anywhere.
         if isinstance(config, SceneConfig) and ":" in "".join(
             [config.model, *config.control_kinds, *metrics]
         ):

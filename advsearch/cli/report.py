@@ -217,7 +217,7 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
             (row.step, {name: value["value"] for name, value in row.values.items()})
             for row in store.rows("sweep")
         ]
-    # line 1 has the heads
+    # line 1 has the heads, so that poses begin on line 2
     for line, pose in enumerate(
         csv.DictReader(
             stored_files.read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()
@@ -225,6 +225,7 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
         2,
     ):
         location = f"photographs: {folder / POSES}, line {line}"
+        # the name alone: no photograph outside of the folder
         file = folder / Path(str(pose.pop("file", ""))).name
         if not file.is_file():
             raise InputError(

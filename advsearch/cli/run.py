@@ -136,14 +136,14 @@ def resume(args: argparse.Namespace) -> int:
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
     command = read_command(path / CONFIG)
-    # these add to a run that is done: the map of a sweep's surface, or a recipe's
-    # figures anew, with the photographs that were taken since
-    adds = command == "recipe" or (
-        changes.get("surface") is True and command == "sweep"
-    )
-    if is_finished(path) and not adds:
+    # These add to a run that is done: the map of a sweep's surface, or a recipe's
+    # figures anew, with the photographs that were taken since.
+    adds_surface = changes.get("surface") is True and command == "sweep"
+    adds_to_finished_run = command == "recipe" or adds_surface
+    if is_finished(path) and not adds_to_finished_run:
         print(f"advsearch: {path} is done already", file=sys.stderr)
-        # missing: the disk was full as it was written, or somebody removed it
+        # The page may be missing: the disk was full as it was written, or somebody
+        # removed it.
         if not (path / REPORT).is_file():
             write_page(path)
         return show_run(str(path), args.json)
@@ -171,12 +171,12 @@ def runs(args: argparse.Namespace) -> int:
         raise InputError(
             f"{folder}: expected a folder with runs in it, got no such folder"
         )
-    listed = list_runs(folder)
+    listed_runs = list_runs(folder)
     rows = [["run", "command", "object", "controls", "rows", "state", "result"]]
-    for run in listed:
+    for run in listed_runs:
         names = ",".join(run.controls)
         more = len(run.controls) - MOST_NAMES
-        if more > 1:
+        if more > 1:  # the last name is as short as "1 more"
             names = f"{','.join(run.controls[:MOST_NAMES])} and {more} more"
         rows.append(
             [
@@ -190,12 +190,12 @@ def runs(args: argparse.Namespace) -> int:
             ]
         )
     text = f"no runs in {folder}/ yet; advsearch attack makes one"
-    if listed:
+    if listed_runs:
         text = output.align_columns(rows)
     output.print_answer(
-        args.json, {"command": "runs", "runs": [vars(run) for run in listed]}, text
+        args.json, {"command": "runs", "runs": [vars(run) for run in listed_runs]}, text
     )
-    for run in listed:
+    for run in listed_runs:
         if run.fault and not args.json:
             print(f"advsearch: {run.name}: {run.fault}", file=sys.stderr)
     return 0

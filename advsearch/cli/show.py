@@ -103,7 +103,8 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
         picture: draw its pictures in the terminal, too.
     """
     path = find_run(name)
-    if not (path / NAME).is_file():
+    has_result = (path / NAME).is_file()
+    if not has_result:
         return _show_unfinished(read_listed_run(path), as_json)
     result = read_result(path)
     photos = find_photographs(path)
@@ -116,15 +117,15 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     if photos and photos.interval is not None and not as_json:
         agreeing = photos.right_right + photos.wrong_wrong
         total = format_count(photos.photos, "photograph")
-        sure = f"95 % interval {format_interval(photos.interval)}"
-        lines = [
+        interval_text = f"95 % interval {format_interval(photos.interval)}"
+        table = [
             ["", "photograph right", "photograph wrong"],
             ["rendering right", str(photos.right_right), str(photos.right_wrong)],
             ["rendering wrong", str(photos.wrong_right), str(photos.wrong_wrong)],
         ]
         print(
             f"\nRenderings and reality agree in {agreeing} of {total}, "
-            f"{sure}:\n{output.align_columns(lines)}"
+            f"{interval_text}:\n{output.align_columns(table)}"
         )
     if picture:
         show_pictures(find_best_images(path))
@@ -181,44 +182,59 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
     entry = registry[name]
-    parts = list[str]()
-    facts: dict[str, object] = {kind: name}
     if kind == "control":
-        facts |= {
-            "parameters": to_json_value(entry.parameters),
-            "choices": to_json_value(entry.choices),
-        }
-        if entry.parameters:
-            parts.append(
-                "parameters, searched or fixed:\n"
-                + _format_table(list(map(_make_parameter_row, entry.parameters)))
-            )
-        else:
-            parts.append(
-                f"The scene names its parameters: --control {name}:KEY=[low, high]"
-            )
-        if entry.choices:
-            parts.append(
-                "settings, chosen:\n"
-                + _format_table(list(map(_make_choice_row, entry.choices)))
-            )
+        facts, paragraphs = _describe_control(name, entry)
     else:
-        options = list[dict[str, Any]]()
-        for option, field in list_declared_options(entry).items():
-            default = get_option_default(field)
-            default = to_json_value(getattr(default, "name", default))
-            options.append(
-                {"name": option, "type": get_option_type(field), "default": default}
-            )
-        facts["options"] = options
-        rows = [
-            {**option, "default": _format_cell(option["default"])} for option in options
-        ]
-        how = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':"
-        parts.append(f"{how}\n{_format_table(rows)}" if rows else "It has no options.")
-    return output.print_answer(
-        as_json, facts, "\n\n".join([f"{name}: {get_first_doc_line(entry)}", *parts])
-    )
+        facts, paragraphs = _describe_options(kind, name, entry)
+    text = "\n\n".join([f"{name}: {get_first_doc_line(entry)}", *paragraphs])
+    return output.print_answer(as_json, {kind: name, **facts}, text)
+
+
+def _describe_control(name: str, control: Any) -> tuple[dict[str, Any], list[str]]:
+    """Return the parameters and choices of a kind of control, for JSON and as
+    paragraphs.
+    """
+    facts = {
+        "parameters": to_json_value(control.parameters),
+        "choices": to_json_value(control.choices),
+    }
+    paragraphs = list[str]()
+    if control.parameters:
+        paragraphs.append(
+            "parameters, searched or fixed:\n"
+            + _format_table(list(map(_make_parameter_row, control.parameters)))
+        )
+    else:
+        paragraphs.append(
+            f"The scene names its parameters: --control {name}:KEY=[low, high]"
+        )
+    if control.choices:
+        paragraphs.append(
+            "settings, chosen:\n"
+            + _format_table(list(map(_make_choice_row, control.choices)))
+        )
+    return facts, paragraphs
+
+
+def _describe_options(
+    kind: str, name: str, entry: Any
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the options of a policy or task, for JSON and as a paragraph."""
+    options = list[dict[str, Any]]()
+    for option, field in list_declared_options(entry).items():
+        default = get_option_default(field)
+        # an object, such as another task, stands by its name
+        default = to_json_value(getattr(default, "name", default))
+        options.append(
+            {"name": option, "type": get_option_type(field), "default": default}
+        )
+    if not options:
+        return {"options": options}, ["It has no options."]
+    rows = [
+        {**option, "default": _format_cell(option["default"])} for option in options
+    ]
+    heading = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':"
+    return {"options": options}, [f"{heading}\n{_format_table(rows)}"]
 
 
 def _make_parameter_row(parameter: Parameter) -> dict[str, str]:
@@ -407,6 +423,7 @@ def _registry(kind: str) -> Any:
 def list_all(args: argparse.Namespace) -> int:
     kinds = [args.kind]
     if args.kind == "all":
+        # cases are listed only by their own kind
         kinds = [kind for kind in REGISTRIES if kind != CASES]
     with open_command_progress(as_json=True, quiet=False):
         names = {kind: list_names(kind) for kind in kinds}

@@ -73,7 +73,7 @@ def make_control(
     known = [choice.name for choice in control.choices] + [
         known.name for known in control.declare_parameters(options)
     ]
-    for setting in options:  # "name" is none that can be given
+    for setting in options:  # "name" is set below, and no setting of a user
         if setting not in known:
             raise UnknownNameError(f"setting of control {kind}", setting, known)
     if name != kind:
@@ -244,6 +244,7 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
         names = ", ".join(control.name for control in controls)
         example = f"{first.name}:KEY=[0.2, 0.8]"
         if first.parameters:
+            # one that has a default range, if there is one
             parameter = next(
                 (
                     parameter
@@ -260,6 +261,28 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
             f"such as {example}"
         )
     return space
+
+
+def _check_names_no_mesh(controls: Sequence[Control], scene: SceneDescription) -> None:
+    """Check that no control's own name is that of a mesh beside the object.
+
+    A name as in light:chair would seem to say that the control acts on that mesh.
+
+    Raises:
+        InputError: a control has such a name.
+    """
+    for control in controls:
+        if control.name != control.kind and control.name in scene.surrounding_meshes:
+            able = ", ".join(
+                kind
+                for kind, usable in CONTROLS.list_usable().items()
+                if usable.of_a_mesh
+            )
+            raise InputError(
+                f"`controls` {control.kind}:{control.name}: {control.kind} can't be "
+                "given to another mesh than the "
+                f"object; {able} can, as in pose:{control.name}"
+            )
 
 
 def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
@@ -281,22 +304,11 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
             f"{', '.join(names)}; write KIND:NAME, such as "
             f"light:key,light:fill"
         )
-    for control in controls:
-        if control.name != control.kind and control.name in scene.surrounding_meshes:
-            able = ", ".join(
-                kind
-                for kind, usable in CONTROLS.list_usable().items()
-                if usable.of_a_mesh
-            )
-            raise InputError(
-                f"`controls` {control.kind}:{control.name}: {control.kind} can't be "
-                "given to another mesh than the "
-                f"object; {able} can, as in pose:{control.name}"
-            )
+    _check_names_no_mesh(controls, scene)
     if scene.backdrop_photograph is not None:
         _check_controls_in_photograph(controls, scene.backdrop_photograph.spec)
     _check_photograph_is_chosen(controls, scene)
-    described = scene
+    described_scene = scene
     adjusted = list[AdjustedDefault]()
     for control in controls:
         prepared = control.prepare(scene)
@@ -304,7 +316,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         scene = prepared
     for control in controls:
         if control.mesh != OBJECT:
-            control.get_mesh(scene)
+            control.get_mesh(scene)  # raises if the scene has no such mesh
     bound = tuple(control.bind(scene) for control in controls)
     for control in bound:
         adjusted += control.adjusted_defaults
@@ -312,7 +324,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     environments = [
         str(default.used) for default in adjusted if default.parameter == ENVIRONMENT
     ]
-    if scene.environment_spec != described.environment_spec:
+    if scene.environment_spec != described_scene.environment_spec:
         environments.append(scene.environment_spec)
     environment = environments[0] if environments else None
     return Space(bound, scene, tuple(adjusted), environment)

@@ -104,6 +104,7 @@ class BackdropControl(Control):
                 )
             _check_compatible(name, scenes[name], first)
         has_model = any(scenes[name].camera_model is not None for name in allowed)
+        # the first of the folder need not be the first that is allowed
         if first.backdrop_photograph is not scene.backdrop_photograph:
             scene = replace(
                 scene,
@@ -159,6 +160,7 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     """
     assert scene.photographs is not None
     view = list(scene.photographs.scenes.values())[index]
+    # (4, 4) from the world of the photograph to that of the scene
     carry = _compute_carry(view, scene)
     pose = carry @ camera_to_world(view)
     inputs = {
@@ -172,6 +174,7 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
         inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
     if scene.environment is not None:
         radiance = torch.from_numpy(scene.environment.radiance.copy())
+        # the turn about the vertical axis, the only one that `carry` may have
         degrees = math.degrees(math.atan2(carry[1, 0], carry[0, 0]))
         inputs["environment.data"] = rotate_map(radiance, torch.tensor(degrees))
     return inputs
@@ -206,13 +209,14 @@ def _check_compatible(
             "`environment` for all photographs, or sweep over them"
         )
     carry = _compute_carry(view, first)
-    up = carry[2, :3] - [0.0, 0.0, 1.0]
-    level = (
+    # how far z is from staying z
+    up_change = carry[2, :3] - [0.0, 0.0, 1.0]
+    is_level = np.abs(up_change).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
+    level_change = (
         carry[2, 3] + view.get_number("ground.level") - first.get_number("ground.level")
     )
-    is_level = np.abs(up).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
     same_plane = has_plane(view) == has_plane(first) and (
-        not has_plane(first) or abs(level) <= PLANE_TOLERANCE
+        not has_plane(first) or abs(level_change) <= PLANE_TOLERANCE
     )
     if not (is_level and same_plane):
         raise InputError(

@@ -147,17 +147,17 @@ def list_replaced_settings(
                 after.environment.name,
             )
     for name, value in after.values.items():
-        scene = before.values[name]
-        if value is None or scene is None or is_same_value(value, scene):
+        value_before = before.values[name]
+        if value is None or value_before is None or is_same_value(value, value_before):
             continue
         if name in before.requested:
             raise InputError(
-                f"`set` {name}={format_value(scene)} and `controls` {control} "
+                f"`set` {name}={format_value(value_before)} and `controls` {control} "
                 "contradict each "
                 "other: the control makes it "
                 f"{format_rounded(value)}; change one of the two, or leave one out"
             )
-        yield AdjustedDefault(control, name, SETTINGS[name].unit, scene, value)
+        yield AdjustedDefault(control, name, SETTINGS[name].unit, value_before, value)
 
 
 NO_INPUTS: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
@@ -533,7 +533,8 @@ class Control:
             dtype=torch.float32,
         )
         self.groups = tuple(self._group(slot) for slot in slots if slot.n_coordinates)
-        # (d,) lower bound and width of the range of each coordinate, see `values`
+        # Lower bound and width of the range of each slot, for `values`; a slot without a
+        # range gets one that is not used.
         ranges = [
             slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0)
             for slot in slots
@@ -543,6 +544,7 @@ class Control:
         ).reshape(-1, 2)
         counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
         # a slot of several values has the same range for each coordinate
+        # (d,) each
         self._low, self._span = low_and_span.T.repeat_interleave(counts, dim=1)
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -638,6 +640,7 @@ class Control:
             hides_others = self.amount not in (None, parameter.name)
             if hides_others or is_same_value(used, scene_value, is_angle=slot.is_angle):
                 continue
+            # as the user sets the same value of the scene
             setting = self.setting_name(parameter)
             label = f"{self.name}.{parameter.name}"
             if setting in self.scene.requested:
@@ -679,7 +682,8 @@ class Control:
                 name, slot.n_coordinates, (), options=len(spec.values), setting=setting
             )
         budget = self.get_budget(parameter)
-        if type(spec) is not Range and budget != FULL_RANGE:
+        is_distribution = type(spec) is not Range  # a subclass of it
+        if is_distribution and budget != FULL_RANGE:
             raise InputError(
                 f"{self.name}.{name}: it has a ball and no distribution; give it a "
                 "range"
@@ -741,7 +745,8 @@ class Control:
             spec = slot.spec
             if isinstance(spec, Range):
                 coordinates = slice(slot.offset, slot.offset + slot.n_values)
-                if parameter.log or type(spec) is not Range:
+                is_distribution = type(spec) is not Range  # a subclass of it
+                if parameter.log or is_distribution:
                     value = spec.interpolate(u[coordinates], log=parameter.log)
                 else:
                     value = linear[coordinates]
@@ -810,7 +815,8 @@ class Control:
         described: dict[str, Value] = {}
         for slot in self.slots:
             parameter = slot.parameter
-            if isinstance(slot.spec, Fixed) or len(parameter.shape) > 1:
+            is_image = len(parameter.shape) > 1
+            if isinstance(slot.spec, Fixed) or is_image:
                 continue
             value = values[parameter.name]
             name = f"{self.name}.{parameter.name}"

@@ -75,14 +75,13 @@ class BodyControl(Control):
         clips = self.rig.clips
         requested = self.chosen["clip"]
         if requested is None:
+            # by default the first animation, if its time is set, or nothing at all
             plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
+        index = -1  # of no animation
         # a number may be given as text
-        index = (
-            int(requested)
-            if Parameter.is_number(requested) or str(requested).isdigit()
-            else -1
-        )
+        if Parameter.is_number(requested) or str(requested).isdigit():
+            index = int(requested)
         if requested not in clips and not 0 <= index < len(clips):
             raise errors.UnknownNameError(
                 f"{self.name}.clip",
@@ -120,7 +119,7 @@ class BodyControl(Control):
             for parameter in self.instance_parameters
             if parameter.name in known
         )
-        self.clip  # noqa: B018 - raises for one that is not there
+        self.clip  # noqa: B018 - raises for an animation that is not there
         super().fit()
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:

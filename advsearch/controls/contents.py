@@ -102,13 +102,14 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     heights = np.linspace(floor, floor + FILL_LIMIT * depth, WALL_ROWS)
     # just above the floor, since a ray along a flat floor might hit anything
     min_height = floor + 0.004 * depth
-    rows = [
+    walls = [
         _find_wall(mesh, axis, max(float(height), min_height)) for height in heights
     ]
-    distances, faces = zip(*rows, strict=True)
+    distances, faces = zip(*walls, strict=True)
     radii = _fill_missed_radii(np.stack(distances))
     if radii is None:
         return None
+    # of the lower half of the wall; -1 is no face
     lower_faces = np.concatenate(faces[: WALL_ROWS // 2])
     wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
     return Vessel(axis, heights, radii, wall_color)
@@ -189,16 +190,18 @@ def _compute_height_map(
     lower = vertices[:, :2].min(axis=0)
     upper = vertices[:, :2].max(axis=0)
     cell = float((upper - lower).max()) / GRID_CELLS
-    # a margin of at least one cell
+    # a margin of at least one cell on each side
     lower = lower - 1.5 * cell
     width, height = (np.ceil((upper - lower) / cell).astype(np.int64) + 2).tolist()
-    ground = np.full((height, width), vertices[:, 2].min() - 1.0)
+    below_mesh = vertices[:, 2].min() - 1.0
+    heights = np.full((height, width), below_mesh)
     corners = vertices[mesh.faces.astype(np.int64)]
     in_cells = (corners[..., :2] - lower) / cell
     face, row, column, weights = images.rasterize_triangles(in_cells, (height, width))
-    np.maximum.at(ground, (row, column), (weights * corners[face, :, 2]).sum(axis=1))
-    _draw_edges(ground, in_cells, corners[..., 2])
-    return lower, cell, ground
+    # several faces may lie over one cell: the highest counts
+    np.maximum.at(heights, (row, column), (weights * corners[face, :, 2]).sum(axis=1))
+    _draw_edges(heights, in_cells, corners[..., 2])
+    return lower, cell, heights
 
 
 def _draw_edges(
@@ -270,7 +273,7 @@ def _find_wall(
     first_side = ray[:, :1] * first_end[:, 1] - ray[:, 1:] * first_end[:, 0]
     second_side = ray[:, :1] * second_end[:, 1] - ray[:, 1:] * second_end[:, 0]
     is_crossed = (first_side > 0.0) != (second_side > 0.0)
-    # along the segment, where the ray's line crosses it
+    # where the ray's line crosses the segment, from 0 at its first end to 1
     fraction = first_side / np.where(is_crossed, first_side - second_side, 1.0)
     along_ray = (ray @ first_end.T) * (1.0 - fraction) + (ray @ second_end.T) * fraction
     along_ray = np.where(is_crossed & (along_ray > 0.0), along_ray, np.inf)
@@ -294,7 +297,7 @@ def _cut_faces(
     corners = corners[face]
     is_above = is_above[face]
     index = np.arange(len(face))
-    # (S,) the corner that is on its side of the plane by itself
+    # (S,) the corner (0 to 2) that is on its side of the plane by itself
     apex_corner = np.where(
         is_above.sum(axis=1) == 1, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
     )
@@ -302,7 +305,7 @@ def _cut_faces(
     ends = []
     for step in (1, 2):
         other = corners[index, (apex_corner + step) % 3]
-        # the two other corners are on the other side: both cut edges begin at the apex
+        # The two other corners are on the other side: both cut edges begin at the apex.
         rise = np.where(other[:, 2] == apex[:, 2], 1.0, other[:, 2] - apex[:, 2])
         fraction = (height - apex[:, 2]) / rise
         ends.append(apex[:, :2] + fraction[:, None] * (other[:, :2] - apex[:, :2]))
@@ -583,16 +586,17 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
     """
     amounts = dict(zip(INGREDIENTS, proportions, strict=True))
     absorption = proportions.new_zeros(3)
-    scattering = proportions.new_tensor(1e-6)  # not 0, of pure water
+    # not 0, since it is divided by; water itself does not scatter
+    scattering = proportions.new_tensor(1e-6)
     for name, reflectance in REFLECTANCE.items():
         deep_reflectance = proportions.new_tensor(reflectance)
-        # scattering of the ingredient
-        part = amounts[name] * SCATTERING[name]
-        # K / S of the ingredient, by its reflectance at infinite depth
-        # (1 - R)^2 / (2 R), with the division in the next line
-        absorption_ratio = (1.0 - deep_reflectance).square()
-        absorption = absorption + part * absorption_ratio / (2.0 * deep_reflectance)
-        scattering = scattering + part
+        added_scattering = amounts[name] * SCATTERING[name]
+        # Kubelka and Munk: K / S = (1 - R)^2 / (2 R), by the reflectance R of an
+        # infinitely deep layer of the ingredient.
+        absorption = absorption + added_scattering * (
+            1.0 - deep_reflectance
+        ).square() / (2.0 * deep_reflectance)
+        scattering = scattering + added_scattering
     ratio = absorption / scattering
     # reflectance of an infinitely deep mixture; 1e-9 keeps the derivative finite at 0
     mixed_color = 1.0 + ratio - (ratio.square() + 2.0 * ratio + 1e-9).sqrt()
@@ -611,13 +615,15 @@ def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     floor.
     """
     heights = torch.from_numpy(vessel.heights).to(level)
-    radii = torch.from_numpy(vessel.radii).to(level)
+    radii = torch.from_numpy(vessel.radii).to(level)  # (len(heights), K)
+    # a fractional index into the heights, which are even
     position = level * (len(heights) - 1)
     row = int(position.detach().clamp(0, len(heights) - 2))
     radius = (
         torch.lerp(radii[row], radii[row + 1], position - row) * DISK_RADIUS_FRACTION
     )
-    # size of the disk: 1 above the level at which it begins to shrink
+    # Size of the disk: 1 above the level at which it begins to shrink. It never gets 0,
+    # so that its faces keep an area.
     opening = (level / SINKING_LEVEL).clamp(1e-3, 1.0)
     depth = heights[-1] - heights[0]
     height = heights[0] + level * depth - (1.0 - opening) * SINKING_LEVEL * depth

@@ -237,6 +237,7 @@ class EnvironmentControl(Control):
             base, values["rotation"] - self.scene.get_number("environment.rotation")
         )
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
+        # an exposure is in stops, each of which doubles the light
         stops = values["exposure"] - self.scene.get_number("environment.exposure")
         lit = rotated * tint * torch.exp2(stops)
         if "harmonics" in self.specs:

@@ -169,7 +169,8 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     n_scalars = min(math.ceil(count / 3) + 2, len(points) - 1)
     width = BANDWIDTH * cell
     density, functions, mass, values = _diffusion_map(points, width, n_scalars)
-    # of the Laplacian, to which the kernel converges: 0 for a constant function
+    # eigenvalues of the Laplacian, to which the kernel converges: 0 for a constant
+    # function
     energy = (1.0 - values) / width**2
     combination = _without_rotation(points, functions, mass, energy, count)
 
@@ -177,6 +178,7 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     # limited, since a division by them amplifies noise
     weights = _compute_landmark_weights(welded_mesh.positions, points, width, density)
     extended = weights @ (functions / np.maximum(values, 0.05))
+    # p positions, s scalar functions, c axes, k fields
     fields = np.einsum("ps,sck->pck", extended, combination)
     return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
 
@@ -198,6 +200,7 @@ def _diffusion_map(
     """
     kernel = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * width**2))
     density = kernel.sum(axis=1)
+    # alpha = 1: where landmarks are dense makes no difference
     kernel /= density[:, None] * density[None, :]
     mass = kernel.sum(axis=1)
     symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
@@ -206,6 +209,7 @@ def _diffusion_map(
     matrix = sparse.csr_matrix(
         np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0)
     )
+    # a fixed start, so that the result does not depend on chance
     first_vector = np.cos(np.arange(len(points)))
     n_lanczos = min(len(points), 4 * (n_scalars + 1))
     values, vectors = sparse_linalg.eigsh(
@@ -234,6 +238,7 @@ def _landmarks(solid: WeldedMesh) -> tuple[Float64Array, float]:
     corners = solid.positions[solid.faces]
     areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
     generator = np.random.default_rng(0)
+    # faces by their areas: at even steps along the sum of all areas
     quantiles = (np.arange(N_SURFACE_SAMPLES) + 0.5) / N_SURFACE_SAMPLES
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), quantiles)
     face = face.clip(max=len(areas) - 1)
@@ -243,12 +248,13 @@ def _landmarks(solid: WeldedMesh) -> tuple[Float64Array, float]:
     cell = CELL_SIZE * solid.extent
     while True:
         cubes = np.floor((pool - pool.min(axis=0)) / cell).astype(np.int64)
-        cube_of = np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
-        if int(cube_of.max()) + 1 <= MAX_LANDMARKS:
+        # index of the occupied cell that each point lies in
+        cell_index = np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
+        if int(cell_index.max()) + 1 <= MAX_LANDMARKS:
             break
         cell *= 1.15
-    n_members = np.bincount(cube_of)
-    means = [np.bincount(cube_of, pool[:, axis]) / n_members for axis in range(3)]
+    n_members = np.bincount(cell_index)
+    means = [np.bincount(cell_index, pool[:, axis]) / n_members for axis in range(3)]
     return np.stack(means, axis=1), cell
 
 
@@ -278,6 +284,7 @@ def _without_rotation(
     """
     n_scalars = functions.shape[1]
     center = (points * mass[:, None]).sum(axis=0) / mass.sum()
+    # (N, 3) displacements by a small rotation about each axis
     turns = [np.cross(axis, points - center) for axis in np.eye(3)]
     # (3, 3 S) coefficients of the rotations in the functions
     rotations = np.stack(
@@ -414,6 +421,7 @@ class DisplacementLimits:
         edges = np.stack([edge_1, edge_2, edge_1 - edge_2])
         longest = np.linalg.norm(edges, axis=-1).max(axis=0)
         double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
+        # a face that is almost a line has no strain to speak of
         is_sound = double_area > MIN_FACE_HEIGHT * longest**2
         edge_1 = edge_1[is_sound]
         edge_2 = edge_2[is_sound]

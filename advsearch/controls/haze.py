@@ -67,7 +67,8 @@ class HazeControl(Control):
         """
         scene_haze = _find_haze(self.scene)
         default = parameter.default
-        if parameter.name != "density":
+        is_color = parameter.name != "density"
+        if is_color:
             if scene_haze is None:
                 return parameter
             albedo = color.linear_to_srgb(

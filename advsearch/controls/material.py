@@ -100,7 +100,11 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
     row = top.astype(np.int64)
 
     def corner(right: int, below: int) -> Float64Array:
-        """Return the dot product of a corner's gradient and the offset from it."""
+        """Return the dot product of a corner's gradient and the offset from it.
+
+        `right` and `below` are 0 or 1: the corner of the cell, from its upper left.
+        """
+        # the lattice goes on periodically, so that tiles meet without a seam
         turn = angle[(row + below) % rows, (column + right) % columns]
         return np.asarray(np.cos(turn) * (x - right) + np.sin(turn) * (y - below))
 
@@ -108,7 +112,7 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
     y_weight = _fade(y)
     upper = corner(0, 0) * (1.0 - x_weight) + corner(1, 0) * x_weight
     lower = corner(0, 1) * (1.0 - x_weight) + corner(1, 1) * x_weight
-    # 1.5: bilinear sums of unit gradients rarely exceed 2 / 3
+    # times 1.5, since such sums of unit gradients rarely exceed 2 / 3
     return np.asarray((upper * (1.0 - y_weight) + lower * y_weight) * 1.5)
 
 
@@ -125,7 +129,9 @@ def _clouds(
     total = np.zeros_like(grid[0])
     for octave in range(octaves):
         total += 0.5**octave * _noise(
-            grid, (cells[0] << octave, cells[1] << octave), seed + 101 * octave
+            grid,
+            cells=(cells[0] << octave, cells[1] << octave),
+            seed=seed + 101 * octave,
         )
     # the sum of all weights
     return total / (2.0 - 0.5 ** (octaves - 1))
@@ -133,8 +139,8 @@ def _clouds(
 
 def _warped(grid: Grid, cells: int, amount: float, seed: int) -> Grid:
     """Return coordinates displaced by up to about `amount` by noise."""
-    right = _clouds(grid, (cells, cells), 2, seed)
-    down = _clouds(grid, (cells, cells), 2, seed + 7)
+    right = _clouds(grid, cells=(cells, cells), octaves=2, seed=seed)
+    down = _clouds(grid, cells=(cells, cells), octaves=2, seed=seed + 7)
     return grid[0] + amount * right, grid[1] + amount * down
 
 
@@ -198,6 +204,7 @@ def _turing(
     )
     for _ in range(rounds):
         field = np.fft.ifft2(np.fft.fft2(field) * band).real
+        # the larger the factor, the harder the edges of stripes
         field = np.tanh(2.5 * field / field.std() + bias)
     return np.asarray(field)
 
@@ -243,20 +250,30 @@ def plain(grid: Grid) -> Float64Array:
 def wood(grid: Grid) -> Float64Array:
     """Paint year rings with fibres and pores.
 
-    The last argument of `_noise` and `_clouds` is a seed; other numbers are chosen by
-    eye.
+    Numbers are chosen by eye.
     """
     x, y = grid
-    bend = 0.16 * _clouds(grid, (2, 1), 2, 11) + 0.012 * _noise(grid, (8, 3), 12)
-    rings = 9.0 * (x + bend) + 0.25 * _noise(grid, (5, 2), 17)
+    bend = 0.16 * _clouds(grid, cells=(2, 1), octaves=2, seed=11) + 0.012 * _noise(
+        grid, cells=(8, 3), seed=12
+    )
+    rings = 9.0 * (x + bend) + 0.25 * _noise(grid, cells=(5, 2), seed=17)
     phase = rings % 1.0
     # slow darkening, sudden end of a year
-    late_wood = _step(phase, 0.66, 0.6) * (1.0 - _step(phase, 0.96, 0.08))
-    fibre = _noise((x + 0.6 * bend, y), (120, 3), 13) + 0.6 * _noise(
-        (x + 0.6 * bend, y), (240, 5), 18
+    late_wood = _step(phase, edge=0.66, soft=0.6) * (
+        1.0 - _step(phase, edge=0.96, soft=0.08)
     )
-    pores = _step(_noise((x + 0.6 * bend, y), (170, 12), 14), 0.5, 0.2)
-    tone = 0.30 + 0.42 * late_wood + 0.13 * fibre + 0.16 * _noise(grid, (3, 1), 15)
+    fibre = _noise((x + 0.6 * bend, y), cells=(120, 3), seed=13) + 0.6 * _noise(
+        (x + 0.6 * bend, y), cells=(240, 5), seed=18
+    )
+    pores = _step(
+        _noise((x + 0.6 * bend, y), cells=(170, 12), seed=14), edge=0.5, soft=0.2
+    )
+    tone = (
+        0.30
+        + 0.42 * late_wood
+        + 0.13 * fibre
+        + 0.16 * _noise(grid, cells=(3, 1), seed=15)
+    )
     return _mix(
         _ramp(tone, "dcb27a", "c8955a", "a06c38", "784824"),
         _color("5a3519"),
@@ -268,26 +285,29 @@ def wood(grid: Grid) -> Float64Array:
 def marble(grid: Grid) -> Float64Array:
     """Paint clouds with dark veins.
 
-    The last argument of `_clouds` and `_warped` is a seed; other numbers are chosen by
-    eye.
+    Numbers are chosen by eye.
     """
-    warped = _warped(grid, 2, 0.22, 21)
-    finely_warped = _warped(warped, 6, 0.03, 22)
+    warped = _warped(grid, cells=2, amount=0.22, seed=21)
+    finely_warped = _warped(warped, cells=6, amount=0.03, seed=22)
     x, y = finely_warped
-    clouds = 0.5 + 0.5 * _clouds(warped, (3, 3), 4, 25)
+    clouds = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=4, seed=25)
     veins = np.zeros((TILE_SIDE, TILE_SIDE))
     for n_right, n_down, width, depth, seed in (
         (1, 1, 0.05, 0.75, 23),
         (2, 1, 0.02, 0.45, 24),
         (1, 3, 0.012, 0.3, 26),
     ):
-        turbulence = 0.5 * _clouds(finely_warped, (2, 2), 4, seed)
-        strength = 0.25 + 0.75 * _step(_clouds(warped, (3, 3), 2, seed + 50), 0.0, 0.8)
+        turbulence = 0.5 * _clouds(finely_warped, cells=(2, 2), octaves=4, seed=seed)
+        strength = 0.25 + 0.75 * _step(
+            _clouds(warped, cells=(3, 3), octaves=2, seed=seed + 50), edge=0.0, soft=0.8
+        )
         profile = _compute_vein_profile(n_right * x + n_down * y + turbulence, width)
         # n_right and n_down are whole, so that veins meet at the tile's border
         veins += depth * strength * profile
     return _mix(
-        _mix(_color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, 0.58, 0.8)),
+        _mix(
+            _color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, edge=0.58, soft=0.8)
+        ),
         _color("4c5159"),
         np.clip(veins, 0.0, 0.9),
     )
@@ -305,36 +325,42 @@ def _compute_vein_profile(phase: Float64Array, width: float) -> Float64Array:
 def brick(grid: Grid) -> Float64Array:
     """Paint a wall of bricks with mortar.
 
-    The last argument of `_noise`, `_clouds` and `_warped` is a seed; other numbers are
-    chosen by eye.
+    Numbers are chosen by eye.
     """
-    x, y = _warped(grid, 12, 0.0035, 31)
+    x, y = _warped(grid, cells=12, amount=0.0035, seed=31)
     rows = 8
     columns = 4
     row = np.floor(y * rows)
     # every other course is shifted by half a brick
     course_x = x * columns + 0.5 * (row % 2.0)
     column = np.floor(course_x) % columns
-    # distance to the edge of the brick, in heights of a course
-    # a brick is twice as long as high
+    # Distance to the edge of the brick, in heights of a course. A brick is twice as
+    # long as high, so the one along x is doubled.
     edge_x = 2.0 * (0.5 - np.abs(course_x % 1.0 - 0.5))
     edge_y = 0.5 - np.abs(y * rows % 1.0 - 0.5)
     solid = _step(
-        np.minimum(edge_x, edge_y) + 0.02 * _noise(grid, (60, 60), 32), 0.075, 0.05
+        np.minimum(edge_x, edge_y) + 0.02 * _noise(grid, cells=(60, 60), seed=32),
+        edge=0.075,
+        soft=0.05,
     )
     tone = np.random.Generator(np.random.PCG64(33)).random((rows, columns))
     brick_tone = tone[row.astype(np.int64) % rows, column.astype(np.int64)]
-    mortar = _color("c3bbac") + 0.10 * _clouds(grid, (80, 80), 2, 36)[..., None]
+    mortar = (
+        _color("c3bbac")
+        + 0.10 * _clouds(grid, cells=(80, 80), octaves=2, seed=36)[..., None]
+    )
     return _mix(mortar, _paint_fired_clay(grid, brick_tone), solid)
 
 
 def _paint_fired_clay(grid: Grid, brick_tone: Float64Array) -> Float64Array:
     """Return the color of bricks of some tone, with grain and dark stains."""
-    grain = _clouds(grid, (40, 40), 3, 34)
+    grain = _clouds(grid, cells=(40, 40), octaves=3, seed=34)
     clay = _ramp(
         brick_tone + 0.22 * grain, "7c2f22", "9a3f2b", "ad4d35", "bd6547", "a5553c"
     )
-    stains = 0.5 * _step(_clouds(grid, (70, 70), 2, 35), 0.35, 0.2)
+    stains = 0.5 * _step(
+        _clouds(grid, cells=(70, 70), octaves=2, seed=35), edge=0.35, soft=0.2
+    )
     return _mix(clay, _color("4f211a"), stains)
 
 
@@ -342,10 +368,9 @@ def _paint_fired_clay(grid: Grid, brick_tone: Float64Array) -> Float64Array:
 def fabric(grid: Grid) -> Float64Array:
     """Paint a plain weave of two threads.
 
-    The last argument of `_noise` and `_warped` is a seed; other numbers are chosen by
-    eye.
+    Numbers are chosen by eye.
     """
-    x, y = _warped(grid, 6, 0.004, 41)
+    x, y = _warped(grid, cells=6, amount=0.004, seed=41)
     count = 16
     thread_x = x * count
     thread_y = y * count
@@ -361,8 +386,8 @@ def fabric(grid: Grid) -> Float64Array:
     )
     fibres = np.where(
         warp_is_over,
-        _noise((x, y), (count * 8, count), 42),
-        _noise((x, y), (count, count * 8), 43),
+        _noise((x, y), cells=(count * 8, count), seed=42),
+        _noise((x, y), cells=(count, count * 8), seed=43),
     )
     generator = np.random.Generator(np.random.PCG64(44))
     warp = _color("b9a77f") * _thread_tones(generator, thread_x, count)
@@ -383,20 +408,24 @@ def _thread_tones(
 def leopard(grid: Grid) -> Float64Array:
     """Paint rosettes with dots between them.
 
-    The last argument of `_clouds`, `_warped` and `_scattered` is a seed; other numbers
-    are chosen by eye, lengths in tiles.
+    The last argument of `_scattered` is a seed; other numbers are chosen by eye,
+    lengths in tiles.
     """
-    warped = _warped(_warped(grid, 4, 0.03, 51), 12, 0.012, 52)
+    warped = _warped(
+        _warped(grid, cells=4, amount=0.03, seed=51), cells=12, amount=0.012, seed=52
+    )
     points = _scattered(42, 53)
     distance, index = _cells(warped, points)
     rosettes, core = _draw_rosettes(warped, points, distance[..., 0], index[..., 0])
-    fur = _clouds(grid, (24, 90), 2, 55)
-    shade = 0.5 + 0.5 * _clouds(grid, (3, 3), 2, 56)
+    fur = _clouds(grid, cells=(24, 90), octaves=2, seed=55)
+    shade = 0.5 + 0.5 * _clouds(grid, cells=(3, 3), octaves=2, seed=56)
     coat = _mix(_color("d8a861"), _color("e7c58c"), shade)
     coat = _mix(coat, _color("a9692f"), 0.75 * core)
     dot_distance, _ = _cells(warped, _scattered(150, 57), 1)
-    between_rosettes = _step(distance[..., 0], 0.07, 0.012)
-    dots = 1.0 - _step(dot_distance.reshape(TILE_SIDE, TILE_SIDE), 0.011, 0.006)
+    between_rosettes = _step(distance[..., 0], edge=0.07, soft=0.012)
+    dots = 1.0 - _step(
+        dot_distance.reshape(TILE_SIDE, TILE_SIDE), edge=0.011, soft=0.006
+    )
     spots = np.clip(rosettes + dots * between_rosettes, 0.0, 1.0)
     return _mix(coat * (1.0 + 0.10 * fur)[..., None], _color("221710"), spots)
 
@@ -428,15 +457,21 @@ def _draw_rosettes(
     # around a ring: it is broken where this is low
     waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
     outer_edge = 0.056 + 0.004 * np.cos(angle + turn)
-    ring = _step(radius, 0.031, 0.008) * (1.0 - _step(radius, outer_edge, 0.008))
-    return ring * _step(waves, -0.75, 0.5), 1.0 - _step(radius, 0.042, 0.02)
+    ring = _step(radius, edge=0.031, soft=0.008) * (
+        1.0 - _step(radius, edge=outer_edge, soft=0.008)
+    )
+    return ring * _step(waves, edge=-0.75, soft=0.5), 1.0 - _step(
+        radius, edge=0.042, soft=0.02
+    )
 
 
 @register_pattern(0.8, roughness=0.8, specular=0.2)
 def zebra(grid: Grid) -> Float64Array:
     stripes = _turing((0.42, 0.125), 0.0, 61)
-    black = _step(stripes + 0.12 * _noise(grid, (10, 40), 62), 0.0, 0.7)
-    fur = 1.0 + 0.06 * _clouds(grid, (30, 110), 2, 63)
+    black = _step(
+        stripes + 0.12 * _noise(grid, cells=(10, 40), seed=62), edge=0.0, soft=0.7
+    )
+    fur = 1.0 + 0.06 * _clouds(grid, cells=(30, 110), octaves=2, seed=63)
     return _mix(_color("efeae0"), _color("17140f"), black) * fur[..., None]
 
 
@@ -451,22 +486,29 @@ def checker(grid: Grid) -> Float64Array:
 def rust(grid: Grid) -> Float64Array:
     """Paint rust under flakes of paint.
 
-    The last argument of `_noise`, `_clouds` and `_warped` is a seed; other numbers are
-    chosen by eye.
+    Numbers are chosen by eye.
     """
-    warped = _warped(grid, 4, 0.06, 71)
-    broad = 0.5 + 0.5 * _clouds(warped, (3, 3), 5, 72)
-    grain = _clouds(grid, (48, 48), 3, 73)
+    warped = _warped(grid, cells=4, amount=0.06, seed=71)
+    broad = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=5, seed=72)
+    grain = _clouds(grid, cells=(48, 48), octaves=3, seed=73)
     tone = np.clip(1.5 * (broad - 0.5) + 0.5 + 0.22 * grain, 0.0, 1.0)
     oxide = _ramp(tone, "2e1710", "5a2712", "8b3f16", "b5591d", "cf7b33")
-    paint = _color("5d6668") + 0.05 * _clouds(grid, (20, 20), 2, 74)[..., None]
-    flakes = _clouds(_warped(warped, 16, 0.015, 75), (4, 4), 4, 76)
+    paint = (
+        _color("5d6668")
+        + 0.05 * _clouds(grid, cells=(20, 20), octaves=2, seed=74)[..., None]
+    )
+    flakes = _clouds(
+        _warped(warped, cells=16, amount=0.015, seed=75),
+        cells=(4, 4),
+        octaves=4,
+        seed=76,
+    )
     # paint that has not come off yet, and the dark rim around it
-    paint_left = _step(flakes, 0.26, 0.05)
-    rim = _step(flakes, 0.20, 0.10) - paint_left
+    paint_left = _step(flakes, edge=0.26, soft=0.05)
+    rim = _step(flakes, edge=0.20, soft=0.10) - paint_left
     rimmed_oxide = _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0))
     surface = _mix(rimmed_oxide, paint, 0.85 * paint_left)
-    pits = _step(_noise(grid, (70, 70), 77), 0.5, 0.15)
+    pits = _step(_noise(grid, cells=(70, 70), seed=77), edge=0.5, soft=0.15)
     return _mix(surface, _color("1b0d09"), 0.6 * pits)
 
 
@@ -542,22 +584,30 @@ def _draw_points(
 def elephant(grid: Grid) -> Float64Array:
     """Paint skin with folds.
 
-    The last argument of `_clouds` and `_warped` is a seed; other numbers are chosen by
-    eye.
+    Numbers are chosen by eye.
     """
-    warped = _warped(_warped(grid, 3, 0.05, 91), 14, 0.012, 92)
+    warped = _warped(
+        _warped(grid, cells=3, amount=0.05, seed=91), cells=14, amount=0.012, seed=92
+    )
     folds = np.zeros((TILE_SIDE, TILE_SIDE))
     for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
         points = _scattered(count, seed)
         distance, _ = _cells(warped, points)
         # folds run where the two nearest points are equally far
         folds += depth * np.exp(-(((distance[..., 1] - distance[..., 0]) / width) ** 2))
-    long_folds = np.abs(_clouds(_warped(grid, 5, 0.04, 95), (3, 14), 3, 96))
+    long_folds = np.abs(
+        _clouds(
+            _warped(grid, cells=5, amount=0.04, seed=95),
+            cells=(3, 14),
+            octaves=3,
+            seed=96,
+        )
+    )
     folds += 0.55 * np.exp(-((long_folds / 0.035) ** 2))
     tone = (
         0.55
-        + 0.25 * _clouds(warped, (3, 3), 3, 97)
-        + 0.16 * _clouds(grid, (60, 60), 2, 98)
+        + 0.25 * _clouds(warped, cells=(3, 3), octaves=3, seed=97)
+        + 0.16 * _clouds(grid, cells=(60, 60), octaves=2, seed=98)
     )
     hide = _ramp(tone, "5f5850", "7d756c", "958d84", "a9a29a")
     return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
@@ -567,14 +617,14 @@ def elephant(grid: Grid) -> Float64Array:
 def steel(grid: Grid) -> Float64Array:
     """Paint brushed steel: scratches along x.
 
-    The last argument of `_noise` is a seed; other numbers are chosen by eye.
+    Numbers are chosen by eye.
     """
     scratches = (
-        _noise(grid, (3, 240), 101)
-        + 0.6 * _noise(grid, (7, 120), 102)
-        + 0.4 * _noise(grid, (2, 256), 103)
+        _noise(grid, cells=(3, 240), seed=101)
+        + 0.6 * _noise(grid, cells=(7, 120), seed=102)
+        + 0.4 * _noise(grid, cells=(2, 256), seed=103)
     )
-    tone = 0.72 + 0.09 * scratches + 0.03 * _noise(grid, (2, 2), 104)
+    tone = 0.72 + 0.09 * scratches + 0.03 * _noise(grid, cells=(2, 2), seed=104)
     return np.asarray(tone[..., None] * _color("fbfdff"))
 
 

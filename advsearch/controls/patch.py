@@ -187,6 +187,7 @@ class PatchControl(PictureControl):
             return
         fixing_setting = "pixels" if picture is None else "picture"
         for ball_setting in ("epsilon", "norm"):
+            # "box" is the norm of no ball
             if self.chosen[ball_setting] not in (None, "box"):
                 raise InputError(
                     f"{self.name}.{ball_setting}: is of the ball that searched pixels "
@@ -247,6 +248,7 @@ class PatchControl(PictureControl):
             high = pixels.spec.high
             # (side, side, 3), as fractions of the range
             underneath = (self._painter.sample_underneath() - low) / (high - low)
+            # the pixels' coordinates come first
             start = underneath.clamp(0.0, 1.0)
             self.start[: pixels.n_coordinates] = start.reshape(-1)
             if not torch.allclose(start, underneath, atol=1e-5):
@@ -426,6 +428,7 @@ class PatchPainter:
         self._positions = charts.compute_positions()[is_used].astype(np.float64)
         self._normals = charts.compute_normals()[is_used].astype(np.float64)
         self._areas = charts.compute_areas()[is_used].astype(np.float64)
+        # many images in a row have the patch in the same position
         self._find_texels = lru_cache(maxsize=4)(self._find_nearby_texels)
 
     def paint(
@@ -459,6 +462,7 @@ class PatchPainter:
         base_colors = base.reshape(-1, 3)
         colors_below = base_colors.index_select(0, indices)
         blended = colors_below + opacity * (patch_colors - colors_below)
+        # the base color with the blended texels in place of those below
         return base_colors.index_copy(0, indices, blended).reshape(base.shape)
 
     def sample_underneath(self) -> Tensor:
@@ -501,7 +505,7 @@ class PatchPainter:
         """
         center, radius, half_height = self._center_and_sizes
         outwards = _outward_direction(azimuth, height, radius, half_height)
-        # far outside of the object
+        # certainly outside of the object
         ray_origin = center + 4.0 * (radius + half_height) * outwards
         face, point = self._surface.find_hit(ray_origin, -outwards)
         # A face may be seen from its back: then all normals are flipped.
@@ -665,6 +669,7 @@ def unroll_surface(
     phi = np.arctan2(sine, np.maximum(cosine, 0.1))
     stretch = np.where(sine > 1e-4, phi / np.maximum(np.sin(phi), 1e-9), 1.0)
     along_turn = (in_plane * turn_direction).sum(axis=1)
+    # what the stretch adds to the component along the turn
     added = ((stretch - 1.0) * along_turn)[:, None] * turn_direction
     return in_plane + added, cosine
 

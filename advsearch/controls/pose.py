@@ -92,7 +92,8 @@ class PoseControl(Control):
         else:
             lowest = floor - center[2]
         shift = torch.stack([values["x"], values["y"], floor + values["z"] - lowest])
-        # turned about its center, the mesh stays above where that was
+        # Turned about its center, the mesh stays above where that was; the height of
+        # the center is in `shift`.
         level_center = torch.cat([center[:2], center.new_zeros(1)])
         translation = shift - linear @ center + level_center
         return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base}

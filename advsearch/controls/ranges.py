@@ -392,6 +392,7 @@ def _check_value(label: str, parameter: Parameter, value: object) -> ParameterVa
         if value not in parameter.options:
             raise UnknownNameError(label, value, parameter.options)
         return value
+    # a name without a list of options, such as a file
     if parameter.unit == "name" and isinstance(value, str) and value.strip():
         return value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -542,7 +543,7 @@ def parse_distribution(
 
     Args:
         label: how messages name the parameter.
-        parameter: whose bounds cut the distribution off.
+        parameter: parameter whose bounds cut the distribution off.
         setting: the setting.
 
     Raises:
@@ -576,6 +577,7 @@ def parse_distribution(
             "choose a narrower one, or cut it "
             "yourself (truncnorm)"
         )
+    # an infinite tail is cut off
     lower_probability = max(lower_probability, 0.0 if has_end[0] else TAIL_PROBABILITY)
     upper_probability = min(
         upper_probability, 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
@@ -611,6 +613,7 @@ def _freeze_distribution(
         if not all(map(Parameter.is_number, arguments.values())):
             raise TypeError("expected numbers")
         frozen = family(**arguments)
+        # with arguments out of range, scipy's median is NaN
         is_valid = np.isfinite(frozen.ppf(0.5))
     except TypeError:
         is_valid = False

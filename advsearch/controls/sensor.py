@@ -149,9 +149,10 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     ).to(image.device)
     light = apply_aberration(light, values["aberration"])
     variance = values["shot"] ** 2 * light + values["read"] ** 2
-    # the square root, but with a finite derivative at 0
+    # The square root, shifted so that its derivative at 0 is finite; it is 0 there.
     std = torch.sqrt(variance + _DARK**2) - _DARK
     light = light + std * images.draw_noise(height, width, seed, "sensor").to(light)
+    # `mosaic` from 0 to 1: how much of the effect is mixed in
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
     # white balance: red and blue in stops, green is the reference
     gains = torch.stack(
@@ -161,7 +162,8 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     compression = round(float(values["compression"].detach()))
     if not compression:
         return display
-    return images.compress_jpeg(display, 100 - compression).clamp(0.0, 1.0)
+    jpeg_quality = 100 - compression
+    return images.compress_jpeg(display, jpeg_quality).clamp(0.0, 1.0)
 
 
 def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:

@@ -255,10 +255,12 @@ class ShadowControl(Control):
             .numpy()
         )
         cone_angle = self._image_cone_angle(earlier_inputs)
+        # [1] is the lamp's distance
         max_distance = MAX_LAMP_FRACTION * find_strongest_light(self.scene)[1]
         for factor in np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES):
             distance = min(requested * factor, max_distance)
             card = geometry.compute_center(self.scene) + distance * outwards + offset
+            # a row times the rotation is its transpose, the inverse, times the column
             in_camera = (card - camera[:3, 3]) @ camera[:3, :3]
             if _is_outside_cone(in_camera, size, cone_angle):
                 return float(distance)
@@ -320,7 +322,8 @@ def find_strongest_light(scene: SceneDescription) -> tuple[assets.Float64Array, 
         max_irradiance = float(irradiance.max())
     for lamp in scene.lamps.values():
         to_lamp, lamp_irradiance = lamp.compute_lighting(geometry.compute_center(scene))
-        if float(lamp_irradiance.mean()) > max_irradiance and to_lamp[2] > 0.0:
+        is_above_center = to_lamp[2] > 0.0
+        if float(lamp_irradiance.mean()) > max_irradiance and is_above_center:
             strongest_distance = float(np.linalg.norm(to_lamp))
             strongest_direction = to_lamp / strongest_distance
             max_irradiance = float(lamp_irradiance.mean())

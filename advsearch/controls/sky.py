@@ -173,6 +173,8 @@ class Sky:
             load_tables(sun.device)[0], elevation, turbidity
         ).unbind(-1)
         level = self._interpolated(load_tables(sun.device)[1], elevation, turbidity)
+        # of the angle between a direction and the sun; `self.cosines` are of that
+        # between a direction and the zenith
         cosine = (self.directions @ sun)[..., None]
         angle = compute_angles(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
@@ -242,8 +244,9 @@ class Sky:
             sun
         ) * compute_sun_irradiance(elevation, turbidity)
         arriving = upper * self.solid_angles
-        on_ground = (arriving * self.cosines).sum((0, 1))
-        lower = (self.ground * on_ground / math.pi).expand(
+        ground_irradiance = (arriving * self.cosines).sum((0, 1))
+        # a diffuse ground, whose radiance is the same in all directions
+        lower = (self.ground * ground_irradiance / math.pi).expand(
             MAP_ROWS - MAP_ROWS // 2, MAP_COLUMNS, 3
         )
         facing = (self.directions @ sun).clamp_min(0.0)[..., None]

@@ -142,6 +142,7 @@ class Space:
         for index in self._evaluation_order:
             control = self.controls[index]
             new_inputs = control.inputs(slices[index], merged)
+            # tests check ours; a check of every image would take time
             if not is_ours(type(control)):
                 _check_inputs(control.name, new_inputs)
             for name in new_inputs:
@@ -168,10 +169,11 @@ class Space:
         """
         slices = u.detach().split(self.sizes)
         order = self._evaluation_order
-        refining = [
+        # a rank is a position in the order of evaluation
+        refining_ranks = [
             rank for rank, index in enumerate(order) if self.controls[index].refines
         ]
-        last_refining = max(refining, default=0)
+        last_refining = max(refining_ranks, default=0)
         earlier_inputs = NO_INPUTS
         inputs_before = dict[int, Mapping[str, Tensor]]()
         for rank, index in enumerate(order):
@@ -460,12 +462,13 @@ def _check_inputs(control: str, inputs: object) -> None:
                 f"`controls` {control}: {name}: expected a tensor of real "
                 f"numbers, got {got}"
             )
+        # inputs that are not known may have any shape and any values
         anything = (None, -math.inf, math.inf)
         shape, low, high = EXPECTED_INPUTS.get(name.rpartition(".")[2], anything)
         if shape is not None and not _has_shape(value, shape):
             sides = ", ".join("N" if side is None else str(side) for side in shape)
             if len(shape) == 1:
-                sides += ","
+                sides += ","  # as Python writes a tuple of one
             raise InputError(
                 f"`controls` {control}: {name}: expected shape "
                 f"({sides}), got {tuple(value.shape)}"

@@ -518,6 +518,7 @@ def compute_palette(image: Tensor, weight: Float32Array, count: int) -> Tensor:
             for channel in range(3)
         ]
         means = np.stack(sums, axis=1) / np.maximum(center_mass[:, None], 1e-12)
+        # a center without colors stays where it is
         centers = np.where(center_mass[:, None] > 0.0, means, centers)
     order = np.argsort(-center_mass, kind="stable")
     return torch.from_numpy(centers[order].clip(0.0, 1.0).astype(np.float32))

@@ -147,9 +147,11 @@ class ThingsControl(Control):
                 moved.add(thing)
         # The rest stay where they are, or another control moves them.
         self._moved_things = tuple(name for name in things if name in moved)
+        # with all parameters 0, things stand where the scene has them
         unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
         for name, stand in self._compute_stands(unmoved, {}).items():
-            if stand.push_distance:
+            is_pushed = bool(stand.push_distance)
+            if is_pushed:
                 raise InputError(
                     f"`controls` {self.name}: {name} stands in something "
                     "else; put it elsewhere"
@@ -202,9 +204,11 @@ class ThingsControl(Control):
             part = self.scene.meshes[name]
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
             foot = torch.from_numpy(_find_foot(part)).to(base)
+            # a heading, without pitch and roll
             turn = geometry.make_euler_rotation(
                 values[f"{name}.heading"], *base.new_zeros(2)
             )
+            # the index of the choice: 0 is present, 1 is absent
             is_absent = values[f"{name}.presence"]
             if is_absent:
                 turn = ABSENT_SCALE * turn
@@ -240,7 +244,7 @@ class ThingsControl(Control):
         """
         scene = self.scene
         obstacles = self._list_obstacles(earlier_inputs)
-        object_outline = obstacles[0].outline
+        object_outline = obstacles[0].outline  # the object is the first of them
         object_center = (object_outline.min(axis=0) + object_outline.max(axis=0)) / 2.0
         solids = [
             solid for part in scene.surrounding_meshes.values() for solid in part.solids
@@ -391,9 +395,11 @@ def _find_free_shift(
         for obstacle in obstacles
     ]
     shift = 0.0
+    # of the solids in which the thing stands without a shift
     solid_begins = [begin for begin, end in solid_intervals if begin < 0.0 < end]
     if solid_begins:
         shift = min(solid_begins) - gap
+    # in order of their begins, so that a shift past one is tested by all behind it
     for begin, end in sorted(obstacle_intervals + solid_intervals):
         if begin < shift < end:
             shift = end + gap

@@ -143,10 +143,11 @@ def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     views = [compare_view(index) for index in range(N_FIRST_VIEWS)]
     first = Deviation.from_views(views)
     margin_limit = CLEARLY_GOOD * first.allowed_margin_bias
-    is_good = (
+    is_clearly_good = (
         first.levels_fraction <= CLEARLY_GOOD and abs(first.logits) <= margin_limit
     )
-    if not is_good and first.levels_fraction < CLEARLY_BAD:
+    may_be_good = first.levels_fraction < CLEARLY_BAD
+    if not is_clearly_good and may_be_good:
         views += [compare_view(index) for index in range(N_FIRST_VIEWS, N_VIEWS)]
     return Deviation.from_views(views)
 
@@ -162,6 +163,9 @@ def compare_with_traced(
 ) -> ComparedView:
     """Compare a predicted image with traced images of the same configuration.
 
+    The reference is traced with many samples. The error that a prediction may have is
+    that of an image which is traced with the samples of the search.
+
     Args:
         renderer: traces images.
         predicted: (H, W, 3) image.
@@ -173,18 +177,21 @@ def compare_with_traced(
             under the same conditions; None if `u` is that.
     """
     with torch.no_grad():
-        rendered = renderer(u, seeds.stream(seed, "rendered"), spp)
+        # what the search would see without a predictor
+        search_image = renderer(u, seeds.stream(seed, "rendered"), spp)
+        # two images with independent noise, and the denoised image of both
         *halves, converged = renderer.render_halves(u, seed, CHECK_SPP)
         object_mask = renderer.mask(u)
     predicted_margin = measure_margin(predicted, u)
+    # how far the search has moved the margin, by which its bias is judged
     margin_change = 0.0
     if predicted_start is not None:
         margin_change = abs(predicted_margin - measure_margin(predicted_start, u))
     return ComparedView(
         squared_error=compute_squared_error(predicted, halves, object_mask),
-        allowed_squared_error=compute_squared_error(rendered, halves, object_mask),
+        allowed_squared_error=compute_squared_error(search_image, halves, object_mask),
         margin_bias=predicted_margin - measure_margin(converged, u),
-        n_traced=3,
+        n_traced=3,  # the image of the search, and the two halves
         margin_change=margin_change,
     )
 

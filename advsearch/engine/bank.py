@@ -256,6 +256,7 @@ class Bank(PredictedSearch):
         """
         # no growth in the second half
         index = min(index, self.steps // 2 - 1)
+        # evaluations so far at which the bank grew
         n_growing_steps = 0
         for begin in (0, *self.growth_steps):
             n_growing_steps += min(max(index - begin + 1, 0), COMPARISON_INTERVAL)
@@ -285,35 +286,43 @@ class Bank(PredictedSearch):
     def _fill(self, index: int, tick: ProgressCallback = lambda samples: None) -> None:
         """Make the matrices of all conditions that the bank has by an evaluation.
 
-        The light of all conditions up to the next comparison is requested at once, so
-        that workers collect it in parallel. The oldest matrices are dropped when they
-        take more than `MAX_BYTES`. `tick` is called with the samples of each condition.
+        Args:
+            index: index of the evaluation.
+            tick: called with the samples of each condition that is made.
         """
         size = self._bank_size(index)
-        first = self._conditions[-1].index + 1 if self._conditions else 0
-        if first >= size:
+        first_missing = self._conditions[-1].index + 1 if self._conditions else 0
+        if first_missing >= size:
             return
         with self.count_time():
-            if self._collected_until <= first:
-                next_comparison = (
-                    index // COMPARISON_INTERVAL + 1
-                ) * COMPARISON_INTERVAL
-                self._collected_until = self._bank_size(next_comparison - 1)
-                queries = [
-                    self._make_query(number)
-                    for number in range(first, self._collected_until)
-                ]
-                self._incoming = iter(self.trace(queries))
-            for number in range(first, size):
+            if self._collected_until <= first_missing:
+                self._request_light(first_missing, index)
+            for number in range(first_missing, size):
                 condition = self._make_condition(number, next(self._incoming).light)
                 self._conditions.append(condition)
                 self._bytes += condition.renderer.n_bytes
                 tick(SPP)
-                while len(self._conditions) > 1 and self._bytes > scale_limit(
-                    MAX_BYTES
-                ):
-                    self._bytes -= self._conditions.pop(0).renderer.n_bytes
-                    self._n_dropped += 1
+                self._drop_oldest()
+
+    def _request_light(self, first_missing: int, index: int) -> None:
+        """Request the light of all conditions up to the comparison after an evaluation.
+
+        They are requested at once, so that workers collect them in parallel. Later ones
+        depend on how the comparison ends.
+        """
+        next_comparison = (index // COMPARISON_INTERVAL + 1) * COMPARISON_INTERVAL
+        self._collected_until = self._bank_size(next_comparison - 1)
+        queries = [
+            self._make_query(number)
+            for number in range(first_missing, self._collected_until)
+        ]
+        self._incoming = iter(self.trace(queries))
+
+    def _drop_oldest(self) -> None:
+        """Drop the oldest matrices, but the last, while all take too much memory."""
+        while len(self._conditions) > 1 and self._bytes > scale_limit(MAX_BYTES):
+            self._bytes -= self._conditions.pop(0).renderer.n_bytes
+            self._n_dropped += 1
 
     def _make_condition(self, number: int, light: LinearizedScene | None) -> Condition:
         """Return the condition with an index, with the matrix of its light."""
@@ -323,7 +332,8 @@ class Bank(PredictedSearch):
         self.n_traced += 1
         with torch.no_grad():
             searched_inputs = self.problem.searched_space.inputs(query.u[:dim])
-        # whether the searched controls alone set all inputs of the matrix
+        # Whether the searched controls alone set all inputs of the matrix: then they
+        # have the same values without the condition's controls.
         depends_on_searched_only = True
         for name, value in renderer.linearized_at.items():
             if name not in searched_inputs or not torch.equal(
@@ -352,7 +362,10 @@ class Bank(PredictedSearch):
                 torch.cat([u, condition.u]) for condition in conditions
             ]
             evaluated, _ = problem.evaluate_batch(
-                partial(self._predict_images, conditions), full_configurations, u, False
+                partial(self._predict_images, conditions),
+                full_configurations,
+                u,
+                gradient=False,
             )
             bank_objectives = [evaluation.objective for evaluation, _ in evaluated]
             gap, standard_error = _compare_means(bank_objectives, unseen_objectives)
@@ -360,6 +373,7 @@ class Bank(PredictedSearch):
             self.n_traced += N_COMPARED
 
         def compare_view(number: int) -> ComparedView:
+            # there may be more views than conditions, which are then used again
             position = number % len(conditions)
             return problem.compare_view(
                 conditions[position].renderer,
@@ -369,7 +383,9 @@ class Bank(PredictedSearch):
             )
 
         is_accurate = self.compare(compare_view).is_accepted
-        if not is_accurate or gap > MIN_STANDARD_ERRORS * standard_error:
+        # the search has adapted to the conditions of the bank
+        is_overfitted = gap > MIN_STANDARD_ERRORS * standard_error
+        if not is_accurate or is_overfitted:
             self._grown_at[index] = u.detach().clone()
             self.growth_steps.append(index)
 

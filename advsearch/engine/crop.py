@@ -103,9 +103,12 @@ class CroppedSearch(PredictedSearch):
         return self.problem.evaluate_full(query, query.u, query.seed, renderer)[0]
 
     def _update(self, query: Query) -> Renderer | None:
-        """Return the renderer of a query; None where whole images are rendered.
+        """Return the renderer of the window for a query; None to render a full image.
 
-        Where that is due, a whole image is rendered, measured and used.
+        Every `COMPARISON_INTERVAL` queries of a search a full image is rendered, and
+        the surroundings of the window in it are compared with those in use. They are
+        renewed by it; after two comparisons in a row that differ too much, the rest of
+        the search renders full images.
         """
         kind = query.kind
         number = query.index
@@ -116,7 +119,9 @@ class CroppedSearch(PredictedSearch):
             self.prepare()
         assert self.windowing is not None
         image, renderer = self._current.setdefault(kind, self._current["start"])
-        if number == 0 or number % COMPARISON_INTERVAL or not kind.startswith("search"):
+        is_due = number > 0 and number % COMPARISON_INTERVAL == 0
+        # a baseline draws configurations by chance: there is nothing to keep up with
+        if not is_due or not kind.startswith("search"):
             return renderer
         was_accepted = self.deviations[-1].is_accepted
         with self.count_time():
@@ -124,7 +129,7 @@ class CroppedSearch(PredictedSearch):
                 self.windowing.window, image, query.u
             )
             self.deviations.append(deviation)
-            if self.deviations[-1].is_accepted or was_accepted:
+            if deviation.is_accepted or was_accepted:
                 self.n_renewals = (self.n_renewals or 0) + 1
                 return self._use(self.windowing, kind, number, current)
         self.trace_from(kind, number, f" of the {kind}")

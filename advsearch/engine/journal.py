@@ -96,16 +96,21 @@ class ParallelEvaluator:
         return {} if self.worker_stats is None else self.worker_stats.progress_counts
 
     def __call__(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """Evaluate queries, and yield the evaluations in the order of the queries."""
+        """Evaluate queries, and yield the evaluations in the order of the queries.
+
+        Workers return results as they are done; a result waits here until those of all
+        earlier queries have been yielded.
+        """
+        # a single query is evaluated here: sending it away would save no time
         if self.executor is None or len(queries) < 2:
             yield from map(self.problem.evaluate, queries)
             return
         items: list[WorkItem] = [
             (self.key, self.problem.preparation, query) for query in queries
         ]
-        # by identity: workers return the same objects
+        # A result has the item that was sent, the same object.
         index_of_item = {id(item): index for index, item in enumerate(items)}
-        # evaluations that came before those of earlier queries
+        # evaluations by index that came before those of earlier queries
         waiting = dict[int, Evaluation]()
         next_index = 0
         results: Any = self.executor.compute([item] for item in items)
@@ -119,6 +124,7 @@ class ParallelEvaluator:
                 waiting[index] = replace(evaluation, machine=result.machine)
                 while next_index in waiting:
                     evaluation = waiting.pop(next_index)
+                    # evaluations in this process count them as they render
                     self.problem.renderer.non_finite += evaluation.non_finite
                     yield evaluation
                     next_index += 1
@@ -147,6 +153,13 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
 def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
     """Return the evaluation of a query whose workers all died.
 
+    It counts as evaluated, without a result: objective and margin are NaN, the gradient
+    is zero.
+
+    Args:
+        query: query that was lost.
+        reason: why, as a clause.
+
     Raises:
         ClusterError: the query is for an image or for light, which nothing replaces.
     """
@@ -158,6 +171,7 @@ def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
             f"{product}: {reason}; `advsearch resume RUN workers=null` makes it here"
         )
     gradient = torch.zeros_like(query.u) if query.gradient else None
+    # only an evaluation of a search, which has a phase, is paid from its budget
     cost = 0 if query.phase is None else query.samples
     judgement = Judgement(
         math.nan,
@@ -182,7 +196,11 @@ def check_digests(
     """Store the digests of networks and functions, or check those of a resumed run.
 
     A model behind an address has none: its answers are stored in the run instead.
-    Functions are by name; None stands for one that was not given.
+
+    Args:
+        run: run that is new or resumed.
+        models: models of the run; of an ensemble each network counts.
+        functions: user functions by name; None for one that was not given.
 
     Raises:
         InputError: a network or a function is not the one that the run began with.
@@ -216,6 +234,7 @@ def compute_weights_digest(model: Model) -> str | None:
             name: tensor for name, tensor in state.items() if isinstance(tensor, Tensor)
         }
         digest = hashlib.sha256()
+        # by name, since a network may list them in any order
         for name, tensor in sorted(tensors.items()):
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
             flat = tensor.detach().cpu().contiguous().flatten()
@@ -233,15 +252,17 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
     """
     while isinstance(function, partial):
         function = function.func
+    # without decorators, and a method without its object
     unwrapped: Any = inspect.unwrap(function)
     unwrapped = getattr(unwrapped, "__func__", unwrapped)
     arrays: list[Any] = []
-    # an object that is called as a function
-    if not hasattr(unwrapped, "__code__"):
+    is_callable_object = not hasattr(unwrapped, "__code__")
+    if is_callable_object:
         attributes = sorted(getattr(unwrapped, "__dict__", {}).items())
         simplified = [(name, _simplify(value)) for name, value in attributes]
         arrays = [pair for pair in simplified if isinstance(pair[1], bytes)]
         cls = type(unwrapped)
+        # a module of PyTorch computes in `forward`
         unwrapped = getattr(cls, "forward", None) or cls.__call__
     code = getattr(unwrapped, "__code__", None)
     if code is None:
@@ -284,6 +305,7 @@ def _simplify(value: Any) -> Any:
             return None
     if isinstance(value, (tuple, list)):
         return [_simplify(item) for item in value]
+    # sorted, since the order differs from process to process
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
     if isinstance(value, (np.ndarray, Tensor)):
@@ -360,25 +382,26 @@ class Journal:
             if evaluation is None
         ]
         evaluate = self.evaluator if evaluate is None else evaluate
-        # lazy: each is computed when it is asked for below
+        # a generator: each evaluation is computed by its `next` below
         new_evaluations = iter(evaluate(new_queries))
         for query, evaluation in zip(queries, stored, strict=True):
             started = time.perf_counter()
+            belongs_to_search = query.phase is not None  # and is no trial
             if evaluation is None:
                 evaluation = next(new_evaluations)
                 seconds = None
-                if query.phase is not None:
+                if belongs_to_search:
                     seconds = time.perf_counter() - started
                 self.store([(query, replace(evaluation, seconds=seconds))])
-            elif query.phase is not None:
+            elif belongs_to_search:
                 on_replay(query)
             yield evaluation
 
     def _trials_of(self, kind: str) -> dict[int, Evaluation]:
-        """Return the trials of a kind by their numbers; the stored ones are read at
-        first use.
+        """Return the trials of a kind by their numbers.
 
-        Trials that were lost are counted then.
+        Those of the store are read at the first call for the kind, which also counts
+        those that were lost with their workers.
         """
         if kind in self._trials:
             return self._trials[kind]
@@ -419,7 +442,8 @@ class Journal:
         if stored is None:
             return None
         row, cached = stored
-        if cached.u != compute_digest(query.u) or row.seed != query.seed:
+        is_same_query = cached.u == compute_digest(query.u) and row.seed == query.seed
+        if not is_same_query:
             raise InputError(
                 f"{self.run.path}: cannot resume: evaluation {query.index} of the "
                 f"{query.kind} is not the one that "
@@ -434,6 +458,7 @@ class Journal:
             gradient = torch.from_numpy(cached.gradient.copy())
         image = None
         if cached.picture is not None:
+            # stored with 8 bits
             image = torch.from_numpy(cached.picture.copy()).float() / 255.0
         return Evaluation(
             objective=math.nan if row.objective is None else row.objective,
@@ -471,6 +496,7 @@ class Journal:
             if query.phase is None:
                 row = self._row_of_trial(query, evaluation)
                 if not id_is_number:
+                    # so that later calls find it; its image is stored elsewhere
                     trials = self._trials_of(query.kind)
                     trials[query.index] = replace(evaluation, picture=None)
             elif query.index < self._counts.get(query.kind, 0):
@@ -478,8 +504,11 @@ class Journal:
                 continue
             else:
                 row, cached = self._row_of_search(query, evaluation)
-            rows.append(replace(row, id=query.index + 1) if id_is_number else row)
+            if id_is_number:
+                row = replace(row, id=query.index + 1)  # ids begin at 1
+            rows.append(row)
         if self.run is None:
+            # without a run, rows stay in memory, and get what the store would add
             for row in rows:
                 row_id = row.id or len(self.rows) + 1
                 self.rows.append(replace(row, id=row_id, time=time.time()))
@@ -513,7 +542,8 @@ class Journal:
         row = make_trial_row(
             query.kind,
             query.index,
-            # A predicted image has no noise of its own.
+            # A predicted image has no noise of its own, and in place of the samples
+            # per pixel the count by which it was predicted.
             None if evaluation.predicted else query.seed,
             evaluation.predicted or query.spp,
             evaluation.required_judgement,
@@ -538,6 +568,7 @@ class Journal:
             query.kind,
             query.index,
             query.seed,
+            # samples and renders of a predicted image are none
             None if is_predicted else problem.spp * query.samples,
             objective=evaluation.objective if is_finite else math.nan,
             success=evaluation.success and is_finite,
@@ -586,14 +617,17 @@ class Journal:
             stored = self.run.store.rows(kind)
         phases = [(row.phase, row.seconds or 0.0) for row in stored]
         search_seconds = [spent for phase, spent in phases if phase == "search"]
+        # rows of another phase are those of the ranking
         has_ranking = len(phases) > len(search_seconds)
         seconds_left = seconds - math.fsum(search_seconds)
         started = time.perf_counter()
 
         def is_out_of_time(n_evaluations: int) -> bool:
             nonlocal started
-            if n_evaluations < len(search_seconds):
-                started = time.perf_counter()  # reading takes none of the time
+            is_from_store = n_evaluations < len(search_seconds)
+            if is_from_store:
+                # the clock starts after the last one, so reading takes none of the time
+                started = time.perf_counter()
                 return False
             return has_ranking or time.perf_counter() - started >= seconds_left
 

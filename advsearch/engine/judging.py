@@ -67,6 +67,9 @@ def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
 
     A function that cannot be imported so has its bare name.
 
+    Args:
+        metrics: functions of (image, output, truth) by name, or such texts.
+
     Raises:
         InputError: no mapping of functions, a function with other parameters, or a name
             that a column of rows has already.
@@ -80,7 +83,8 @@ def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
         )
     settings = {}
     for name, function in metrics.items():
-        if name in (*LEADING_COLUMNS, *TRAILING_COLUMNS) or not name:
+        is_column = name in (*LEADING_COLUMNS, *TRAILING_COLUMNS)
+        if is_column or not name:
             raise InputError(
                 f"metrics: {name!r} is a column that rows have already; "
                 "choose another name"
@@ -106,6 +110,7 @@ def _import_name(function: Metric) -> str:
     """
     module_name = str(getattr(function, "__module__", None))
     qualified_name = str(getattr(function, "__qualname__", None))
+    # what an import by this name would give
     imported: Any = sys.modules.get(module_name)
     for attribute in qualified_name.split("."):
         imported = getattr(imported, attribute, None)
@@ -203,18 +208,19 @@ def judge_images(
     """
     with torch.no_grad():
         if len(truths) == 1:
-            judged = task.judge(output, truths[0])
+            judgements = task.judge(output, truths[0])
             truths = [truths[0]] * len(images)
         else:
-            judged = [
+            # A task judges a batch by one truth: here each image is its own batch.
+            judgements = [
                 task.judge(output[index : index + 1], truth)[0]
                 for index, truth in enumerate(truths)
             ]
     if not metrics:
-        return judged
+        return judgements
     return [
         add_metrics(
-            judged[index], metrics, images[index], output[index : index + 1], truth
+            judgements[index], metrics, images[index], output[index : index + 1], truth
         )
         for index, truth in enumerate(truths)
     ]
@@ -255,6 +261,7 @@ def add_metrics(
     Raises:
         InputError: a metric returns no number and no mapping of numbers.
     """
+    # what the metrics returned, with an entry for each item of a mapping
     returned = dict[str, Any]()
     values = dict[str, float | None]()
     image_output, image_truth = _unbatch(output, truth)
@@ -273,6 +280,7 @@ def add_metrics(
                     f"metrics: {name}: expected a number, or a dict from names to "
                     f"numbers, got {result!r:.80}"
                 ) from None
+            # neither JSON nor a column of rows has NaN or infinity
             values[name] = value if math.isfinite(value) else None
     return replace(judgement, metrics=values)
 
@@ -290,7 +298,7 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
         ]
         outputs, truths = zip(*pairs, strict=True) if pairs else ((), ())
         return outputs, truths
-    labels = truth_to_labels(truth, output, 1)
+    labels = truth_to_labels(truth, output, 1)  # for a batch of one
     first_label = labels[0] if isinstance(labels, Tensor) else labels
     return first_output, first_label
 
@@ -338,7 +346,7 @@ def calibrate_task(
 
     Args:
         task: task of the model.
-        model: whose predictions are read.
+        model: model that predicts.
         scenes: scenes in order.
         label: what is right; None for the label of each object.
         judge: the thing that is judged.
@@ -356,6 +364,7 @@ def calibrate_task(
             model,
             task=task,
             label=label,
+            # one thing is enough to see how predictions are to be read
             judge=OBJECT if judge == ALL_THINGS else judge,
             spp=CALIBRATION_SPP,
             **image_settings,
@@ -387,6 +396,7 @@ def check_truth(
         for facts_of_thing in facts.each.values() or (facts,):
             task.check(facts_of_thing)
     except InputError as error:
+        # a stated label is wrong, and the task's own message says how
         if facts.label is not None:
             raise
         rendering = render(
@@ -400,15 +410,16 @@ def check_truth(
             for prediction in predictions
         )
         first = predictions[0]
-        term = f"#{first.index}"
-        # The label instead, if it names this class and no other.
+        suggested_label = f"#{first.index}"
+        # The name instead, if it names this class and no other; `label_set` raises for
+        # a name that no class has.
         with suppress(InputError):
             if model.label_set(first.label).indices == (first.index,):
-                term = first.label
+                suggested_label = first.label
         raise InputError(
             f"{error}; model {model.name} calls a clean picture of it "
             f"{prediction_texts}; name what is right, such as "
-            f'`label="{term}"`'
+            f'`label="{suggested_label}"`'
         ) from None
 
 
@@ -549,6 +560,7 @@ class ConfigurationInputs:
         Raises:
             InputError: "texture", and not exactly one control has searched colors.
         """
+        # the caller then needs the derivative by u that does not go through the image
         self.used = True
         if name == "inputs":
             inputs = [self._space.inputs(u) for u in self._configurations]
@@ -557,6 +569,7 @@ class ConfigurationInputs:
             values = [self._space.get_numeric_values(u) for u in self._configurations]
             return StackedTensors("number of the configuration", values)
         n_configurations = len(self._configurations)
+        # The searched coordinates come first, and are the same in all configurations.
         searched_u = self._configurations[0][: len(self._searched.start)]
         if name == "u":
             return searched_u.expand(n_configurations, *searched_u.shape)
@@ -610,14 +623,15 @@ def mean_variation(colors: Tensor) -> Tensor:
     right = colors.diff(dim=1)
     down = colors.diff(dim=0)
     if is_masked:
+        # the step's first pixel is masked at the end, its second one here
         right = right * mask[:, 1:]
         down = down * mask[1:]
     # zero for the last column and the last row, which have no neighbor
     squared_right = F.pad(right.square(), (0, 0, 0, 1))
     squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
     squared = squared_right + squared_down
-    # clamped, since the square root has no derivative at 0
-    # minus the smallest length, so that an even color has none
+    # Clamped, since the square root has no derivative at 0; then minus the smallest
+    # length, so that the result is 0 for an even color.
     length = squared.clamp(min=MIN_COLOR_STEP**2).sqrt() - MIN_COLOR_STEP
     if is_masked:
         length = length[mask[..., 0] > 0.0]
@@ -632,8 +646,11 @@ def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
             over 0 count.
         palette: (P, 3) sRGB of printable colors; None for the grid of 125 colors.
     """
-    if colors.shape[-1] != 3:
+    is_masked = colors.shape[-1] != 3
+    if is_masked:
+        # (N, 1, 3): an image of one column
         colors = colors[colors[..., 3] > 0][:, None, :3]
+    # which color is nearest has no derivative
     fixed_colors = colors.detach()
     if palette is None:
         # of the grid: rounded to its steps
@@ -745,13 +762,14 @@ def make_objective(
             get_objective(part.objective if uses_task_objectives else requested, part)
             for part in task.tasks
         ]
+        # A mean needs equal units, which the tasks' own objectives do not have.
         default_ensemble: EnsembleReduction = (
             "worst" if uses_task_objectives else "mean"
         )
         return reduce_objectives(objectives, ensemble or default_ensemble), ""
     if not needs_features:
         return get_objective(requested, task), ""
-    # Without logits, the output of the model itself is compared.
+    # A task that reads no logits compares the output of the model itself.
     features = features_of(model) if task.reads_logits else None
     with torch.no_grad():
         clean_image = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)

@@ -222,6 +222,7 @@ class Scene:
         if description.camera_model is not None:
             description.camera_model.check_no_fov(overrides)
         values = {**description.values, **{name: resolved[name] for name in overrides}}
+        # the height of the camera would set another elevation
         if "camera.elevation" in overrides:
             values["camera.height"] = None
         changed = with_requested_ground(
@@ -310,11 +311,13 @@ def load_scene(
             f"object: expected the name of a node or shape of the scene, got {object!r}"
         )
     mitsuba_dict = scene if isinstance(scene, Mapping) else None
+    # a node of a scene file is named as "scene.glb#chair"
     object_spec = object
     if scene is not None and mitsuba_dict is None:
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
     has_environment = environment is not None
+    # of a folder, each photograph has its own light, which is read with it below
     if environment is None and not is_photograph_folder(backdrop):
         environment = find_photographed_light(backdrop)
     description = load_description(
@@ -338,6 +341,7 @@ def load_scene(
         description = description.with_backdrop(backdrop, occluder)
     elif backdrop is None:
         _check_no_photograph(fixed_values or {}, occluder)
+    # assets have no name by which another session could load them
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
         for asset in (object, environment, backdrop)
@@ -364,7 +368,8 @@ def _put_into_photographs(
         has_environment: whether the user chose the light. If not, a photograph of a
             folder is lit by the map beside it.
     """
-    if not is_photograph_folder(spec):
+    is_single_photograph = not is_photograph_folder(spec)
+    if is_single_photograph:
         return put_into_photograph(
             description, read_photograph_view(spec), camera, occluder
         )
@@ -383,6 +388,7 @@ def _put_into_photographs(
                 lit_scene = Scene(description).with_environment(environment).description
             scenes[name] = put_into_photograph(lit_scene, view, camera)
     folder = PhotographFolder(str(spec), camera, scenes)
+    # the first photograph, until a control chooses another one
     return replace(next(iter(scenes.values())), photographs=folder)
 
 
@@ -411,8 +417,8 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
     array = np.asarray(
         texture.detach().cpu() if isinstance(texture, Tensor) else texture
     )
-    scale = 255.0 if array.dtype == np.uint8 else 1.0
-    texels: Float32Array = array.astype(np.float32) / scale
+    max_level = 255.0 if array.dtype == np.uint8 else 1.0
+    texels: Float32Array = array.astype(np.float32) / max_level
     if texels.ndim != 3 or texels.shape[2] != 3 or not texels.size:
         raise InputError(
             "texture: expected a picture (h, w, 3), got an array of shape "
@@ -493,8 +499,10 @@ def fit_camera(
         size = (height, width)
         folder = description.photographs
         if folder is not None:
-            fitted = {name: fit_camera(s, size) for name, s in folder.scenes.items()}
-            folder = replace(folder, scenes=fitted)
+            fitted_scenes = {
+                name: fit_camera(scene, size) for name, scene in folder.scenes.items()
+            }
+            folder = replace(folder, scenes=fitted_scenes)
         return replace(
             fit_to_photograph(
                 description, description.backdrop_photograph, size, description.gain
@@ -508,10 +516,12 @@ def fit_camera(
             raise InputError(
                 "`set` camera.drops: of one camera, not of several; leave it out"
             )
-        # Drops need a camera whose rays are computed one by one.
+        # Drops need a camera model, whose rays are computed one by one. One without a
+        # name is such a pinhole, of an earlier picture size.
         if camera_model is None or not camera_model.name:
             camera_model = make_pinhole(description.get_number("camera.fov"), aspect)
     if camera_model is not None:
+        # bundled lenses depend on the aspect; any other model stays
         camera_model = make_bundled_models(aspect).get(camera_model.name, camera_model)
         scaling_remarks = camera_model.describe_scaling((height, width))
         remarks = tuple(dict.fromkeys((*remarks, *scaling_remarks)))
@@ -560,6 +570,7 @@ def make_renderer(
             that they show does.
     """
     size = _height_and_width(resolution)
+    # a control may have changed the scene, as one that chooses the photograph does
     description = space.scene or description
     if not description.is_lit:
         raise InputError(
@@ -578,6 +589,7 @@ def make_renderer(
     )
     has_exposure_time = any(space.exposure)
     _check_rig_times(description, space)
+    # knows how points move in the image: for derivatives at outlines, and for blur
     motion = None
     if differentiated or has_exposure_time:
         motion = Motion(description, size, scene.assembly)
@@ -603,7 +615,8 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
     Raises:
         InputError: nothing changes with time, or an image has motion blur.
     """
-    if not any(mount.delay for mount in description.rig):
+    takes_turns = any(mount.delay for mount in description.rig)
+    if not takes_turns:
         return
     prefix = (
         f"camera: the pictures of {description.rig_spec} are taken one after the other"
@@ -645,6 +658,8 @@ def choose_moments(
         assembly: turns the inputs of the space into those of the scene.
         height: height of the image in pixels.
     """
+    # seconds that a row is exposed, and seconds between the first row and the last
+    # (negative from the bottom up)
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)
     max_pixels_moved = _measure_max_motion(space, motion, assembly, duration)
@@ -729,6 +744,7 @@ def make_controls(controls: Controls) -> tuple[Control, ...]:
     # several names may state parameters of one control
     settings_by_control = merge_control_settings(named_settings)
     for name in instances:
+        # an instance has brought an empty mapping; anything in it came by a name
         if settings_by_control[name]:
             raise InputError(
                 f"controls: {name} is given twice, by an instance and by "

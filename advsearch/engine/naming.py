@@ -133,7 +133,11 @@ def load_models(
         warnings.simplefilter("always", ModelWarning)
         loaded = tuple(
             _load_for_task(
-                model, task_of_model, config, is_only_task=task_of_model is task
+                model,
+                task_of_model,
+                config,
+                # not one of several
+                is_only_task=task_of_model is task,
             )
             for model, task_of_model in zip(models, tasks, strict=True)
         )
@@ -161,9 +165,8 @@ def _load_for_task(
     single_image_task = task.single_image_task
     labels = None
     prompt = None
-    if is_only_task or (
-        single_image_task.labelled and not single_image_task.names_source
-    ):
+    needs_names = single_image_task.labelled and not single_image_task.names_source
+    if is_only_task or needs_names:
         labels = config.labels
         prompt = config.prompt
     if isinstance(model, str):
@@ -415,6 +418,7 @@ def select_run_settings(
     run_settings = {}
     for setting in RUN_SETTINGS:
         value = getattr(config, setting, None)
+        # a mapping has values for some controls by their names
         if isinstance(value, Mapping):
             is_named = instance_name in value
             value = {instance_name: value[instance_name]} if is_named else None
@@ -436,6 +440,7 @@ def check_run_settings(config: SceneConfig) -> None:
     for setting, value in collect_run_settings(config).items():
         random_controls: Mapping[str, Any] = {}
         if setting not in SETTINGS_OF_SEARCHES:
+            # only some commands have controls that vary by chance
             random_controls = getattr(config, "over", {})
         controls = merge_control_settings({**config.controls, **random_controls})
         # kind of each control that does not take the setting
@@ -510,14 +515,15 @@ def _list_active_choices(
     searched: it is set to a number, another choice fixes it, or it has no default range
     and none is set.
     """
+    # parameters by name
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
+    fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
     searched |= {name for name, value in settings.items() if value is not None}
-    fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
     searched -= fixed
     return [
         choice

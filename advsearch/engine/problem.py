@@ -289,15 +289,15 @@ class Problem:
             judged = self._judge_outputs(output, images, truths, full_configurations)
         judgements_without_objective = []
         for judgement in judged:
-            # without the objective, and with NaN for a margin that is not finite
-            plain = Judgement.of(
+            # `of` makes a margin NaN that is not finite
+            without_objective = Judgement.of(
                 judgement.score,
                 judgement.margin,
                 judgement.prediction,
                 judgement.payload,
             )
             judgements_without_objective.append(
-                replace(plain, metrics=judgement.metrics)
+                replace(without_objective, metrics=judgement.metrics)
             )
         return judgements_without_objective
 
@@ -351,6 +351,8 @@ class Problem:
             predicted = predict(full_u)
             # the start of the search, under the same conditions
             start = torch.cat([self.domain.start, full_u[dim:]])
+            # What the search has not moved is equal in both, so that only the search
+            # makes a difference.
             if is_random is not None:
                 start[:dim][is_random] = full_u[:dim][is_random]
             predicted_start = None if torch.equal(start, full_u) else predict(start)
@@ -480,7 +482,7 @@ class Problem:
         if not group.step_reason or group.size != 1:
             return None, ""
         u = self.add_conditions(self.domain.start).clone()
-        half_step = min(group.step, 0.5)
+        half_step = min(group.step, 0.5)  # within the range, from its middle
         u[group.coordinates] = 0.5 - half_step
         lower = self.space.describe(u).get(group.name)
         u[group.coordinates] = 0.5 + half_step
@@ -527,10 +529,15 @@ class Problem:
         non_finite_before = self.renderer.non_finite
         if query.product == "light":
             linear = self.make_linear_renderer(query.u, query.seed, query.spp)
-            evaluation = Evaluation(math.nan, None, False, light=linear.collected)
+            # neither light nor an image has an objective
+            evaluation = Evaluation(
+                math.nan, gradient=None, success=False, light=linear.collected
+            )
         elif query.product == "picture":
             image = self.picture(query.u, query.seed, query.spp)
-            evaluation = Evaluation(math.nan, None, False, picture=image)
+            evaluation = Evaluation(
+                math.nan, gradient=None, success=False, picture=image
+            )
         elif query.phase is None:
             evaluation = self._evaluate_trial(query)
         elif self.conditions is None:
@@ -608,6 +615,7 @@ class Problem:
         searched_groups = [
             group.name for group in self.plan.groups if group.control in searched_names
         ]
+        # the inputs of the scene through which each group acts
         routes = [
             self.renderer.routes.get(name, frozenset()) for name in searched_groups
         ]
@@ -644,8 +652,10 @@ class Problem:
         truth = self.find_truth(full_u)
         variable_u = full_u.detach().clone().requires_grad_(bool(query.gradient))
         inputs = self.make_objective_inputs(variable_u)
-        # image and output of each call of the loss; the first is that of u itself
+        # image and output of each call of the loss; the first is that of u itself, any
+        # others are of finite differences
         calls: list[tuple[Tensor, Output]] = []
+        # of the objective by u, past the image; zero where it reads the image only
         input_gradient = torch.zeros(())
 
         def loss(image: Tensor) -> Tensor:
@@ -656,7 +666,8 @@ class Problem:
             values = self._compute_objective(output, image[None], truth, inputs)
             objective = values[0]
             # The derivative by inputs is exact, whatever the plan does with the image.
-            if inputs.used and len(calls) == 1 and objective.requires_grad:
+            is_at_u = len(calls) == 1
+            if inputs.used and is_at_u and objective.requires_grad:
                 (gradient_or_none,) = torch.autograd.grad(
                     objective, variable_u, retain_graph=True, allow_unused=True
                 )
@@ -683,6 +694,7 @@ class Problem:
             gradient,
             judgement.success,
             renderer.non_finite - non_finite_before,
+            # a renderer that predicts counts no renders: an evaluation costs 1 at least
             cost=max(1, renderer.renders - renders_before) * query.samples,
             judgement=judgement,
             picture=round_to_8_bit(image) if query.with_image else None,
@@ -725,6 +737,7 @@ class Problem:
                 torch.cat([variable_u, full_u[len(variable_u) :]])
                 for full_u in full_configurations
             ]
+            # else one truth holds for all images
             if self.task.varies:
                 values = self._compute_objective_of_each(
                     outputs_of_images, images, truths, variable_configurations
@@ -736,6 +749,7 @@ class Problem:
                     truths[0],
                     self.make_objective_inputs(*variable_configurations),
                 )
+            # zero where the objective depends on nothing that is searched
             derivative = torch.zeros_like(u) if gradient else None
             if values.requires_grad:
                 weighted_sum = (values * compute_condition_weights(values)).sum()
@@ -816,6 +830,7 @@ class Problem:
             for every draw.
         """
         evaluations, outputs = zip(*evaluated, strict=True)
+        # of the searched coordinates only, which come first
         gradients = [
             evaluation.gradient[: u.numel()]
             for evaluation in evaluations
@@ -830,6 +845,7 @@ class Problem:
         ]
         judgement = self._average_judgements(judged, outputs)
         n_successes = sum(evaluation.success for evaluation in evaluations)
+        # the percentage of conditions under which a success must hold
         n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
         total_objective = sum(evaluation.objective for evaluation in evaluations)
         return Evaluation(
@@ -851,10 +867,12 @@ class Problem:
         the outputs.
         """
         if self.task.varies:
-            usual = most_frequent_judgement(judged)
+            most_frequent = most_frequent_judgement(judged)
             score = mean([judgement.score for judgement in judged])
             margin = mean([judgement.margin for judgement in judged])
-            return Judgement.of(score, margin, usual.prediction, usual.payload)
+            return Judgement.of(
+                score, margin, most_frequent.prediction, most_frequent.payload
+            )
         with torch.no_grad():
             output = self.task.average(list(outputs))
             return self.task.judge(output, self.find_truth())[0]

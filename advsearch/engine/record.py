@@ -206,8 +206,8 @@ def make_rate(
         successes: the judgements whose labels and outcomes are counted.
     """
     labels = Counter(trial.prediction.label for trial in successes)
-    # 0.0 - x, and not -x: the mean of zeros is shown as 0 and not as -0.
-    # a margin is the score with the opposite sign
+    # A margin is the score with the opposite sign. It is 0.0 - x and not -x, so that the
+    # mean of zeros is shown as 0 and not as -0.
     margin = 0.0 - mean_number(trial.score for trial in trials)
     return VerifiedRate(
         successes=counts.successes,

@@ -339,6 +339,7 @@ def render(
     description = scene.description
     unbound_task = make_task(task)
     model = load_model(model, task=unbound_task.single_image_task)
+    # a scene without a rig has one camera
     model = replace(model, cameras=max(1, len(description.rig)))
     check_judged_thing(description, judge)
     model_task = unbound_task.on(model)
@@ -364,10 +365,10 @@ def render(
     views = list[View]()
     truth_warnings = list[str]()
     remarks = tuple[str, ...]()
-    # a calibrated task goes on to the next view
     for view_description in _orbit_scene(description, around):
         rendered = _render_view(view_description, model, model_task, settings)
         views.append(rendered.view)
+        # what the task has learned of the model's predictions holds for the next view
         model_task = rendered.task
         remarks = remarks or model_task.remarks
         if rendered.truth_error:
@@ -578,12 +579,14 @@ def make_facts(
             sight = partial(
                 _look_at, cached_look, mesh, metres=description.object.size_in_metres
             )
+        # the object has the name that the caller states, any other thing its mesh's
         if mesh == OBJECT:
             own_label = description.object.label
             return Facts(name, thing_label, own_label, collect_numbers, sight)
         own_label = description.things[mesh].label
         return Facts(mesh, thing_label, own_label, collect_numbers, sight)
 
+    # `label` is that of the judged thing alone; all others have labels of their own
     labelled_mesh = OBJECT if judge == ALL_THINGS else judge
     single_facts = {
         mesh: make_thing_facts(mesh, label if mesh == labelled_mesh else None)
@@ -626,6 +629,7 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
         return None
     names = (OBJECT, *description.things)
     labels = {name: description.meshes[name].label for name in names}
+    # as for a thing that the image does not show, until it is found there
     things: JsonObject = {
         name: {
             "label": labels[name],

@@ -74,10 +74,9 @@ def find_surface_light_refusal(
     if problem.renderer.composition_reason:
         return Refusal(problem.renderer.composition_reason)
     names = [control.name for control in problem.space.controls]
-    if (
-        not surface_renderer.find_changed_inputs(problem.renderer, names)
-        & CAMERA_INPUTS
-    ):
+    changed_inputs = surface_renderer.find_changed_inputs(problem.renderer, names)
+    moves_camera = bool(changed_inputs & CAMERA_INPUTS)
+    if not moves_camera:
         return NO_CAMERA
     if steps * problem.n_draws < MIN_IMAGES:
         return Refusal(
@@ -87,7 +86,9 @@ def find_surface_light_refusal(
     if policy.takes_differences(problem.domain, steps):
         return Refusal(f"{policy.name} takes derivatives that need rendered pictures")
     for group in problem.plan.groups:
-        if group.is_forced and group.estimator not in ("none", "image"):
+        # a prediction has derivatives of its own: no estimator that a user chose
+        needs_estimator = group.estimator not in ("none", "image")
+        if group.is_forced and needs_estimator:
             return Refusal(f"the estimator of {group.name} is forced")
     return surface_renderer.find_refusal(problem.renderer, names)
 
@@ -142,6 +143,7 @@ class SurfaceLight(PredictedSearch):
                 0, self.moving_coordinates, True
             )
         self._has_moving = bool(self._moving.any())
+        # the searched coordinates come first, those of the conditions after them
         is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
         self._searches_colors = bool(is_coloring.any())
         self.draws_conditions = problem.conditions is not None and self._searches_colors
@@ -180,21 +182,21 @@ class SurfaceLight(PredictedSearch):
             return needs_new_light
         start = problem.add_conditions(problem.domain.start)
         for group in problem.space.groups:
-            if bool(needs_new_light[group.coordinates].all()):
+            changes_environment = bool(needs_new_light[group.coordinates].all())
+            if changes_environment:
                 lower = start.clone()
-                # two values within the range, off its ends
-                lower[group.coordinates] = 0.3
                 upper = start.clone()
+                # any two different values within the range, off its ends
+                lower[group.coordinates] = 0.3
                 upper[group.coordinates] = 0.8
-                darker = MapFingerprint.compute(
+                lower_map = MapFingerprint.compute(
                     self._compute_inputs(lower)[ENVIRONMENT_INPUT]
                 )
-                brighter = MapFingerprint.compute(
+                upper_map = MapFingerprint.compute(
                     self._compute_inputs(upper)[ENVIRONMENT_INPUT]
                 )
-                needs_new_light[group.coordinates] = (
-                    darker.find_factor(brighter) is None
-                )
+                is_multiple = lower_map.find_factor(upper_map) is not None
+                needs_new_light[group.coordinates] = not is_multiple
         return needs_new_light
 
     @property
@@ -239,6 +241,7 @@ class SurfaceLight(PredictedSearch):
             self._bank_conditions = [full_u[problem.domain.dim :]]
             if problem.conditions is not None:
                 seed = seeds.stream(problem.seed, "bank")
+                # where no condition needs a light of its own, one light serves all
                 n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
                 self._bank_conditions = [
                     sample_condition(problem.conditions, index, seed)
@@ -246,12 +249,12 @@ class SurfaceLight(PredictedSearch):
                 ]
             for condition in self._bank_conditions:
                 inputs = self._compute_inputs(torch.cat([u, condition]))
-                self._renderer.get_light(inputs)
+                self._renderer.get_light(inputs)  # computes it, and stores it
                 tick(N_LIGHTS // len(self._bank_conditions))
             self._n_lights = (
                 len(self._renderer.stored_lights) + self._renderer.n_dropped
             )
-        self._compare(u, 0)
+        self._compare(u, index=0)
 
     @property
     def renderer(self) -> SurfaceRenderer:
@@ -278,6 +281,7 @@ class SurfaceLight(PredictedSearch):
                 yield from trace(queries[position:])
                 return
             can_batch = self.problem.conditions is None and not self._searches_colors
+            # the last batch is used up
             if can_batch and position not in predicted_images:
                 batch = queries[position : position + self.renderer.batch_size]
                 images = self.renderer.predict_images([batched.u for batched in batch])
@@ -343,7 +347,7 @@ class SurfaceLight(PredictedSearch):
         ]
 
         def predict(batch: slice, u: Tensor) -> Tensor:
-            # under which the views of these conditions are stored
+            # the key under which the views of these conditions are stored
             key = (index, batch.start) if reuses_conditions else None
             return self._predict_images(full_configurations[batch], u, key)
 
@@ -435,7 +439,7 @@ class SurfaceLight(PredictedSearch):
         is_accurate = self._compare(query.u, query.index).is_accepted
         interval = COMPARISON_INTERVAL
         if is_accurate and not self._searches_colors:
-            # the next comparison is at twice the number
+            # doubles: the next comparison is at twice the index of this one
             interval = query.index
         self._next_comparison = query.index + interval
         if is_accurate:
@@ -458,7 +462,7 @@ class SurfaceLight(PredictedSearch):
         seed = seeds.stream(problem.seed, kind, index)
         with self.count_time():
             generator = torch.Generator().manual_seed(seed)
-            samples = problem.domain.sample(generator, N_VIEWS)
+            samples = problem.domain.sample(generator, N_VIEWS)  # (N_VIEWS, d)
             configurations = torch.where(self._moving, samples, u)
             configurations[0] = u
             conditions = self._choose_conditions(kind, index, N_VIEWS)
@@ -468,7 +472,8 @@ class SurfaceLight(PredictedSearch):
             ]
             is_random = self._moving
             if not self._searches_colors:
-                # then nothing of the margin's change is due to the search
+                # Only cameras and environments are searched, which are random here:
+                # nothing of the margin's change is due to the search.
                 is_random = torch.ones_like(self._moving)
 
         def compare_view(number: int) -> ComparedView:

@@ -88,11 +88,13 @@ def find_matrix_refusal(
         )
     condition_names = []
     if problem.conditions is not None:
+        # the controls that vary by chance come after the searched ones
         conditions = problem.space.controls[problem.n_searched :]
         condition_names = [control.name for control in conditions]
     refusal = find_refusal(problem.renderer, condition_names)
     if refusal is not None or problem.conditions is not None or steps is None:
         return refusal
+    # one image for each light is rendered before the first prediction
     min_steps = MIN_STEPS_PER_LIGHT * count_lights(problem.renderer)
     if steps < min_steps:
         return Refusal(
@@ -350,7 +352,14 @@ class Transport(PredictedSearch):
         number: int,
         tick: ProgressCallback = lambda samples: None,
     ) -> Predictor:
-        """Compute the matrix at u (d,)."""
+        """Compute the predictor at a configuration, in the window if there is one.
+
+        Args:
+            u: (d,) the configuration.
+            kind: kind of the search.
+            number: index of its query, for the seed.
+            tick: called with the samples that were traced.
+        """
         with self.count_time():
             seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
             renderer = self.problem.renderer
@@ -394,7 +403,9 @@ class Transport(PredictedSearch):
         if query.phase != "search" or number >= self.count_predicted(kind, self.steps):
             return None
         predictor = self._current.setdefault(kind, self.start)
-        if number == 0 or number % COMPARISON_INTERVAL or not kind.startswith("search"):
+        is_due = number > 0 and number % COMPARISON_INTERVAL == 0
+        # a baseline draws configurations by chance: there is nothing to keep up with
+        if not is_due or not kind.startswith("search"):
             return predictor
         seed = seeds.stream(self.problem.seed, "transport check", number)
         renderer = self.problem.renderer
@@ -412,8 +423,10 @@ class Transport(PredictedSearch):
         has_same_surroundings, current = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
-        # Basis images of lights do not depend on u: nothing can be linearised again.
-        if self.start.n_entries == 0:
+        # Basis images of lights (no matrix, hence no entries) do not depend on u:
+        # nothing can be linearised again.
+        has_basis_images = self.start.n_entries == 0
+        if has_basis_images:
             self.trace_from(kind, number, f" of the {kind}")
             return None
         self._current[kind] = self._make_predictor(query.u, kind, number)

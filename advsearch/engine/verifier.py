@@ -147,7 +147,7 @@ class Verifier:
     def choose_spp(
         self, candidates: dict[str, Tensor], search_samples: int | None = None
     ) -> None:
-        """Choose the sample count of the verification, and store it in the findings.
+        """Choose the sample count of the verification, and store it in the state.
 
         Samples are raised until more would not change the verdict: under the conditions
         of the scene or, where conditions vary, until they would not change the fraction
@@ -163,6 +163,7 @@ class Verifier:
         ladder = self.ladder
         has_choice = len(ladder) > 1
         n_trials = self.looks[0]
+        # `max_samples` are those of every trial at every sample count, for the progress
         if varies:
             choose: Callable[..., SampleCount] = choose_rate_spp
             if has_choice:
@@ -245,7 +246,8 @@ class Verifier:
     ) -> Verification:
         """Verify the configuration that a search found against the control group.
 
-        If the control group has too few trials it gets more, which are kept.
+        The control group, the clean arm, is the scene without the change that was
+        found. If it has too few trials it gets more, which later calls use as well.
 
         Args:
             kind: kind of the rows.
@@ -268,6 +270,7 @@ class Verifier:
             control_kind=self._clean_kind,
             n_images=MAX_STORED_IMAGES,
             curtailed=curtailed,
+            # numbered after all others, so that their seeds are new too
             first_index=self.n_trials if with_new_trials else 0,
         )
         if not with_new_trials:
@@ -294,6 +297,7 @@ class Verifier:
         queries = list[Query]()
         for number, u in configurations.items():
             seed = seeds.stream(problem.seed, kind, number)
+            # those of a texture would fill the store
             values: dict[str, Any] = {}
             if problem.domain.dim <= MAX_DESCRIBED_COORDINATES:
                 values = problem.describe(u, seed)
@@ -426,8 +430,13 @@ class Retrials:
     ) -> None:
         """Make a journal for each condition; all of them share one store.
 
-        `trials` are the trials of a configuration under a condition; `executor`
-        evaluates them on workers, if there are any.
+        Args:
+            conditions: conditions under which configurations are tried again.
+            run: run whose store has the rows.
+            progress: progress that is told of each trial.
+            trials: number of trials of a configuration under a condition.
+            seed: root of the trials' seeds.
+            executor: evaluates trials on workers, if there are any.
         """
         self._progress = progress
         self._n_trials = trials
@@ -443,8 +452,8 @@ class Retrials:
             for condition in conditions
         }
         self._clean: dict[str, tuple[Judgement, ...]] = {}
-        # shared images and radiances of `_shared_kind`, by source or light, seed and
-        # spp
+        # Images and radiances that several conditions need, of one kind of rows: by
+        # what sets them (`image_key`, `radiance_key`), seed and spp.
         self._images: dict[tuple[Hashable, int, int], Tensor] = {}
         self._radiances: dict[tuple[Hashable, int, int], Tensor] = {}
         self._shared_kind = ""
@@ -520,6 +529,7 @@ class Retrials:
             if key not in self._images
         ]
         evaluator = self._journals[condition.name].evaluator
+        # a single image is rendered here, where its radiance can be shared
         has_workers = evaluator.executor is not None and len(missing) > 1
         # in the order of `missing`; empty without workers
         from_workers = iter(evaluator(missing) if has_workers else ())
@@ -547,7 +557,8 @@ class Retrials:
         formation of the image from it differs.
         """
         problem = condition.problem
-        if self._n_conditions_of_light[condition.radiance_key] < 2:
+        is_light_shared = self._n_conditions_of_light[condition.radiance_key] >= 2
+        if not is_light_shared:
             return problem.picture(u, seed, condition.spp)
         renderer = problem.renderer
         full_u = problem.add_conditions(u, seed)

@@ -81,7 +81,12 @@ class Windowing:
 def find_window(problem: Problem) -> Windowing | Refusal:
     """Return the smallest window outside of which a search changes little.
 
-    It takes three whole images of few samples. Without one, why there is none.
+    The box around what is searched is grown by each of `MARGINS` in turn. Outside of
+    the window, the images of the smallest and of the largest values of all coordinates
+    must look like that of the start. This takes three full images of few samples.
+
+    Returns:
+        The window with the image of the start, or why there is none.
     """
     refusal = find_crop_refusal(problem)
     if refusal is not None:
@@ -96,12 +101,12 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         return Refusal("what is searched fills much of the picture")
     lower = domain.project(torch.zeros_like(domain.start))
     upper = domain.project(torch.ones_like(domain.start))
-    start, *ends = [render_full(problem, u) for u in (domain.start, lower, upper)]
+    start, *extremes = [render_full(problem, u) for u in (domain.start, lower, upper)]
     for margin in MARGINS:
         window = box.grow(margin, resolution)
         if window.area > largest_area:
             break
-        deviation = measure_outside(problem, window, start, ends)
+        deviation = measure_outside(problem, window, start, extremes)
         if deviation.is_accepted:
             return Windowing(window, start, deviation)
     return Refusal(f"its surroundings change with it: {_describe(deviation)}")
@@ -131,7 +136,11 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
 
 
 def _find_searched_refusal(problem: Problem) -> Refusal | None:
-    """Return why what is searched shows in more than a part of the image."""
+    """Return why what is searched shows in more than a part of the image.
+
+    None if it shows in a part only: it changes the surface of a mesh, which stays where
+    it is.
+    """
     light_inputs = find_light_inputs(problem.renderer)
     names = _find_searched_inputs(problem)
     if not names:
@@ -191,22 +200,24 @@ def measure_outside(
         before: the image whose surroundings are pasted.
         others: the images that are compared with it.
     """
-    squares = []
-    biases = []
-    changes = []
+    squared_differences = []
+    margin_biases = []
+    margin_changes = []
     for image in others:
-        squares.append(_measure_square(problem, window, before, image))
+        squared_differences.append(_measure_square(problem, window, before, image))
         bias, change = _measure_margin(problem, window, before, image)
-        biases.append(bias)
-        changes.append(change)
+        margin_biases.append(bias)
+        margin_changes.append(change)
     count = len(others)
-    limit = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * sum(changes) / count)
+    # a bias may be a fraction of what the search itself changes
+    allowed_bias = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * sum(margin_changes) / count)
     return Deviation(
-        levels=math.sqrt(max(0.0, sum(squares) / count)),
-        logits=sum(biases) / count,
+        # without noise, the mean square can be below 0 by chance
+        levels=math.sqrt(max(0.0, sum(squared_differences) / count)),
+        logits=sum(margin_biases) / count,
         allowed_levels=MAX_LEVELS,
         n_traced=count,
-        allowed_margin_bias=limit,
+        allowed_margin_bias=allowed_bias,
     )
 
 

@@ -123,13 +123,15 @@ class RunDirectory:
         path = _make_numbered_directory(default) if run is None else locate_run(run)
         # else the missing folder of a moved study would be made again
         check_not_moved(path)
-        check_free(path, overwrite=overwrite)
+        check_free(path, overwrite=overwrite)  # early, before anything is made
         with storage_errors(path):
             path.mkdir(parents=True, exist_ok=True)
         try:
+            # releases the lock and closes the store if anything below fails
             with ExitStack() as undo:
                 lock = RunLock(path)
                 undo.callback(lock.release)
+                # again: another process may have made a run before the lock was held
                 check_free(path, overwrite=overwrite)
                 with storage_errors(path):
                     _clear(path)
@@ -144,9 +146,9 @@ class RunDirectory:
                     with suppress(OSError):
                         _clear(path)
                     raise
-                undo.pop_all()
+                undo.pop_all()  # nothing failed: the caller closes it
                 return run_directory
-        except InputError:  # it is another's
+        except InputError:  # the folder belongs to another run, and stays
             raise
         except BaseException:
             _remove_if_bare(path)
@@ -196,6 +198,7 @@ class RunDirectory:
         with ExitStack() as undo:
             lock = RunLock(path)
             undo.callback(lock.release)
+            # closed and unlocked if the settings do not fit
             opened = cls(path, lock)
             undo.callback(opened.close)
             opened._is_new = False
@@ -281,7 +284,8 @@ class RunDirectory:
                 f"with: {changes}; restore it, or "
                 f"{self.restart_advice}"
             )
-        if not facts.keys() <= before.keys():
+        has_new_facts = not facts.keys() <= before.keys()
+        if has_new_facts:
             self.store.write_note(note, json.dumps({**facts, **before}))
 
     def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
@@ -434,6 +438,7 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
     the path is None: the old run stays until the new one takes its place.
     """
     location, overwrite = config.run_location
+    # an old run is not cleared before its successor has something to store
     if overwrite and location is not None and is_run(locate_run(location)):
         yield None
         return
@@ -449,6 +454,7 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
         with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
             if run.is_empty:
                 run.discard()
+        # from the innermost out; one that is not empty ends it by an error
         with suppress(OSError):
             for folder in missing_folders:
                 folder.rmdir()

@@ -286,8 +286,9 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
     with file:
         # without end; `range` gives the number of the line
         for number in range(1 << 62):
+            # one byte more than allowed shows that a line is too long
             line = file.readline(MAX_LINE_BYTES + 1)
-            if not line:
+            if not line:  # the end of the file; an empty line has its line break
                 return
             if len(line) > MAX_LINE_BYTES:
                 raise _make_line_error(
@@ -317,7 +318,10 @@ def _parse_line(
     row = Row(
         "sweep",
         number,
+        # 3DB writes a bool or the text of one
         correct=str(record.get("is_correct")) == "True",
+        # A loss is large where the model is wrong, a margin where it is right. The
+        # difference has no -0.0.
         margin=0.0 - loss if isinstance(loss, (int, float)) else None,
         label=label,
         label_index=label_index,

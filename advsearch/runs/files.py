@@ -163,6 +163,9 @@ ANIMATION_BYTES = 3_000_000
 ANIMATION_FRAMES = 60
 # longest side of an animation in pixels; larger pictures are averaged down
 ANIMATION_SIDE = 320
+# an animation that is too large gets fewer frames, down to these, then smaller ones
+MIN_ANIMATION_FRAMES = 10
+MIN_ANIMATION_SIDE = 16
 _PALETTE_PIXELS = 200_000
 FRAME_MS = 100
 LAST_FRAME_MS = 2500
@@ -290,16 +293,16 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
     `ANIMATION_BYTES` at most, or cannot get smaller.
     """
     count = min(len(frames), ANIMATION_FRAMES)
-    shrink = 1
+    shrink = 1  # factor by which sides are divided beyond ANIMATION_SIDE
     while True:
-        # the first and the last among them
+        # evenly spaced, with the first and the last frame
         indices = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
         pictures = [
             Image.fromarray(_check_image_shape(to_8bit(frames[index])))
             for index in indices
         ]
-        # each side is divided by this: rounded up, so that the longest one fits into
-        # ANIMATION_SIDE
+        # Blocks of so many pixels a side become one pixel. -(-a // b) is rounded up, so
+        # that the longest side fits into ANIMATION_SIDE.
         block = max(shrink, -(-max(pictures[0].size) * shrink // ANIMATION_SIDE))
         # cut to a multiple of the block
         width, height = (
@@ -309,9 +312,10 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
             picture.reduce(block, (0, 0, width, height)) for picture in pictures
         ]
         data = _encode_gif(pictures)
-        if len(data) <= ANIMATION_BYTES or min(pictures[0].size) < 16:
+        is_minimal = min(pictures[0].size) < MIN_ANIMATION_SIDE
+        if len(data) <= ANIMATION_BYTES or is_minimal:
             return data
-        if count > 10:
+        if count > MIN_ANIMATION_FRAMES:
             # a tenth less, or less in proportion to what is too much
             count = min(count * 9 // 10, count * ANIMATION_BYTES // len(data))
         else:

@@ -86,16 +86,18 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
     read_paths = [
         path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
     ]
+    # `_LISTED` has, by key, the state of the files when they were read, and the result.
     key = (os.path.abspath(path), counts)
     state = (str(path), running, *map(_state, read_paths))
-    if key not in _LISTED or _LISTED[key][0] != state or (running and counts):
+    is_known = key in _LISTED and _LISTED[key][0] == state
+    gets_rows = running and counts
+    if not is_known or gets_rows:
         faults: list[str] = []
         try:
             check_links(path)
             listed = _make_listed_run(path, counts, running, faults)
-        except (
-            Exception
-        ) as error:  # whatever is wrong with one run, the others are listed
+        # whatever is wrong with one run, the others are listed
+        except Exception as error:
             faults.append(
                 str(error)
                 if isinstance(error, AdvsearchError)

@@ -107,7 +107,7 @@ class Measurements:
         """
         context = self._context
         collected_rows: list[Row] = []
-        context.ending = INTERRUPTED
+        context.ending = INTERRUPTED  # unless the rows end, or the time is up
         try:
             with interruptible():
                 for row in rows:
@@ -120,11 +120,9 @@ class Measurements:
         except OutOfTime:
             context.ending = OUT_OF_TIME
         result = make_result(collected_rows)
-        if (
-            context.ending == INTERRUPTED
-            and not self.n_new
-            and (context.run.path / NAME).is_file()
-        ):
+        # without a new row, not all stored ones may have been read
+        may_lack_stored_rows = context.ending == INTERRUPTED and not self.n_new
+        if may_lack_stored_rows and (context.run.path / NAME).is_file():
             earlier = read_stored_result(context.run.path)
             return earlier if isinstance(earlier, type(result)) else result
         return result

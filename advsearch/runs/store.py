@@ -168,7 +168,7 @@ class Store:
         """
         check_not_moved(self.path)
         start_time = time.monotonic()
-        timestamp = time.time()
+        timestamp = time.time()  # monotonic time has no date
         must_sync = start_time >= self._next_sync
         with storage_errors(self.path):
             self._db.execute(
@@ -195,7 +195,8 @@ class Store:
                     )
         if must_sync:
             end_time = time.monotonic()
-            # syncing takes SYNC_SHARE of the time at most
+            # the wait before the next one, so that syncing takes SYNC_SHARE of the time
+            # at most
             self._next_sync = end_time + max(
                 SYNC_INTERVAL, (end_time - start_time) / SYNC_SHARE
             )
@@ -392,15 +393,17 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     for name in _ENCODED_FIELDS:
         value = getattr(row, name)
         if name in _AS_JSON and value is not None:
+            is_empty_metrics = name == "metrics" and not value
             try:
-                # fails for numbers of numpy and for NaN, which are turned first then
-                value = _JSON.encode(value) if value or name != "metrics" else None
+                value = None if is_empty_metrics else _JSON.encode(value)
+            # numbers of numpy and NaN: they are turned into Python's and None first,
+            # which is slow, so only where it is needed
             except (TypeError, ValueError):
                 value = _JSON.encode(to_json_value(value))
-        elif type(value) not in _SIMPLE and not (
-            type(value) is float and math.isfinite(value)
-        ):
-            value = to_json_value(value)
+        else:
+            is_finite_float = type(value) is float and math.isfinite(value)
+            if type(value) not in _SIMPLE and not is_finite_float:
+                value = to_json_value(value)
         values.append(value)
     return (*values, stamp, row.id)
 

@@ -146,12 +146,13 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
         raise FileFormatError(f"{expected} {str(error)[:120]}") from None
     if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MAX_HEADER_BYTES]:
         raise FileFormatError(f"{expected} something else, or the beginning of one")
+    # the header states the count d
     header = HEADER.match(data)
     # four bytes for each float32 behind the header, and nothing more
     if header is not None and len(data) == header.end() + 4 * int(header[1]):
         u: NDArray[np.float32] = np.frombuffer(
-            data, np.float32, int(header[1]), header.end()
-        ).copy()
+            data, np.float32, count=int(header[1]), offset=header.end()
+        ).copy()  # frombuffer is read-only
         if bool(((u >= 0.0) & (u <= 1.0)).all()):
             return u
     raise FileFormatError(
@@ -219,6 +220,7 @@ def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
         for setting in NAMES_BUNDLED
         for name in _find_bundled_names(settings.get(setting))
     }
+    # a scene whose environment is not stated has the default one
     if (
         settings.get("object")
         and "environment" in settings

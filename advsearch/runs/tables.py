@@ -133,15 +133,13 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
         return None
     with suppress(ValidationError):
         units = TypeAdapter(Units).validate_python(noted)
+        # an older note: what it calls samples is repetitions of the noise
         if not is_sampled and units.noise == 1:
             units = replace(units, samples=1, noise=units.samples)
         is_frame_axis_valid = units.frames is None or units.frames < len(units.sizes)
-        if (
-            is_frame_axis_valid
-            and prod(units.sizes) * units.samples * units.noise * units.models
-            <= MAX_ROWS
-            and units.photographs * units.scene <= MAX_ROWS
-        ):
+        n_rows = prod(units.sizes) * units.samples * units.noise * units.models
+        n_scene_rows = units.photographs * units.scene
+        if is_frame_axis_valid and n_rows <= MAX_ROWS and n_scene_rows <= MAX_ROWS:
             return units
     raise FileFormatError(
         f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}"

@@ -157,9 +157,11 @@ def _open_tracker(
     if name == "mlflow":
         package.start_run(run_name=folder.name, nested=True)
         package.log_params(settings)
-        return lambda numbers, step: package.log_metrics(
-            dict(numbers), step=step
-        ), package.end_run
+
+        def log_metrics(numbers: MetricValues, step: int) -> None:
+            package.log_metrics(dict(numbers), step=step)
+
+        return log_metrics, package.end_run
     # its files are in the run, whose run.yaml has the settings
     if name == "tensorboard":
         writer = package.Writer(str(folder / "artifacts" / "tensorboard"))

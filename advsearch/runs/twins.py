@@ -56,10 +56,10 @@ def find_twin_evidence(
 
     Args:
         run: run of twins, its name or folder; None for none.
-        model: model of the other run, by name, as all these.
+        model: name of the model of the other run, to which all these belong.
         task: task that judged it.
         object_name: a bundled name, or a file.
-        environment: around the object.
+        environment: name of the environment around the object.
         in_photograph: the scene is rendered into a photograph.
 
     Raises:
@@ -78,16 +78,17 @@ def find_twin_evidence(
     rows = [row for row in rows if row.task == task]
     if not rows:
         return _make_empty(run, TwinMatch.OTHER_TASK)
-    wanted = IN_PHOTOGRAPH if in_photograph else environment
+    surroundings = IN_PHOTOGRAPH if in_photograph else environment
     stem = PurePath(object_name).stem
-    # the nearest row: this object before all together, then this environment, then any
-    # but photographs
+    # The nearest row: of this object, or else of all objects together; among these in
+    # these surroundings, or else in any but photographs.
     row = max(
         (row for row in rows if not row.condition),
+        # by the first of these in which rows differ; a row without object is over all
         key=lambda row: (
             row.object == stem,
             not row.object,
-            row.surroundings == wanted,
+            row.surroundings == surroundings,
             row.surroundings != IN_PHOTOGRAPH,
         ),
     )
@@ -95,7 +96,7 @@ def find_twin_evidence(
         run=run,
         match=TwinMatch.MEASURED,
         same_object=row.object == stem,
-        same_surroundings=row.surroundings == wanted,
+        same_surroundings=row.surroundings == surroundings,
         row=row,
     )
 

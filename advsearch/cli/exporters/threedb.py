@@ -44,18 +44,20 @@ def write_threedb(
         InputError: there are no rows, or the folder is not empty.
     """
     writing.check_free_folder(out, "out")
+    # parameters, in the order in which rows have them; a dict is an ordered set
     names = dict[str, None]()
+    # index of each predicted class by its label; None where the model has no index
     classes = dict[str, int | None]()
     for row in rows():
         names |= dict.fromkeys(name for name in row.values if name not in PLACED)
         classes.setdefault(row.label or Store.NOT_A_NUMBER, row.label_index)
     if not classes:
         raise InputError("format 3db: needs the rows of a sweep, and this run has none")
-    numbers = {name: number for name, number in classes.items() if number is not None}
-    for name in classes:  # those without a number come behind the others
-        if name not in numbers:
-            numbers[name] = max(numbers.values(), default=-1) + 1
-    class_by_number = {number: name for name, number in numbers.items()}
+    class_index = {name: index for name, index in classes.items() if index is not None}
+    for name in classes:  # those without an index come behind the others
+        if name not in class_index:
+            class_index[name] = max(class_index.values(), default=-1) + 1
+    class_by_index = {index: name for name, index in class_index.items()}
     with writing.name_setting_in_errors("out"):
         n_rows = 0
         with (
@@ -63,7 +65,8 @@ def write_threedb(
             part.open("w", encoding="utf-8") as file,
         ):
             for row in rows():
-                line = make_line(row, names, numbers[row.label or Store.NOT_A_NUMBER])
+                prediction = class_index[row.label or Store.NOT_A_NUMBER]
+                line = make_line(row, names, prediction)
                 file.write(json.dumps(line, allow_nan=False) + "\n")
                 data = picture(row.step)
                 if data is not None:
@@ -73,8 +76,8 @@ def write_threedb(
                 n_rows += 1
         # a list by index, in which gaps get a name
         class_names = [
-            class_by_number.get(number, f"class {number}")
-            for number in range(max(class_by_number) + 1)
+            class_by_index.get(index, f"class {index}")
+            for index in range(max(class_by_index) + 1)
         ]
         writing.write_text(out / CLASSES, json.dumps(class_names))
     return n_rows

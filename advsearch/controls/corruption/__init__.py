@@ -212,7 +212,7 @@ def apply_corruption(
         applied_severity = round_severity(severity)
         result = apply_at(image, applied_severity) if applied_severity else image
         # A staircase has no slope: the gradient is that of the straight lines between
-        # its steps; what is added is zero.
+        # its steps. What is added has the value 0, and only a derivative.
         if severity.requires_grad:
             below = min(int(severity.detach()), filters.MAX_SEVERITY - 1)
             low = apply_at(image, below).detach() if below else image.detach()
@@ -221,6 +221,7 @@ def apply_corruption(
         return result.clamp(0.0, 1.0)
     if name in CONTINUOUS_FROM_ZERO:
         return CONTINUOUS_FROM_ZERO[name](image, severity, seed).clamp(0.0, 1.0)
+    # The tables of these begin at severity 1; below, the picture is blended with that.
     if float(severity.detach()) >= 1.0:
         return CONTINUOUS_CORRUPTIONS[name](image, severity, seed).clamp(0.0, 1.0)
     mildest = CONTINUOUS_CORRUPTIONS[name](

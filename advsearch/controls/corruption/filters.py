@@ -111,6 +111,7 @@ def blur_along_line(
         angle: angle of the line, radians.
         step: pixels of this image for a pixel of the reference image.
     """
+    # number of weights, one for each pixel along the line
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
     # in pixels of the reference image
     distance = torch.arange(count, device=image.device) / step
@@ -253,9 +254,11 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """
     (radius,) = interpolate_table(DEFOCUS, level)
     radius = radius * compute_pixel_scale(image)
+    # half the width of the kernel, with the soft edge
     reach = math.ceil(float(radius.detach()) + 0.5)
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
     distance = torch.sqrt(offsets[:, None] ** 2 + offsets[None, :] ** 2)
+    # 1 inside and 0 outside, soft over one pixel: differentiable in the radius
     disc = (radius + 0.5 - distance).clamp(0.0, 1.0)
     height, width = image.shape[:2]
     padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
@@ -342,11 +345,13 @@ def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tens
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
     rows, columns = compute_reference_size(height, width)
+    # the first number is the strength of the blur, which is done elsewhere
     _, reach, n_passes = (int(value) for value in GLASS[severity - 1])
     source = make_generator(seed, "glass blur")
     origins = list(range(rows * columns))
     for _ in range(n_passes):
         jumps = torch.randint(-reach, reach, (rows, columns, 2), generator=source)
+        # as steps between indices of the flattened image
         to_neighbor = (jumps[..., 0] * columns + jumps[..., 1]).flatten().tolist()
         _take_over_origins(origins, to_neighbor, rows, columns, reach)
     shift = _compute_shifts(torch.tensor(origins), columns)

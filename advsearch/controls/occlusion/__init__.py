@@ -314,6 +314,7 @@ class OcclusionControl(Control):
             requested["direction"],
         )
         angle = _find_covering_angle(view, passage, requested["coverage"])
+        # what it hides there, which may be less than requested
         hidden = float(passage.compute_coverage(np.array([angle]))[0])
         return Placement(passage.axes, angle, size, distance, hidden, False)
 
@@ -478,7 +479,7 @@ def _spread_directions(
     """
     row, column = np.divmod(np.arange(count * count), count)
     index = np.arange(count * count)
-    # the fractions of the plastic number (Roberts 2018)
+    # 1 / g and 1 / g^2 of the plastic number g (Roberts 2018)
     x_in_cells = column + (0.5 + 0.7548777 * index) % 1.0
     y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
     x = across[0] + x_in_cells / count * (across[1] - across[0])
@@ -520,6 +521,7 @@ def _fit_occluder(
     half_width = float(np.hypot(points[:, 1], points[:, 2]).max())
     # so that something fits at all
     near = max(near, 3.0 * MIN_CAMERA_DISTANCE)
+    # 0.95 to the 200th is 1 / 28,000: by then anything fits
     for _ in range(200):
         min_distance = MIN_CAMERA_DISTANCE + size * front
         # The back corners lie on a sphere of radius `near` around the camera.

@@ -109,7 +109,7 @@ def rasterise_silhouette(
     pixel = max(window_width, window_height) / RASTER
     width = max(1, math.ceil(window_width / pixel))
     height = max(1, math.ceil(window_height / pixel))
-    # pixel centers are at whole numbers
+    # Pixel centers are at whole numbers: the window's corner is at -0.5.
     in_pixels = (tangents - (window.left, window.low)) * (
         width / window_width,
         height / window_height,
@@ -193,7 +193,8 @@ class Passage:
         if len(sufficient) == 0:
             return float(angles[int(np.argmax(fractions))])
         first = int(sufficient[0])
-        if first == 0:
+        is_enough_outside = first == 0
+        if is_enough_outside:
             return float(angles[0])
         outer_angle = float(angles[first - 1])  # hides too little
         inner_angle = float(angles[first])  # hides enough
@@ -251,14 +252,15 @@ def find_angle_outside(
     corners = cover.window.corners()
     occluder_radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
     image_radius = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
-    # a little beyond the edge; never behind the camera
+    # a little beyond the edge (0.02 is about a degree); never behind the camera
     max_angle = min(image_radius + occluder_radius + 0.02, 0.9 * math.pi)
     angles = np.linspace(max_angle, 0.0, 2 * N_SCAN_ANGLES)
     coverage = Passage(directions, cover, axes, direction).compute_coverage(angles)
-    is_inside = np.nonzero(coverage > 0.0)[0]
-    if not len(is_inside):
+    indices_inside = np.nonzero(coverage > 0.0)[0]
+    if not len(indices_inside):
         return float(angles[0])
-    return float(angles[max(int(is_inside[0]) - 1, 0)])
+    last_outside = max(int(indices_inside[0]) - 1, 0)
+    return float(angles[last_outside])
 
 
 def _unit(vectors: assets.Float64Array) -> assets.Float64Array:

@@ -297,11 +297,14 @@ class PathControl(Control):
                 f"{self.name}: {names[0]} says what the camera does and "
                 "what the object; leave moves out"
             )
-        if "path" in self._settings:  # otherwise the run may say it, later
+        # Where no path is set here, a setting of the run may state one later, and
+        # `prepare` checks then.
+        if "path" in self._settings:
             self._check_needless()
         if any(movement.has_times for movement in self._files):
             self._check_not_set("seconds")
-        if len(self._files) == len(all_movements):
+        are_all_files = len(self._files) == len(all_movements)
+        if are_all_files:
             self._check_not_set("reach")
         if self._files:
             self.chosen["seconds"] = max(
@@ -326,9 +329,10 @@ class PathControl(Control):
         paths, the camera's and the object's. A path is one of `PATHS` or a file.
         """
         names = [name]
-        both = name.split(MOVER_SEPARATOR)
-        if len(both) == 2 and all(map(_is_path, both)):
-            names = both
+        halves = name.split(MOVER_SEPARATOR)
+        # a "+" may also stand in the name of one file
+        if len(halves) == 2 and all(map(_is_path, halves)):
+            names = halves
         is_single = len(names) == 1
         if is_single and not _is_path(name):
             raise InputError(
@@ -399,6 +403,7 @@ class PathControl(Control):
 
         Its notes say what the file does not state.
         """
+        # choices that were left out by name, with the defaults taken for them
         assumed = dict[str, str]()
         times = self._times_of(trajectory, assumed)
         check_times(path, times)
@@ -577,6 +582,7 @@ class PathControl(Control):
         shift, _ = self._shift_object(movements, start, times)
         position, target = self._position_camera(movements, start, times, shift)
         to_target = (target - position).expand(len(times), 3).double()
+        # for each step between two times, where on it the distance is smallest
         fraction, distance = _find_closest_to_origin(to_target)
         if float(distance.min()) < MIN_TARGET_DISTANCE:
             index = int(distance.argmin())
@@ -709,6 +715,7 @@ class PathControl(Control):
         distance = (start - center).norm()
         reach = float(self.chosen["reach"])
         progress = (time / self.seconds).clamp(0.0, 1.0)
+        # columns of the pose: left, up and forwards
         if movement == APPROACH:
             ahead = _level_direction(pose[:3, 2])
             # it begins `reach` times as far away as it ends
@@ -718,6 +725,7 @@ class PathControl(Control):
             # 1 at the begin, 0 where the camera stands, -1 at the end
             from_middle = (1.0 - 2.0 * progress)[..., None]
             return start + pose[:3, 0] * distance * reach * from_middle, center + shift
+        # orbit
         return center + _turn_about_vertical(start - center, progress), center + shift
 
     def _camera_on_waypoints(
@@ -779,7 +787,8 @@ class PathControl(Control):
             # it begins `reach` times as far from the camera as it ends
             to_go = distance * (reach - 1.0) * (1.0 - progress)
             return _level_direction(camera[:3, 2]) * to_go[..., None], no_turn
-        # positive at the begin, 0 where the object stands
+        # Pass: positive at the begin, 0 where the object stands. The camera's x axis
+        # points to its left.
         from_middle = distance * reach * (1.0 - 2.0 * progress)
         return _level_direction(-camera[:3, 0]) * from_middle[..., None], no_turn
 
@@ -946,10 +955,12 @@ def unwrap_headings(
     """
     low = float(degrees.min())
     high = float(degrees.max())
+    # steps for which the other way round is shorter
     jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
     is_within_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
     if not len(jumps) or high - low >= 360.0 or not is_within_turn:
         return degrees, None
+    # of the first such step
     first = f"{degrees[jumps[0]]:g}"
     last = f"{degrees[jumps[0] + 1]:g}"
     note = (
@@ -1024,6 +1035,7 @@ def read_waypoints(
     times = column.pop(TIME_COLUMN)
     times = times - times[0]
     check_times(path, times)
+    # NaN is not within the bounds either
     if not all(np.abs(values).max() <= MAX_DISTANCE for values in column.values()):
         raise errors.FileFormatError(
             f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones, or "

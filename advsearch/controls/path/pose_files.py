@@ -139,6 +139,7 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if first_row is None:
         return None
     has_commas = "," in lines[first_row]
+    # what may be headers
     leading = [_split(line.lstrip("#").strip()) for line in lines[:first_row]]
     headers = [names for names in leading if _find_columns(names)]
     has_waypoint_header = any(WAYPOINT_COLUMNS <= set(names) for names in leading)
@@ -167,11 +168,10 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
         )
     if count == 12:
         return _read_kitti(path, rows)
-    known = (
-        " (KITTI-360's first column is a number of a picture; leave it out)"
-        if count in (13, 17)
-        else ""
-    )
+    known = ""
+    # a matrix of 12 or 16 numbers after the number of a picture
+    if count in (13, 17):
+        known = " (KITTI-360's first column is a number of a picture; leave it out)"
     raise errors.FileFormatError(
         f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, "
         "or 12 as KITTI's poses, got "
@@ -194,6 +194,7 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
     table: one that lacks a time, a position or a part of a quaternion, has a column
     twice, or is a table of waypoints.
     """
+    # time, x, y and z at least
     if not 4 <= len(names) <= MAX_COLUMNS:
         return {}
     columns = dict[str, int]()

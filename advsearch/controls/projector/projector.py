@@ -217,6 +217,7 @@ class ProjectorControl(PictureControl):
         picture = self.chosen["picture"]
         # a pattern may be left out, be False or 0, or be its full range
         is_full_range = isinstance(pattern, (list, tuple)) and [*pattern] == [0.0, 1.0]
+        # an empty list is false as well, but no way to leave the pattern out
         is_empty_list = isinstance(pattern, (list, tuple)) and not pattern
         if is_empty_list or (pattern and not is_full_range):
             raise InputError(
@@ -301,6 +302,7 @@ class ProjectorControl(PictureControl):
                     lux = min(max(lux, 1e-3), 2e5)  # the parameter's range
                 return replace(parameter, default=lux)
             case "lumens":
+                # the light falls on an area that grows with the squared distance
                 max_lumens = (
                     MAX_AMBIENT_FACTOR
                     * float(self.get_clean_value("ambient"))
@@ -409,7 +411,10 @@ class ProjectorControl(PictureControl):
         light = self.project_light(values)
         rate = float(values["flicker"].detach())
         phase = float(values["phase"].detach()) / 360.0
-        if rate and (rate * self._time_shift + phase) % 1.0 >= DUTY_CYCLE:
+        # from 0 at the begin of a flash to 1 at that of the next one
+        cycle_position = (rate * self._time_shift + phase) % 1.0
+        is_off = cycle_position >= DUTY_CYCLE
+        if rate and is_off:
             light = 0.0 * light  # still depends on the pattern, for its derivative
         distance_in_units = values["distance"].detach() / self.scene.size_in_metres
         # white in units of the ambient light, at a distance of one unit: light falls

@@ -176,7 +176,8 @@ class SpotControl(ProjectorControl):
             / self.scene.size_in_metres
         )
         rows, columns = self.part.sides
-        # positions of the texels' centers in that plane
+        # Positions of the texels' centers in that plane: every second one of twice as
+        # many points, since the others are the texels' edges.
         right, up = (
             torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2].to(half_width) * half_width
             for count in (columns, rows)

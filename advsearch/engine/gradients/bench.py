@@ -23,12 +23,15 @@ Loss = Callable[[Tensor], Tensor]
 # fraction of a full turn between the start of periodic coordinates and where gradients
 # are measured
 PERIODIC_OFFSET = 0.0317
+# coordinates of a group up to which they are treated one by one; more are a texture's
+MAX_SMALL_GROUP = 64
 
 
 def find_interior_point(renderer: Renderer, fraction: float = 0.12) -> Tensor:
     """Return a point (d,) near the start at which gradients are measured.
 
-    Discrete choices and groups of more than 64 coordinates stay at their start. But a
+    Discrete choices and groups of more than `MAX_SMALL_GROUP` coordinates stay at
+    their start. But a
     large group that starts at its bounds with all coordinates, as a projector's black
     image does, is measured in the middle: a bound has a kink, and no difference to
     either side. Periodic coordinates are turned a little, as starts are often
@@ -37,11 +40,14 @@ def find_interior_point(renderer: Renderer, fraction: float = 0.12) -> Tensor:
     u = renderer.start.clone()
     for group in renderer.plan.groups:
         coordinates = group.coordinates
-        if group.valid and group.size <= 64 and not group.periodic:
+        has_derivative = bool(group.valid)  # a discrete choice has no valid estimator
+        is_large = group.size > MAX_SMALL_GROUP
+        if has_derivative and not is_large and not group.periodic:
             u[coordinates] = u[coordinates].clamp(fraction, 1.0 - fraction)
-        if group.valid and group.size > 64:
+        if has_derivative and is_large:
             values = u[coordinates]
-            if bool(((values == 0.0) | (values == 1.0)).all()):
+            starts_at_bounds = bool(((values == 0.0) | (values == 1.0)).all())
+            if starts_at_bounds:
                 u[coordinates] = 0.5
         if group.periodic:
             u[coordinates] = (u[coordinates] + PERIODIC_OFFSET).remainder(1.0)
@@ -129,12 +135,14 @@ class Bench:
                 measurement = measure()
             else:
                 measurement = self.store(f"{label} gradient {index}", measure)
-            # as `_measure_gradient` has written it
+            # base64 of float32, the groups' derivatives one after the other, as
+            # `_measure_gradient` writes them; frombuffer wants writable memory
             buffer = bytearray(base64.b64decode(measurement["numbers"]))
             derivatives = torch.frombuffer(buffer, dtype=torch.float32).split(sizes)
             for coordinates, values in zip(slices, derivatives, strict=True):
                 gradients[index, coordinates] = values
             seconds.append(measurement["seconds"])
+            # gradients that are not stored are counted by the caller
             if label is not None:
                 self.tick(self.spp)
         return gradients, statistics.median(seconds)

@@ -25,6 +25,7 @@ from advsearch.scene.gradients import STEP_RANGE, Group, select_compared
 # least
 MIN_SIZE_FRACTION = 0.1
 MAX_SINGLE_PROBES = 8  # groups of at most this many coordinates are probed one by one
+MIXED_STEP = 0.03  # along a direction through more than 64 coordinates
 # relative error that the mean of an estimator may have beyond the noise
 MAX_BIAS = 0.05
 MAX_NOISE = (
@@ -34,6 +35,9 @@ MAX_NOISE = (
 # seeds
 MAX_REFERENCE_ERROR = 0.02
 N_STANDARD_ERRORS = 2.5  # standard errors within which two means agree
+# waves of a smooth loss, and how many of them fit into the image at most
+N_WAVES = 6
+MAX_FREQUENCY = 1.2
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
 """Steps of differences that are tried in turn, as multiples of the plan's. A step that
 moves an outline by a pixel is as wide as a classifier's loss allows; a smooth loss
@@ -95,18 +99,25 @@ def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     rows = torch.linspace(-1.0, 1.0, height)[:, None, None]
     columns = torch.linspace(-1.0, 1.0, width)[None, :, None]
     weights = torch.zeros(height, width, 3)
-    for _ in range(6):
-        across, down, phase, size = (
+    for _ in range(N_WAVES):
+        # for each channel, uniform in [-1, 1]
+        x_frequency, y_frequency, phase, amplitude = (
             torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4)
         )
-        weights += size * torch.cos(
-            math.pi * (1.2 * across * columns + 1.2 * down * rows + phase)
+        # rows and columns run from -1 to 1: a frequency of 1 is one wave over the image
+        weights += amplitude * torch.cos(
+            math.pi
+            * (
+                MAX_FREQUENCY * x_frequency * columns
+                + MAX_FREQUENCY * y_frequency * rows
+                + phase
+            )
         )
-    window = (
+    hann_window = (
         torch.cos(0.5 * math.pi * rows).square()
         * torch.cos(0.5 * math.pi * columns).square()
     )
-    weights *= window / (height * width)
+    weights *= hann_window / (height * width)
 
     def loss(image: Tensor) -> Tensor:
         return (image * weights).sum()
@@ -146,19 +157,20 @@ def compare_with_reference(
     min_sizes = [MIN_SIZE_FRACTION * abs(other.value) for other in others]
     size = max([abs(reference.value), *min_sizes])
     difference = abs(estimate.value - reference.value)
-    doubt = N_STANDARD_ERRORS * math.hypot(
-        estimate.noise / math.sqrt(max(1, estimate.repeats)), reference.noise
-    )
+    estimate_error = estimate.noise / math.sqrt(max(1, estimate.repeats))
+    doubt = N_STANDARD_ERRORS * math.hypot(estimate_error, reference.noise)
     status: GradientStatus
     if difference <= doubt and reference.noise > MAX_NOISE * size:
         status = "reference unusable"
     elif difference > MAX_BIAS * size + doubt:
         status = "biased"
+    elif estimate.noise > MAX_NOISE * size:
+        status = "noisy"
     else:
-        status = "noisy" if estimate.noise > MAX_NOISE * size else "ok"
+        status = "ok"
 
     def relative(value: float) -> float:
-        """Return a value in units of the size."""
+        """Return a value in units of the size; of size 0, any value is infinite."""
         if size > 0.0:
             return value / size
         return math.inf if value else 0.0
@@ -201,12 +213,14 @@ def list_attempts(group: Group) -> list[tuple[str, float]]:
     else:
         names = select_compared(group.valid, group.size)
         attempts = [(name, 1.0) for name in names]
+    # of those that are tried with the planned step
     difference_estimators = [
         name for name in ("differences", "secant") if (name, 1.0) in attempts
     ]
     steps = {group.step}
     for factor in FACTORS[1:]:
         step = min(factor * group.step, STEP_RANGE[1])
+        # beyond the largest step, wider ones are all the same
         if step not in steps:
             steps.add(step)
             attempts += [(name, factor) for name in difference_estimators[:1]]
@@ -225,7 +239,8 @@ def find_probes(bench: Bench) -> list[Probe]:
         if group.estimator == "none":
             continue
         if group.size > MAX_SINGLE_PROBES:
-            step = group.step if group.size <= 64 else 0.03
+            # the planned step of a large group is not one along all coordinates at once
+            step = group.step if group.size <= 64 else MIXED_STEP
             probes.append(
                 Probe(group, group.name, _make_mixed_direction(bench, group), step)
             )
@@ -255,6 +270,7 @@ def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
         * 2.0
         - 1.0
     )
+    # where the gradient is 0, the random sign is left
     mixed = gradient.sign() + 0.5 * random_signs
     direction = torch.zeros_like(bench.u)
     direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
@@ -272,17 +288,25 @@ def measure_reference(
 
     Each seed gives two differences, at a step and at half of it, from which the value
     at a step of 0 is extrapolated. Seeds are added until the standard error of the mean
-    is below `MAX_REFERENCE_ERROR` of its value, between the two numbers of `repeats`.
+    is below `MAX_REFERENCE_ERROR` of its value.
 
-    With several `factors`, steps that many times wider are tried in turn, each with the
-    smaller number of seeds, until one is sure enough; if none is, more seeds are added
-    for the one with the least noise.
+    Args:
+        bench: bench of the renderer.
+        probe: direction along which the derivative is taken.
+        repeats: smallest and largest number of seeds.
+        factors: factors on the probe's step, tried in turn with the smallest number of
+            seeds, until one is sure enough. If none is, seeds are added to that with
+            the least noise.
     """
+    min_repeats, max_repeats = repeats
+    # for each factor, differences at its step and at half of it, a pair for each seed
     pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
 
     def measure(factor: float, count: int) -> tuple[Reference, float]:
-        """Return the reference of `count` pairs of differences, at a step and at half
-        of it with the same seed, and its standard error; missing pairs are measured.
+        """Measure the pairs that are missing of `count`.
+
+        Returns:
+            The reference of all of them, and the standard error of its value.
         """
         step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
         for number in range(len(pairs[factor]), count):
@@ -311,17 +335,17 @@ def measure_reference(
 
     measured = dict[float, tuple[Reference, float]]()
     for factor in factors:
-        reference, error = measured[factor] = measure(factor, repeats[0])
-        if error <= MAX_REFERENCE_ERROR * abs(reference.value):
-            break
-    else:
-        best = min(measured, key=lambda factor: measured[factor][0].noise)
-        reference, error = measured[best]
-        while (
-            error > MAX_REFERENCE_ERROR * abs(reference.value)
-            and len(pairs[best]) < repeats[1]
-        ):
-            reference, error = measure(best, len(pairs[best]) + 1)
+        reference, error = measured[factor] = measure(factor, min_repeats)
+        is_sure = error <= MAX_REFERENCE_ERROR * abs(reference.value)
+        if is_sure:
+            return reference
+    best = min(measured, key=lambda factor: measured[factor][0].noise)
+    reference, error = measured[best]
+    while (
+        error > MAX_REFERENCE_ERROR * abs(reference.value)
+        and len(pairs[best]) < max_repeats
+    ):
+        reference, error = measure(best, len(pairs[best]) + 1)
     return reference
 
 
@@ -342,11 +366,11 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
             # less than two steps if a bound of the range has cut one off
             width = float((above - below) @ probe.direction)
     with torch.no_grad():
-        high, low = (
-            float(bench.loss(bench.renderer(at, seed, bench.spp)))
-            for at in (above, below)
+        loss_above, loss_below = (
+            float(bench.loss(bench.renderer(u, seed, bench.spp)))
+            for u in (above, below)
         )
-    return (high - low) / width
+    return (loss_above - loss_below) / width
 
 
 def measure_estimates(
@@ -387,8 +411,11 @@ def measure_derivatives(
     repeats: tuple[int, int] = (6, 8),
     stage: Callable[[str, int], None] = lambda name, steps: None,
 ) -> Iterator[Measured]:
-    """Measure the derivative by each parameter of a renderer's space beside differences
-    of many samples.
+    """Measure the derivative by each parameter of a renderer's space.
+
+    Each estimate is compared with its reference, a central difference of images with
+    many samples. Parameters whose derivatives come from one gradient are measured
+    together.
 
     Args:
         bench: bench of the renderer.
@@ -405,16 +432,19 @@ def measure_derivatives(
 
     def load_reference(probe: Probe) -> Reference:
         """Return the reference along a probe, measured if it is not stored yet."""
-        # what acts on the picture clips: its mean depends on the noise, so both get the
-        # same
-        is_on_picture = probe.group.estimator == "image"
-        spp = bench.spp if is_on_picture else max(bench.spp, reference_spp)
-        finer = replace(bench, spp=spp)
+        # What acts on the finished image clips values, so that the mean depends on the
+        # noise: estimate and reference need the same sample count there.
+        acts_on_image = probe.group.estimator == "image"
+        spp = bench.spp if acts_on_image else max(bench.spp, reference_spp)
+        reference_bench = replace(bench, spp=spp)
 
         def measure() -> dict[str, Any]:
-            """Measure it, as JSON."""
+            """Measure the reference, and return it as JSON."""
             return measure_reference(
-                finer, probe, repeats=reference_repeats, factors=reference_factors
+                reference_bench,
+                probe,
+                repeats=reference_repeats,
+                factors=reference_factors,
             )._asdict()
 
         reference = Reference(**bench.store(f"reference {probe.name}", measure))
@@ -427,17 +457,16 @@ def measure_derivatives(
         probes = list(control_probes)
         stage(f"references for {control}", len(probes))
         references = {probe.name: load_reference(probe) for probe in probes}
-        # probes whose derivatives come from one gradient
-        sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
+        # One gradient gives the derivatives along all probes with equal estimators.
+        probe_sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
         for probe in probes:
-            sets.setdefault((probe.group.valid, probe.group.estimator), []).append(
-                probe
-            )
-        stage(
-            f"gradients for {control}",
-            sum(len(list_tries(members[0].group)) for members in sets.values()),
+            estimators = (probe.group.valid, probe.group.estimator)
+            probe_sets.setdefault(estimators, []).append(probe)
+        n_tries = sum(
+            len(list_tries(members[0].group)) for members in probe_sets.values()
         )
-        for members in sets.values():
+        stage(f"gradients for {control}", n_tries)
+        for members in probe_sets.values():
             yield from _try_estimators(
                 bench, members, references, list_tries(members[0].group), repeats
             )
@@ -460,31 +489,32 @@ def _try_estimators(
             tried along probes along which none was `ok` before.
         repeats: number of gradients with the factor 1, and with another one.
     """
-    good: set[str] = set()
+    ok_names: set[str] = set()
+    all_references = list(references.values())
     for estimator, factor in tries:
-        wanted = (
-            list(probes)
-            if factor == 1.0
-            else [probe for probe in probes if probe.name not in good]
-        )
-        if not wanted:
+        if factor == 1.0:
+            tried_probes = list(probes)
+            count = repeats[0]
+        else:
+            tried_probes = [probe for probe in probes if probe.name not in ok_names]
+            count = repeats[1]
+        if not tried_probes:
             break
-        count = repeats[0] if factor == 1.0 else repeats[1]
-        name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
+        probe_names = ",".join(probe.name for probe in tried_probes)
         stored = bench.store(
-            name, partial(_estimates_as_json, bench, estimator, wanted, count, factor)
+            f"{estimator} x {factor:g} {probe_names}",
+            partial(_estimates_as_json, bench, estimator, tried_probes, count, factor),
         )
-        for probe, estimate in zip(wanted, stored, strict=True):
-            others = list(references.values())
+        for probe, estimate in zip(tried_probes, stored, strict=True):
             row = compare_with_reference(
                 GradientEstimate(**estimate),
                 references[probe.name],
-                others,
-                probe,
-                bench.spp,
+                others=all_references,
+                probe=probe,
+                spp=bench.spp,
             )
             if row.status == "ok":
-                good.add(probe.name)
+                ok_names.add(probe.name)
             yield row
         bench.tick(bench.spp)
 

@@ -135,7 +135,9 @@ def choose_estimators(
 ) -> GradientPlan:
     """Return the renderer's plan with every contested choice made by measurement.
 
-    The plan of the renderer itself is not changed.
+    A choice is contested where several estimators can give the derivatives of a
+    control. The one with the smallest squared error times seconds is taken: its error
+    after equal time is smallest. The plan of the renderer itself is not changed.
 
     Args:
         bench: computes the gradients.
@@ -148,7 +150,7 @@ def choose_estimators(
     plan = bench.renderer.plan
     for groups, estimators in list_contested(plan, with_all=with_all):
         scores = _score_estimators(
-            bench, plan, groups, estimators, repeats, count_renders
+            bench, plan, groups, estimators, repeats, counted=count_renders
         )
         best = min(scores, key=lambda name: scores[name])
         reason = _explain_scores(scores, best, bench.spp, count_renders)
@@ -169,10 +171,10 @@ def _score_estimators(
     groups: Sequence[Group],
     estimators: Sequence[str],
     repeats: int,
+    *,
     counted: bool,
 ) -> dict[str, float]:
-    """Return the squared error times the seconds of each estimator on groups of a
-    control.
+    """Return squared error times seconds of each estimator, on groups of one control.
 
     Errors are differences from the mean gradient of the estimator that takes finite
     differences, whose own noise is subtracted. If `counted`, the number of renders
@@ -196,6 +198,7 @@ def _score_estimators(
         residual = gradients - gradients.mean(dim=0)  # (repeats, d)
         gradients_of[estimator] = gradients
         seconds_of[estimator] = seconds
+        # variance, summed over the elements
         noise_of[estimator] = float(residual.square().sum() / max(1, repeats - 1))
     errors = _compute_squared_errors(gradients_of, noise_of, repeats)
     return {name: error * seconds_of[name] for name, error in errors.items()}
@@ -329,7 +332,8 @@ def _measure_cosines(
     converged, agreement = _converged_gradient(bench, plan, label, converged_spp)
     for spp in counts:
         needs_samples = agreement < GOAL_COSINE or spp > CONVERGED_SPP
-        if needs_samples and converged_spp == CONVERGED_SPP:
+        is_first_converged = converged_spp == CONVERGED_SPP
+        if needs_samples and is_first_converged:
             converged_spp = CONVERGED_SPP_FACTOR * CONVERGED_SPP
             converged, agreement = _converged_gradient(
                 bench, plan, label, converged_spp
@@ -485,7 +489,7 @@ def measure_path_length(
     cuts = []
     chosen_depth = full_depth
     for depth in range(full_depth - 1, MIN_DEPTH - 1, -1):
-        # largest of all configurations
+        # the largest changes among all configurations
         lost_light = 0.0
         changed_levels = 0.0
         for u, full in zip(configurations, full_renderings, strict=True):
@@ -493,6 +497,7 @@ def measure_path_length(
             lost_light = max(lost_light, light)
             changed_levels = max(changed_levels, levels)
         cuts.append(PathCut(depth=depth, light=lost_light, levels=changed_levels))
+        # NaN, of an image that is not finite, counts as too much
         if not changed_levels <= bound:
             break
         chosen_depth = depth

@@ -53,6 +53,7 @@ class Categories:
         """
         task = image.task
         facts = image.facts
+        # several models have their tasks; the classes are those of the first
         if isinstance(task, tasks.EnsembleTask):
             task = task.tasks[0]
         labels: tuple[str, ...] = (facts.label or facts.object_label or facts.object,)
@@ -61,6 +62,7 @@ class Categories:
             labels = task.labels
             # the first of the classes that are right for the object
             object_category = task.find_right_classes(facts)[0]
+        # empty before the first image
         if self.labels not in ((), labels):
             raise InputError(
                 f"RUN: its parts have other categories, {facts.object} among them; "
@@ -92,7 +94,7 @@ def write_dataset(
         out: the folder, which is made, or empty.
         format: "coco" or "yolo".
         every: also write pictures that all models are right about.
-        progress: is told how far it is.
+        progress: progress of the rows.
 
     Returns:
         How many pictures there are, and sentences that a reader has to know.
@@ -103,7 +105,7 @@ def write_dataset(
         FileFormatError: the run is of another command, or has not ended.
     """
     writing.check_free_folder(out, "out")
-    directory.find_run(run)  # refuses before anything is written
+    directory.find_run(run)  # raises if there is none, before anything is written
     categories = Categories()
     with writing.name_setting_in_errors("out"):
         with writing.storage_errors(out):
@@ -113,7 +115,7 @@ def write_dataset(
             folder = Path(temporary.name) / "dataset"
             images = list[dict[str, Any]]()
             annotations = list[dict[str, Any]]()
-            n_changed = 0
+            n_changed = 0  # images that are not as they were in the run
             rendered = exports.render_rows(run, every=every, progress=progress)
             for image_id, image in enumerate(rendered, 1):
                 things = categories.find_things(image)
@@ -131,6 +133,7 @@ def write_dataset(
                 write_yolo_index(folder, categories)
             else:
                 write_coco_index(folder, categories, images, annotations)
+            # all at once, so that an interrupt leaves no half of it
             with writing.storage_errors(out):
                 os.replace(folder, out)
     return len(images), make_notes(categories, n_changed)

@@ -61,6 +61,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
     notes: list[str] = []
     with writing.name_setting_in_errors("out"), writing.storage_errors(out):
         for control, u in projectors:
+            # several projectors have a folder each
             folder = out / control.file_name if len(projectors) > 1 else out
             folder.mkdir(parents=True)
             notes += write_projector(folder, adversarial, control, control.values(u))
@@ -80,7 +81,7 @@ def write_projector(
     """
     pattern = values["pattern"]
     n_rows, n_columns = pattern.shape[:2]
-    # rounded up, so that pictures have ROWS pixels of height at least
+    # -(-a // b) is rounded up, so that pictures have ROWS pixels of height at least
     factor = -(-ROWS // n_rows)
     marks, marked_texels = make_marks((n_rows, n_columns), factor)
     # the mean of each texel, at the resolution of the pattern
@@ -90,6 +91,7 @@ def write_projector(
     Exporter.write_png(folder / "picture.png", images.enlarge(pattern, factor))
     Exporter.write_png(folder / "texels.png", pattern)
     Exporter.write_png(folder / "marks.png", color.linear_to_srgb(marks))
+    # the scene as the run has it, but with the marks in place of the pattern
     lit_inputs = control.scene_inputs(
         {**values, "pattern": color.linear_to_srgb(texel_marks)}, {}
     )
@@ -195,6 +197,7 @@ def make_marks(
             (row, column, (column + 0.5) / n_columns, (row + 0.5) / n_rows)
         )
         center = (column + 0.5) * factor, (row + 0.5) * factor
+        # the number beside the cross is how many there are by now
         draw_cross(draw, center, height // 24, line, str(len(marked_texels)))
     levels = torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8).reshape(
         height, width, 1

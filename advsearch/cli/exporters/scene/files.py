@@ -71,6 +71,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
                 " ".join(notes),
                 hide_environment=backdrop is not None,
             )
+            # moved when all are written, so that an error leaves none
             for file in sorted(Path(folder).iterdir()):
                 os.replace(file, path.parent / file.name)
         title = (
@@ -131,6 +132,7 @@ def describe_formation(renderer: Any, gain: float, backdrop: Any) -> list[str]:
         "off at 1.",
     ]
     if backdrop is not None:
+        # in units of the radiance, to which it is added
         channels = (backdrop / renderer.formation.gain).tolist()
         red, green, blue = (f"{channel:.9g}" for channel in channels)
         notes.append(
@@ -178,17 +180,17 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
     adversarial = exports.AdversarialRun.load(run)
-    part, found = adversarial.posed_object()
+    # the object of the scene, and the asset of it as the search left it
+    part, posed_asset = adversarial.posed_object()
     description = adversarial.problem.space.scene
     metres = None if description is None else description.object.size_in_metres
     if metres is not None:
         # lengths of our scenes are in object sizes, those of glTF in metres
-        found = replace(
-            found,
-            mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)),
-        )
+        posed_mesh = posed_asset.mesh
+        vertices = posed_mesh.vertices * np.float32(metres)
+        posed_asset = replace(posed_asset, mesh=replace(posed_mesh, vertices=vertices))
     with writing.name_setting_in_errors("out"):
-        writing.write_bytes(out, reading.encode_glb([found]))
+        writing.write_bytes(out, reading.encode_glb([posed_asset]))
     unit = "object sizes" if metres is None else "metres"
     notes = [f"Lengths are in {unit}, y is up, and the texture is rounded to 8 bits."]
     if part.surface is not None:
@@ -196,9 +198,9 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
             "Its surface is one of Mitsuba's own, of which glTF has the base "
             "colour only."
         )
-    elif found.material.specular > reading.DEFAULT_SPECULAR:
+    elif posed_asset.material.specular > reading.DEFAULT_SPECULAR:
         notes.append(
-            f"A specular of {found.material.specular:g} is over glTF's largest, "
+            f"A specular of {posed_asset.material.specular:g} is over glTF's largest, "
             f"{reading.DEFAULT_SPECULAR:g}, which it has there."
         )
     return notes
