@@ -184,7 +184,7 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
 
     Args:
         path: the file.
-        header: header that of a glTF file, or of a file that was converted to glTF.
+        header: header of a glTF file, or of a file that was converted to glTF.
         up: the axis that points up, if the user named it.
     """
     suffix = path.suffix.lower()
@@ -241,12 +241,7 @@ def make_object(
     surfaces = [part.surface for part in parts]
     soup = repair(join_parts(parts, str(file), rotation), str(file), object_notes)
     soup, maps = apply_textures(soup, surfaces, object_notes)
-    opacity = None
-    if maps.color.shape[2] == 4:
-        opacity = np.ascontiguousarray(maps.color[:, :, 3])
-        if not opacity.any():
-            opacity = None
-            object_notes.warn("it is transparent all over; it is shown opaque")
+    opacity = _find_opacity(maps.color, object_notes)
     material = _compute_mean_material(soup, surfaces, object_notes)
     # The soup's extent is 1 but for faces that the repair has removed.
     extent = compute_extent(parts) * float(
@@ -307,6 +302,20 @@ def _find_up(
     )
 
 
+def _find_opacity(color: Float32Array, notes: Notes) -> Float32Array | None:
+    """Return the opacity (H, W) in a map of colors (H, W, 3 or 4); None if opaque.
+
+    What is transparent all over would be invisible, and counts as opaque, with a note.
+    """
+    if color.shape[2] < 4:
+        return None
+    opacity = np.ascontiguousarray(color[:, :, 3])
+    if not opacity.any():
+        notes.warn("it is transparent all over; it is shown opaque")
+        return None
+    return opacity
+
+
 def _compute_mean_material(
     soup: TriangleSoup, surfaces: list[ImportedSurface], notes: Notes
 ) -> Material:
@@ -320,6 +329,7 @@ def _compute_mean_material(
         weights=np.linalg.norm(soup.compute_face_vectors(), axis=1),
         minlength=len(surfaces),
     )
+    # What a surface does not state has the value of the default material.
     materials = [Material().with_values(vars(surface), "") for surface in surfaces]
     values = np.array(
         [[material.roughness, material.metallic] for material in materials]
@@ -354,9 +364,10 @@ def _make_mesh(
 ) -> Mesh:
     """Return the normalised mesh with its materials, and a rig if something moves it.
 
-    `turn` (3, 3) leads from the file's axes to ours.
+    Its largest extent becomes 1. `turn` (3, 3) leads from the file's axes to ours.
     """
     material_names, material_of_face = index_materials(soup, surfaces)
+    # Groups end with the last material that has faces.
     faces_by_material = zip(
         material_names, group_indices(material_of_face), strict=False
     )

@@ -210,10 +210,11 @@ def apply_opacity(
     if cutoff is not None:
         opacity = (opacity >= cutoff).astype(np.float32)
     rgb = color[..., :3]
-    if opacity.min() >= 1.0:
+    if opacity.min() >= 1.0:  # opaque everywhere
         return rgb
     is_cut_out = opacity[..., 0] == 0.0
-    if color.ndim == 3 and not is_cut_out.all():
+    is_image = color.ndim == 3  # not a single color
+    if is_image and not is_cut_out.all():
         # for each texel the rows and columns of the nearest one that is not cut out
         nearest_visible = distance_transform_edt(
             is_cut_out, return_distances=False, return_indices=True

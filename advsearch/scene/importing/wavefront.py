@@ -323,9 +323,10 @@ def _combine_colors(
         if is_tinted:
             notes.warn("colours of vertices are left out where there is a texture")
         return surface, None
-    if surface.color is None:
+    if surface.color is None:  # white, so that only the vertex colors count
         return replace(surface, color=np.ones(3, np.float32)), colors
-    if is_tinted and surface.color[:3].min() < 0.999:
+    is_white = surface.color[:3].min() >= 0.999
+    if is_tinted and not is_white:
         notes.warn("colours of vertices are multiplied by the Kd of their material")
     return surface, colors
 
@@ -358,6 +359,7 @@ def _parse_statements(
             smoothing_changes.append((row, clean_argument))
         elif key in NON_FACE_STATEMENTS:
             notes.record(f"{NON_FACE_STATEMENTS[key]}, statement", key)
+        # What only groups faces, or is switched off, changes nothing.
         elif key not in GROUPING and clean_argument not in ("off", "0"):
             notes.record("statement", keyword)
     return library_lines, material_changes, smoothing_changes
@@ -408,6 +410,7 @@ def _read_colors(
     if stored_colors is None:
         return None
     has_color = np.asarray(np.isfinite(stored_colors).all(axis=1))
+    # In [0, 1] a color may be a little over 1; in [0, 255] one of 2 is black.
     is_in_bytes = has_color.any() and stored_colors[has_color].max() > 2.0
     scale = 255.0 if is_in_bytes else 1.0
     colors = np.where(has_color[:, None], stored_colors / scale, NEUTRAL_GREY)
@@ -579,7 +582,7 @@ class ObjLines:
                     f"at least {kind_indices.max()} {kind!r} lines",
                     f"{got} (is the file cut short?)",
                 )
-        return corners - 1, sizes, rows
+        return corners - 1, sizes, rows  # the file counts from 1, and has 0 for none
 
     def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:
         """Raise FileFormatError for a last face cut short, or faces over a limit.
@@ -681,7 +684,9 @@ class ObjLines:
                         f"whole numbers in the face on line {line_number}",
                         format_name(word),
                     )
+                # What is left out, as in 1//3, is right: it counts as 1.
                 indices = [int(text or "1") for text in word.split("/")]
+                # A negative index counts backwards from the face's line.
                 is_wrong = any(
                     not index or index < -count
                     for index, count in zip(indices, counts, strict=False)
@@ -691,6 +696,7 @@ class ObjLines:
                         f"indices that count from 1 in the face on line {line_number}",
                         format_name(word),
                     )
+        # No single face is wrong, and yet they could not be parsed together.
         raise self.notes.damaged("whole numbers in faces", "something else")
 
 
