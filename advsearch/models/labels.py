@@ -117,7 +117,7 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
     table = {
         name: indices
         for name, indices in _make_name_table(labels).items()
-        if "," not in name
+        if "," not in name  # full labels: their synonyms are in the table, too
     }
     synonym_groups = json.loads((DATA / "synonyms.json").read_text("utf-8"))
     key = _normalize_name(word)
@@ -152,6 +152,7 @@ def _find_class(
         InputError: there is no such class, or several.
     """
     indices = table.get(_normalize_name(term), [])
+    # "#504" is always an index, "504" only if no label has that name.
     number = re.fullmatch(r"#\s*(-?\d+)", term)
     if not number and not indices:
         number = re.fullmatch(r"(-?\d+)", term)
@@ -384,17 +385,17 @@ def _read_file(path: Path) -> tuple[str, ...]:
     try:
         text = read_text(path, "a label file", MAX_FILE_BYTES)
     except OSError as error:
-        advice = (
-            ""
-            if path.suffix
-            else (", and several names have commas between them, such as 'mug,cup'")
-        )
+        # Without a suffix, the path may have been meant for a name.
+        advice = ""
+        if not path.suffix:
+            advice = ", and several names have commas between them, such as 'mug,cup'"
         raise FileFormatError(
             f"{where}: cannot be read ({error.strerror or error}){advice}"
         ) from None
     if not text.strip():
         raise FileFormatError(f"{where}: expected label names, got an empty file")
     names: Any = [line.strip() for line in text.strip("\r\n").splitlines()]
+    # Text has a name on each line, even on an empty one within it.
     if path.suffix.lower() == ".json" or text.lstrip()[0] in "[{":
         try:
             names = parse_json(text)

@@ -256,7 +256,7 @@ def _probe_source(
         origin: origin of the names, for messages.
     """
     min_batch, max_batch = source.batch_limits
-    max_batch = min(max_batch, options.get("max_batch") or max_batch)
+    max_batch = min(max_batch, options.get("max_batch") or max_batch)  # 0: not set
     preprocessing = _make_preprocessing(source, options)
     model = Model(
         module=_adapt_to_images_alone(source, preprocessing),
@@ -268,7 +268,8 @@ def _probe_source(
         device=source.device,
         read=read,
     )
-    return probe(model, source.labels if names is None else names, origin)
+    class_names = source.labels if names is None else names
+    return probe(model, class_names, origin)
 
 
 def _adapt_to_images_alone(
@@ -412,6 +413,7 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
                 raise InputError(
                     f"{key}: expected one of {', '.join(choices)}, got {options[key]!r}"
                 )
+    # What is empty has the default of `Preprocessing`.
     return Preprocessing(**{key: value for key, value in fields.items() if value})
 
 
@@ -489,7 +491,7 @@ def _parse_numbers(
     problem = InputError(f"{key}: expected {expected}, got {value!r}")
     if isinstance(value, str):
         value = value.split(",")
-    elif hasattr(value, "tolist"):
+    elif hasattr(value, "tolist"):  # a tensor or an array
         value = value.tolist()
     items = list(value) if isinstance(value, Sequence) else [value]
     try:

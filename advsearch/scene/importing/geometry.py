@@ -375,6 +375,26 @@ def _link_windings(
     return starts, ends
 
 
+def _select_larger_choice(
+    as_is: IntArray, turned: IntArray, area: Float64Array
+) -> BoolArray:
+    """Return which faces (F,) to turn over, so that most area of each shell stays.
+
+    Args:
+        as_is: (F,) for each face the choice, for its shell, that leaves it as it is.
+        turned: (F,) the reverse choice, which turns it over.
+        area: (F,) twice the area of each face.
+    """
+    n_choices = int(max(as_is.max(), turned.max())) + 1
+    # the area that each choice leaves as it is
+    unturned_area = np.bincount(as_is, weights=area, minlength=n_choices)
+    reverse_keeps_more = unturned_area[turned] > kept_area[as_is]
+    areas_are_equal = unturned_area[turned] == kept_area[as_is]
+    # Of equal areas the first face's winding is kept: choices are numbered by their
+    # first face, which the lower one of two leaves as it is.
+    return reverse_keeps_more | (areas_are_equal & (turned < as_is))
+
+
 def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     """Decide which faces to turn over so that neighbours agree in winding.
 
@@ -395,16 +415,7 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     component = find_components(2 * len(area), starts, ends)
     as_is = component[0::2]
     turned = component[1::2]
-    # The area that each choice leaves as it is. A face is turned if more area is left
-    # by the reverse choice; of equal areas, the first face's winding is kept.
-    component_area = np.bincount(
-        as_is, weights=area, minlength=int(component.max()) + 1
-    )
-    reverse_is_larger = component_area[turned] > component_area[as_is]
-    areas_are_equal = component_area[turned] == component_area[as_is]
-    # Components are numbered by their first node, so the lower one has the first face
-    # as it is.
-    is_turned = reverse_is_larger | (areas_are_equal & (turned < as_is))
+    is_turned = _select_larger_choice(as_is, turned, area)
     # A shell is one component, or two that are each other's reverse.
     _, shell = np.unique(np.minimum(as_is, turned), return_inverse=True)
     return is_turned, shell.astype(np.int64), bool((as_is == turned).any())
