@@ -388,8 +388,8 @@ def _select_larger_choice(
     n_choices = int(max(as_is.max(), turned.max())) + 1
     # the area that each choice leaves as it is
     unturned_area = np.bincount(as_is, weights=area, minlength=n_choices)
-    reverse_keeps_more = unturned_area[turned] > kept_area[as_is]
-    areas_are_equal = unturned_area[turned] == kept_area[as_is]
+    reverse_keeps_more = unturned_area[turned] > unturned_area[as_is]
+    areas_are_equal = unturned_area[turned] == unturned_area[as_is]
     # Of equal areas the first face's winding is kept: choices are numbered by their
     # first face, which the lower one of two leaves as it is.
     return reverse_keeps_more | (areas_are_equal & (turned < as_is))
