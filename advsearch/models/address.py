@@ -98,6 +98,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
             f"key in {models.KEY}; "
             f"{models.explain_how_to_allow(spec)}"
         )
+    # A chat answers in words, another address with scores. After a # stands the name.
     chat = address.path.endswith(CHAT_SUFFIX)
     name = address.fragment or address.netloc
     free, question = purpose.parse_question(name, "is behind an address")
@@ -122,6 +123,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         times=purpose.times if free else 1,
     )
     if not free:
+        # Without names by the user, those of its scores for a gray image are taken.
         gray_image = np.full(
             (models.DEFAULT_SIZE, models.DEFAULT_SIZE, 3), 128, np.uint8
         )
@@ -155,7 +157,7 @@ def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
         if (
             isinstance(value, bool)
             or not isinstance(value, (int, float))
-            or not value >= 0
+            or not value >= 0  # NaN is not either
         ):
             raise InputError(
                 f"`ask` {name}: expected a number of at least 0, got {value!r}"
@@ -372,6 +374,7 @@ class AddressModel(models.RemoteNetwork):
         new_bodies = dict[str, dict[str, Any]]()
         for image, turn in requests:
             body = self._make_body(image)
+            # An answer is stored by all that it depends on.
             request = json.dumps([body, turn, self.spec]).encode()
             key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
             keys.append(key)
@@ -379,7 +382,7 @@ class AddressModel(models.RemoteNetwork):
                 answers[key] = self.answer_cache.get(key)
             else:
                 answers[key] = self.store.read_json_note(key)
-            if not isinstance(answers[key], dict):
+            if not isinstance(answers[key], dict):  # it is not stored, or damaged
                 new_bodies[key] = body
         new_keys = list(new_bodies)
         for index, response in self._send(list(new_bodies.values())):
@@ -537,6 +540,7 @@ class AddressModel(models.RemoteNetwork):
                         failures.append(reason)
                     else:
                         retries.append(retry)
+            # After all responses of the wave, so that none is lost.
             if failures:
                 raise errors.ModelError(failures[0])
             if retries:
@@ -544,7 +548,7 @@ class AddressModel(models.RemoteNetwork):
                 delayed = [
                     replace(request, delay=2 * request.delay) for request in retries
                 ]
-                pending = delayed + pending
+                pending = delayed + pending  # they come first
 
     def _max_concurrent(self) -> int:
         """Return how many requests may be sent at once."""
@@ -581,7 +585,7 @@ class AddressModel(models.RemoteNetwork):
             spent = self._spent_by_limit
             reached = [name for name in spent if spent[name] >= self.limits[name]]
             if reached and count:
-                break
+                break  # those counted so far may be made
             if reached:
                 name = reached[0]
                 limit = self.limits[name]
@@ -656,10 +660,11 @@ class AddressModel(models.RemoteNetwork):
             The reason, whether another try may succeed, and after how many seconds.
         """
         if not isinstance(error, urllib.error.HTTPError):
-            cause = getattr(error, "reason", error)
+            cause = getattr(error, "reason", error)  # what urllib's error wraps
             text = type(cause).__name__
             if str(cause):
                 text += f": {cause}"
+            # Later a refused connection may mean that the server is restarted.
             no_server = first and isinstance(cause, ConnectionRefusedError)
             is_final = isinstance(cause, (ssl.SSLCertVerificationError, ValueError))
             return self._clean(text), not no_server and not is_final, 0.0
@@ -702,19 +707,22 @@ class AddressModel(models.RemoteNetwork):
         key = models.read_key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)
-        if key:
+        if key:  # never sent on to another address
             request.add_unredirected_header("Authorization", f"Bearer {key}")
         handlers: list[Any] = [
             models.NoRedirect,
             _PlainHandler(deadline, connections),
             _SecureHandler(deadline, connections),
         ]
-        if models.is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
+        # without the port, and the brackets of an IPv6 address
+        host = request.host.rpartition(":")[0].strip("[]") or request.host
+        if models.is_local(host):  # no proxy leads to this machine
             handlers.append(urllib.request.ProxyHandler({}))
         opener = urllib.request.build_opener(*handlers)
         max_size = stored_files.scale_limit(MAX_ANSWER_BYTES)
         content = bytearray()
         with opener.open(request, timeout=self.limits["seconds"]) as response:
+            # Read in pieces: a server may send without end.
             while chunk := response.read1(1 << 16):
                 content += chunk
                 if len(content) > max_size:

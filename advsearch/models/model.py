@@ -604,6 +604,7 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.
     """
+    # The usual case, first because it is quick.
     if (
         isinstance(output, Tensor)
         and output.is_floating_point()
@@ -621,6 +622,7 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
         got = describe_output(output if tensor is None else tensor)
         raise ModelError(f"{expected}, got {got}; {advice}")
     likely_task = _guess_task(output)
+    # A map of scores for each pixel gets the advice on its shape below instead.
     is_map = tensor is not None and tensor.dim() == 4
     has_other_task = likely_task in ("detection", "segmentation", "depth", "similarity")
     if likely_task and has_other_task and not is_map:
