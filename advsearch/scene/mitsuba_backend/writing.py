@@ -162,8 +162,8 @@ def _put_all_inputs(
     unset_names = []
     for name in sorted(inputs):
         key, _ = scene.declared_inputs[name]
-        has_place = _put_input(xml_scene, key.split("."), inputs[name])
-        if not has_place:
+        was_put = _put_input(xml_scene, key.split("."), inputs[name])
+        if not was_put:
             unset_names.append(name)
     if unset_names:
         raise InputError(

@@ -89,7 +89,6 @@ def read_scene(path: Path) -> Plugin:
     return scene
 
 
-@dataclass
 def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element) -> Any:
     """Parse a scene with Mitsuba's parser, and return the parser's state.
 
@@ -119,6 +118,7 @@ def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element)
         ) from error
 
 
+@dataclass
 class _SceneText:
     """The text of a scene file and of the files that it includes.
 
