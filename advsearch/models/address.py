@@ -312,6 +312,7 @@ class AddressModel(models.RemoteNetwork):
         levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8)
         images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
         if self.names:
+            # Scores of 0 have no logarithm: they are `MIN_SCORE`.
             rows = [
                 [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
                 for scores in self.request_scores(images)
@@ -449,7 +450,7 @@ class AddressModel(models.RemoteNetwork):
             raise self._make_error(
                 "choices with a message, as a chat answers", response
             ) from None
-        if isinstance(content, list):
+        if isinstance(content, list):  # in pieces
             content = " ".join(
                 str(part.get("text", "")) for part in content if isinstance(part, dict)
             )
@@ -643,7 +644,7 @@ class AddressModel(models.RemoteNetwork):
                     error.url, error.code, error.reason, error.headers, io.BytesIO(text)
                 )
             return error
-        # URLError is an OSError
+        # urllib's URLError is an OSError, too
         except (OSError, http.client.HTTPException, errors.ModelError) as error:
             return error
 
@@ -772,6 +773,7 @@ class AddressModel(models.RemoteNetwork):
             isinstance(count, int) and not isinstance(count, bool) and count >= 0
             for count in counts
         )
+        # Tokens of a limit that nobody set, and of no price, need not be known.
         if is_stated:
             tokens_in, tokens_out = counts
             self.spent.update({"tokens_in": tokens_in, "tokens_out": tokens_out})

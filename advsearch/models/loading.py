@@ -147,13 +147,14 @@ def load_model(
             f"{task.names_source}; leave `labels` out"
         )
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
+    # Only tasks that read texts have `tokens` and `times`.
     purpose = Purpose(
-        task.name if task else "classification",
-        names,
-        prompts,
-        getattr(task, "tokens", 16),
-        getattr(task, "times", 1),
-        ask or {},
+        task=task.name if task else "classification",
+        names=names,
+        prompts=prompts,
+        tokens=getattr(task, "tokens", 16),
+        times=getattr(task, "times", 1),
+        ask=ask or {},
     )
     source = _find_source(spec, purpose)
     switches = find_code_switches()
@@ -473,6 +474,7 @@ def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
     for key in ("mean", "std"):
         value = options.get(key)
         if isinstance(value, str) and value.strip().lower() in PRESETS:
+            # A preset sets both, but does not replace what the user gave for the other.
             preset_mean, preset_std = PRESETS[value.strip().lower()]
             if key == "mean" or "mean" not in options:
                 fields["mean"] = preset_mean
@@ -481,7 +483,7 @@ def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
         elif value is not None:
             expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
             numbers = _parse_numbers(key, value, (1, 3), expected)
-            # One number is repeated.
+            # The first, middle and last of three; of one number three times this.
             fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
     return fields
 

@@ -74,6 +74,7 @@ class TriangleSoup:
 
         Normals stay as they are.
         """
+        # Two corners of a turned face change places, with all that belongs to them.
         order = np.where(mask[:, None], [0, 2, 1], [0, 1, 2])
         rows = np.arange(len(order))[:, None]
         names = ["faces", "normals", "uvs", "colors"]
@@ -219,7 +220,7 @@ def find_unique_rows(rows: npt.NDArray[Any]) -> tuple[IntArray, IntArray]:
         The index of the first row of each distinct one (U,), and which of these each
         row is (N,).
     """
-    order = np.lexsort(rows.T[::-1])
+    order = np.lexsort(rows.T[::-1])  # its last key, here the first column, counts most
     is_new = np.ones(len(rows), np.bool_)
     is_new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
     unique_of_row = np.empty(len(rows), np.int64)
@@ -336,6 +337,7 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
         and whether both faces run along it in the same direction, that is, disagree in
         winding.
     """
+    # The side k of a face runs from its corner k to the next one.
     start = faces.reshape(-1)
     end = np.roll(faces, -1, axis=1).reshape(-1)
     lower = np.minimum(start, end)
@@ -369,6 +371,7 @@ def _link_windings(
             one of them must be turned.
     """
     starts = np.concatenate([2 * left_face, 2 * left_face + 1])
+    # `same_direction` is 1 where the "as it is" of one agrees with the other "turned".
     ends = np.concatenate(
         [2 * right_face + same_direction, 2 * right_face + 1 - same_direction]
     )
@@ -764,15 +767,15 @@ def _project_to_planes(corners: Float64Array) -> Float64Array:
     """
     corners = corners - corners.mean(axis=1, keepdims=True)
     sizes = np.abs(corners).max(axis=(1, 2), keepdims=True)
-    corners = corners / np.maximum(sizes, 1e-300)
+    corners = corners / np.maximum(sizes, 1e-300)  # never by 0
     normal = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     # the axis that is the least parallel to the normal
     other_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
     x_axis = np.cross(other_axis, normal)
     x_axis /= np.maximum(np.linalg.norm(x_axis, axis=1, keepdims=True), 1e-300)
-    plane = np.stack([x_axis, np.cross(normal, x_axis)], axis=2)
-    return np.asarray(corners @ plane)
+    plane_axes = np.stack([x_axis, np.cross(normal, x_axis)], axis=2)
+    return np.asarray(corners @ plane_axes)
 
 
 def _compute_doubled_areas(
@@ -883,7 +886,7 @@ class _EarCutter:
         self.is_present[rows] &= self.dent[rows] != b[:, None]
         self.next_corner[rows, a] = c
         self.previous_corner[rows, c] = a
-        self.n_tries[rows] = 0
+        self.n_tries[rows] = 0  # without b, other corners may be ears
         self.n_cut[rows] += 1
 
 

@@ -121,12 +121,14 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
 def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
     """Return the error for the first entry of a header that is invalid."""
     first_error = error.errors(include_url=False)[0]
+    # As in "meshes[0].primitives[1].mode".
     keys = (
         f"[{key}]" if isinstance(key, int) else f".{key}" for key in first_error["loc"]
     )
     location = "".join(keys).lstrip(".")
     if first_error["type"] == "missing":
         return damaged(path, f"glTF with {location}", "nothing")
+    # pydantic's sentences, without their beginnings
     requirement = (
         first_error["msg"].removeprefix("Input should be ").removeprefix("Field ")
     )
@@ -240,7 +242,7 @@ def _check_references(path: Path, header: Header) -> None:
     """
     for entry in header.iterate_entries():
         for kind, index in entry.iterate_references():
-            count = len(getattr(header, kind))
+            count = len(getattr(header, kind))  # such as `header.meshes`
             if index >= count:
                 raise damaged(
                     path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}"

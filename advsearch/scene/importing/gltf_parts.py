@@ -418,6 +418,7 @@ class GltfSurfaces:
         image = self._load_image(
             use, "colours", "the texture {name} of the emission {why}; it is left out"
         )
+        # A texture that cannot be read leaves no emission: without it all would shine.
         if use is not None and image is None:
             return None
         return compute_radiance(factor, image, self.notes)
@@ -827,7 +828,7 @@ def _read_pieces(
     }
     pieces = dict[tuple[int, int], PrimitiveData | None]()
     for mesh in meshes:
-        assert mesh is not None
+        assert mesh is not None  # for mypy: these nodes have meshes
         entry = header.meshes[mesh]
         for index, primitive in enumerate(entry.primitives):
             pieces[mesh, index] = read_primitive(
@@ -1191,10 +1192,11 @@ def _make_triangles(order: IntArray, mode: int) -> IntArray:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
     index = np.arange(max(0, len(order) - 2))
     if mode == STRIP:
+        # i, i + 1, i + 2 of an even face, and i, i + 2, i + 1 of an odd one
         corners = np.stack(
             [index, index + 1 + index % 2, index + 2 - index % 2], axis=1
         )
-    else:
+    else:  # all faces of a fan share the first vertex
         corners = np.stack([index + 1, index + 2, np.zeros_like(index)], axis=1)
     faces = order[corners]
     # Faces with a repeated vertex join strips that are far apart.

@@ -524,6 +524,7 @@ class MtlReader:
                 *(other for other in uses if uses[other].name == use.name)
             )
             if image is not None:
+                # These two keywords are for normals alone; bump maps may be either.
                 if key in ("norm", "map_kn") or has_normals(image):
                     return make_normal_map(image, use.bump)
                 self._images.note_missing(
@@ -539,7 +540,7 @@ class MtlReader:
         They are multiplied; without a map the radiance is (1, 1, 3). A map that cannot
         be read leaves no emission, with a note.
         """
-        values = parse_numbers(material.read_argument("ke") or "0")
+        values = parse_numbers(material.read_argument("ke") or "0")  # by default black
         if values is None or len(values) not in (1, 3) or min(values) < 0:
             self.notes.warn(
                 f"the emission {format_name(material.read_argument('ke'))} is no "
@@ -573,6 +574,7 @@ class MtlReader:
         image = self._images.load_file(use.name, kind, note_template)
         if image is None or use.range == (0.0, 1.0):
             return image
+        # -mm base gain: values are multiplied by the gain, then the base is added.
         base, gain = map(np.float32, use.range)
         colors = np.clip(image[:, :, :3] * gain + base, 0.0, 1.0)
         return np.concatenate([colors, image[:, :, 3:]], axis=2)
@@ -586,9 +588,10 @@ def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """
     channel = CHANNELS.get(use.options.get("imfchan", "").lower())
     has_alpha = picture.shape[2] == 4
-    if channel is None and has_alpha and picture[:, :, 3].min() < 1.0:
-        channel = 3
-    if channel is None or (channel == 3 and not has_alpha):
+    alpha_index = 3
+    if channel is None and has_alpha and picture[:, :, alpha_index].min() < 1.0:
+        channel = alpha_index
+    if channel is None or (channel == alpha_index and not has_alpha):
         mean: Float32Array = picture[:, :, :3].mean(axis=2)
         return mean
     return picture[:, :, channel]

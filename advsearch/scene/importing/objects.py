@@ -157,7 +157,7 @@ def check_facing(facing: str, up: str | None) -> str:
             "facing: expected an axis of the file, one of "
             f"{', '.join(FRONT_AXES)}, got {facing!r}"
         )
-    if axis[1] == up:
+    if axis[1] == up:  # the letter behind the sign
         raise InputError(
             f"facing: {facing} is along the axis that points up, {up}; "
             "give another one, or another `up`"
@@ -294,6 +294,7 @@ def _find_up(
         return FileAxis(up)
     if file.suffix.lower() in GLTF_SUFFIXES:
         return FileAxis("y")
+    # the letter behind the sign: "y" of "-y"
     if front.axis[1] in UP_OF_FRONT:
         return FileAxis(UP_OF_FRONT[front.axis[1]])
     as_stored = join_parts(parts, str(file), np.eye(3))
@@ -422,6 +423,7 @@ def _compute_emitted(
     if emission is None or opacity is None:
         return emission
     rows, columns = emission.shape[:2]
+    # Pairs are compared by width first, then by height.
     width, height = max((columns, rows), (opacity.shape[1], opacity.shape[0]))
     resized_opacity = np.asarray(
         Image.fromarray(opacity).resize((width, height), Image.Resampling.BILINEAR)

@@ -384,7 +384,7 @@ def _combine_colors(
     """
     if colors is None:
         return surface, None
-    if surface.texture is None:
+    if surface.texture is None:  # white, so that only these colors count
         return ImportedSurface(color=np.ones(3, np.float32)), colors
     if colors[group].min() < 1.0:
         notes.warn("colours of vertices or faces are left out where there is a texture")
@@ -733,7 +733,7 @@ def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
     """
     largest = float(np.nan_to_num(values).max(initial=0.0))
     if kind.kind == "f":
-        return 1.0 if largest <= 2.0 else 255.0
+        return 1.0 if largest <= 2.0 else 255.0  # some are a little over 1
     if kind.itemsize == 1 or (kind.itemsize > 2 and largest <= 255.0):
         return 255.0
     if kind.itemsize == 2 or largest <= 65535.0:
