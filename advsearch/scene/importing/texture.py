@@ -193,7 +193,7 @@ def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     )
     # Smallest and largest material on each texel: if they differ, it is shared. Texels
     # without a face have a largest one of -1.
-    first_material = np.full(size * size, len(uvs))
+    first_material = np.full(size * size, len(uvs))  # more than any index
     last_material = np.full(size * size, -1)
     np.minimum.at(first_material, row * size + column, material[face])
     np.maximum.at(last_material, row * size + column, material[face])
@@ -595,6 +595,7 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     grid_i, grid_j = np.meshgrid(np.arange(steps), np.arange(steps))
     i = grid_i.reshape(-1)
     j = grid_j.reshape(-1)
+    # grid points at which a small triangle of either kind begins within the large one
     is_up = i + j < steps
     is_down = i + j < steps - 1
     # of the second and the third corner: steps along the two sides, as fractions
@@ -645,6 +646,7 @@ def sample_texture(texture: Float32Array, uvs: Float64Array) -> Float32Array:
     height, width = texture.shape[:2]
     # Modulo comes first, since a huge number times a width is infinite.
     u, v = (uvs % 1.0).T
+    # Texel centers are at integers, and row 0 is at the top, where v is 1.
     return look_up_texture(texture, u * width - 0.5, (1.0 - v) * height - 0.5)
 
 
@@ -755,6 +757,7 @@ def _compute_tangents(
     used_faces, used_index = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used_faces, k]] for k in range(3))
     uvs = soup.uvs[used_faces]
+    # v of the second and third corner, from the first one
     (_, v1) = (uvs[:, 1] - uvs[:, 0]).T
     (_, v2) = (uvs[:, 2] - uvs[:, 0]).T
     handedness = np.sign(compute_doubled_areas(uvs))[:, None]

@@ -377,6 +377,7 @@ def _find_values_in_effect(
     values = list(dict.fromkeys(value for _, value in changes))
     index_of_value = {value: index for index, value in enumerate(values)}
     change_rows = np.array([row for row, _ in changes], dtype=np.int64)
+    # the last change on a row before; -1 if there is none
     last_change = np.searchsorted(change_rows, rows) - 1
     # Position -1, of rows before the first change, is the last entry.
     index_of_change = np.array([*(index_of_value[value] for _, value in changes), -1])
@@ -539,6 +540,7 @@ class ObjLines:
                 )
             if not all(map(is_number, words)):
                 raise self.notes.damaged(f"numbers {where}", got)
+        # No single line is wrong, and yet they could not be parsed together.
         raise self.notes.damaged(f"numbers after {kind!r}", "something else")
 
     def read_faces(self, counts: dict[str, int]) -> tuple[IntArray, IntArray, IntArray]:
@@ -596,6 +598,7 @@ class ObjLines:
             ((line_number, words),) = self._iterate_words(rows[-1:])
             got = f"{format_name(' '.join(['f', *words]))} (is the file cut short?)"
             raise self.notes.damaged(f"3 or more corners on line {line_number}", got)
+        # Rows count from 0, lines from 1.
         where = f"in the face on line {rows[sizes.argmax()] + 1}"
         self.notes.check_most(
             int(sizes.max()), MAX_CORNERS, f"at most {{}} corners {where}"
@@ -624,6 +627,7 @@ class ObjLines:
         count_before = np.repeat(count_before_line[rows], sizes)
         if (index < -count_before).any():
             self._raise_for_faces(rows)
+        # -1 is the last row above the line, whose number is their count.
         index[is_relative] += (count_before + 1)[is_relative]
 
     def read_zbrush_colors(self, count: int) -> Float64Array | None:
@@ -636,8 +640,9 @@ class ObjLines:
         digits = b"".join(
             re.findall(rb"^#MRGB[ \t]+([0-9a-fA-F]+)", self.text, re.MULTILINE)
         )
-        if len(digits) != 8 * count:
+        if len(digits) != 8 * count:  # not a color for each vertex
             return None
+        # two hexadecimal digits for each channel
         channels = np.frombuffer(bytes.fromhex(digits.decode()), np.uint8)
         # The first of four is a mask.
         return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
@@ -712,6 +717,7 @@ def _normalize_lines(data: bytes) -> bytes:
     # A backslash continues a line, but not a comment.
     if _CONTINUED.search(text):
         text = _CONTINUED.sub(b" ", _COMMENTED.sub(rb"\1\n", text))
+    # Lines without their leading blanks.
     if b"\n " in text or b"\n\t" in text or text[:1] in b" \t":
         text = re.sub(rb"\n[ \t]+", b"\n", text.lstrip(b" \t"))
     # Old files have ``fo`` for a face.

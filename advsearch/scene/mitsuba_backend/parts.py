@@ -132,6 +132,7 @@ def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
         ]
     owner = scene_input.owner
     if owner is not None:
+        # Mitsuba's properties of a parameter: the third is the object that has it.
         keys = [key for key in keys if parameters.properties[key][2] is owner]
     if len(keys) > 1:
         raise RuntimeError(
@@ -400,7 +401,8 @@ def _translate_beam(part: parts.BeamLamp) -> Translation:
     slanted by it.
     """
     height, width = part.table.shape
-    # Middles of the table's cells, on a plane at distance 1.
+    # Centers of the table's cells, on a plane at distance 1: every second of the points
+    # that cut the plane into half cells. A field of view of 90 degrees is 2 wide there.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
@@ -568,7 +570,7 @@ def convert_refusals(description: SceneDescription) -> Iterator[None]:
             yield
     except (RuntimeError, TypeError, ValueError) as error:
         if not has_user_surface and not has_user_plugins:
-            raise
+            raise  # it is our own mistake
         reason = " ".join(str(error).split())
         raise InputError(
             f"{description.object_name}: Mitsuba refuses the scene: "

@@ -277,7 +277,7 @@ class MitsubaScene:
         other = MitsubaScene(
             description, self.resolution, filter=filter_name, **settings
         )
-        # An integrator that is loaded later makes the recordings of all scenes stale.
+        # Load both now: one that is loaded later makes the recordings of all scenes stale.
         for method in ("path", "guides"):
             other._integrator(method)
         return other
@@ -470,6 +470,7 @@ class MitsubaScene:
                     on_glass = hits.visible_mask(part.name)
                     carrier_face = torch.from_numpy(part.face_of_carrier)
                     hits.face[on_glass] = carrier_face[hits.face[on_glass]]
+                    # ids count from 1, and 0 is no surface
                     hits.id[on_glass] = hits.names.index(part.carrier) + 1
             return hits
 
@@ -702,10 +703,12 @@ class MitsubaScene:
         """
         self._check_known(inputs)
         if self._every:
+            # All inputs are written at each call, as if none were set.
             inputs = {**self._every, **inputs}
             self._applied.clear()
         changes = self._find_changes(inputs)
-        population.changes += not self._literals.isdisjoint(changes)
+        changes_literal = not self._literals.isdisjoint(changes)
+        population.changes += changes_literal
         for name, fresh in changes.items():
             self._write(name, fresh)
             if fresh is None:

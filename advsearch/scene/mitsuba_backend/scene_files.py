@@ -269,6 +269,7 @@ def _find_shape(
     """
 
     def letters_of(name: str) -> str:
+        """Return the letters and digits of a name, without case."""
         return "".join(filter(str.isalnum, name.casefold()))
 
     ids = [name for name, plugin in named.items() if plugin["type"] in SHAPE_TYPES]
@@ -293,6 +294,7 @@ def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
     ]
     if not posed_sensors:
         return False
+    # A camera's own upward axis is its y axis, the second column.
     upwards = abs(shapes.get_pose(posed_sensors[0])[:3, 1])
     return bool(upwards[2] > upwards[1])
 
@@ -551,6 +553,7 @@ class _ObjectFrame:
             -(lower[1] + upper[1]) / 2,
             -lower[2],
         )
+        # z up first, then centered on the ground, then of extent 1
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ translation @ to_z_up
 
     def move_plugin(

@@ -303,7 +303,7 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     end = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), np.float64)
     radius = _get_radius(shape)
     length = float(np.linalg.norm(end - start))
-    axis = (end - start) / max(length, 1e-30)
+    axis = (end - start) / max(length, 1e-30)  # not by 0
     x, y, z = axis
     sign = np.copysign(1.0, z)
     # axes as in Mitsuba's `coordinate_system` (Duff et al. 2017), which has float32
@@ -406,8 +406,10 @@ def _read_haze_medium(
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
     # how many lengths of the object one length of the scene has
+    # (the cube root of the determinant is the scale of lengths)
     object_size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / object_size
+    # one value for all channels, and in range
     is_grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MAX_EXTINCTION
     albedo = np.broadcast_to(_parse_numbers(medium.get("albedo", 0.75)), (3,)).tolist()
     if not (is_grey and MIN_ALBEDO <= min(albedo) and max(albedo) <= 1.0):
@@ -602,6 +604,7 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
             f"it has no base colour that can be searched ({reason}): not for "
             "texture, patch and material"
         )
+    # with a tolerance for rounding; NaN is out of range too
     if not (linear.min() >= 0.0 and linear.max() <= 1.0 + 1e-4):
         notes.append("its base colour is cut to reflectances from 0 to 1")
     return notes
@@ -719,8 +722,9 @@ def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
     """
     image = value.get("bitmap")
     if isinstance(image, np.ndarray):
-        if image.ndim == 2:
+        if image.ndim == 2:  # grey
             image = image[:, :, None]
+        # without alpha, the second or the fourth channel
         image = image[:, :, :1] if image.shape[2] == 2 else image[:, :, :3]
         return np.broadcast_to(image, (*image.shape[:2], 3)).astype(np.float32)
     if image is None and "filename" not in value:
@@ -729,7 +733,7 @@ def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
         bitmap = mi.Bitmap(str(value["filename"]) if image is None else image)
     except (RuntimeError, TypeError):
         return None  # Mitsuba gives the reason when the scene is loaded
-    if value.get("raw"):
+    if value.get("raw"):  # its values are taken as linear
         bitmap.set_srgb_gamma(False)
     return np.array(
         bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False),
