@@ -87,12 +87,10 @@ def find_label_set(
         InputError: no term, an unknown name (with near matches), a name of several
             classes (with their indices), an index that the model does not have.
     """
-    terms = (
-        [str(text)] if isinstance(text, (str, int)) else [str(term) for term in text]
-    )
-    terms = [
-        term.strip() for joined in terms for term in joined.split(",") if term.strip()
-    ]
+    texts: Sequence[str | int] = [text] if isinstance(text, (str, int)) else text
+    # Each text may have several terms itself.
+    joined_terms = ",".join(str(entry) for entry in texts)
+    terms = [term.strip() for term in joined_terms.split(",") if term.strip()]
     if not terms:
         raise InputError(
             f"label: expected at least one label name or class index, got {text!r}"
@@ -153,11 +151,11 @@ def _find_class(
     """
     indices = table.get(_normalize_name(term), [])
     # "#504" is always an index, "504" only if no label has that name.
-    number = re.fullmatch(r"#\s*(-?\d+)", term)
-    if not number and not indices:
-        number = re.fullmatch(r"(-?\d+)", term)
-    if number:
-        index = int(number[1])
+    index_match = re.fullmatch(r"#\s*(-?\d+)", term)
+    if not index_match and not indices:
+        index_match = re.fullmatch(r"(-?\d+)", term)
+    if index_match:
+        index = int(index_match[1])
         if not 0 <= index < len(labels):
             raise InputError(
                 "label: expected a class index from 0 to "

@@ -667,7 +667,8 @@ def _check_gradient(
         gradient: (N, H, W, 3) of `_compute_checked_value`.
         detached: whether the network detaches tensors, for the message.
     """
-    # Suppression of boxes may make outputs jump in the larger step only.
+    # A gradient that holds for one of two steps is right. Suppression of boxes may make
+    # outputs jump in the larger one only.
     step_sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)
     min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
     if min_step > STEP:
@@ -684,10 +685,9 @@ def _check_gradient(
             if len(choices) > 1:
                 return  # outputs that jump cannot be compared with a gradient
         size = max(abs(change), abs(predicted))
-        if (
-            size <= MIN_CHANGE * total
-            or abs(change - predicted) <= MAX_GRADIENT_ERROR * size
-        ):
+        is_too_small_to_tell = size <= MIN_CHANGE * total
+        is_predicted = abs(change - predicted) <= MAX_GRADIENT_ERROR * size
+        if is_too_small_to_tell or is_predicted:
             return
     reason = "Steps that round, or a defence that masks gradients?"
     if detached:

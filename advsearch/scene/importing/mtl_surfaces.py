@@ -92,16 +92,10 @@ class MtlReader:
         try:
             text = decode_text(self.references.get(name))
         except FileNotFoundError:
-            file_name = normalize_name(name)
-            missing_file = (
-                f"{format_name(file_name)}, which {self.references.refused[file_name]}"
-            )
-            self.notes.warn(
-                f" names the material file {missing_file}; neutral grey is used instead"
-            )
+            self._note_missing_library(name)
             return
         self.n_libraries += 1
-        file = normalize_name(name).rpartition("/")[2]
+        file = normalize_name(name).rpartition("/")[2]  # without its folder
         materials, stray_keywords = parse_mtl(text, file)
         for keyword in stray_keywords:
             self.notes.record(
@@ -109,6 +103,24 @@ class MtlReader:
                 "statement",
                 keyword,
             )
+        self._add_materials(materials)
+
+    def _note_missing_library(self, name: str) -> None:
+        """Note a material file that is missing, or that must not be read."""
+        file_name = normalize_name(name)
+        missing_file = (
+            f"{format_name(file_name)}, which {self.references.refused[file_name]}"
+        )
+        self.notes.warn(
+            f" names the material file {missing_file}; neutral grey is used instead"
+        )
+
+    def _add_materials(self, materials: Sequence[MtlMaterial]) -> None:
+        """Add the materials of one file by name; of equal names the first counts.
+
+        A second material of a name is noted, unless its statements are the same, or the
+        first is of another file.
+        """
         for material in materials:
             known_material = self._materials.setdefault(material.name, material)
             if (
@@ -116,8 +128,8 @@ class MtlReader:
                 and known_material.file == material.file
             ):
                 self.notes.warn(
-                    f"{file} has the material {format_name(material.name)} more "
-                    "than once; the first counts"
+                    f"{material.file} has the material {format_name(material.name)} "
+                    "more than once; the first counts"
                 )
         # A # may begin a comment or be part of a name: both are tried.
         for material in materials:
