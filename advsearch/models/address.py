@@ -98,6 +98,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
             f"key in {models.KEY}; "
             f"{models.explain_how_to_allow(spec)}"
         )
+    # A chat answers in words, another address with scores. After a # stands the name.
     chat = address.path.endswith(CHAT_SUFFIX)
     name = address.fragment or address.netloc
     free, question = purpose.parse_question(name, "is behind an address")
@@ -122,6 +123,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         times=purpose.times if free else 1,
     )
     if not free:
+        # Without names by the user, those of its scores for a gray image are taken.
         gray_image = np.full(
             (models.DEFAULT_SIZE, models.DEFAULT_SIZE, 3), 128, np.uint8
         )
@@ -155,7 +157,7 @@ def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
         if (
             isinstance(value, bool)
             or not isinstance(value, (int, float))
-            or not value >= 0
+            or not value >= 0  # NaN is not either
         ):
             raise InputError(
                 f"`ask` {name}: expected a number of at least 0, got {value!r}"
@@ -310,6 +312,7 @@ class AddressModel(models.RemoteNetwork):
         levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8)
         images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
         if self.names:
+            # Scores of 0 have no logarithm: they are `MIN_SCORE`.
             rows = [
                 [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
                 for scores in self.request_scores(images)
@@ -372,6 +375,7 @@ class AddressModel(models.RemoteNetwork):
         new_bodies = dict[str, dict[str, Any]]()
         for image, turn in requests:
             body = self._make_body(image)
+            # An answer is stored by all that it depends on.
             request = json.dumps([body, turn, self.spec]).encode()
             key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
             keys.append(key)
@@ -379,7 +383,7 @@ class AddressModel(models.RemoteNetwork):
                 answers[key] = self.answer_cache.get(key)
             else:
                 answers[key] = self.store.read_json_note(key)
-            if not isinstance(answers[key], dict):
+            if not isinstance(answers[key], dict):  # it is not stored, or damaged
                 new_bodies[key] = body
         new_keys = list(new_bodies)
         for index, response in self._send(list(new_bodies.values())):
@@ -446,7 +450,7 @@ class AddressModel(models.RemoteNetwork):
             raise self._make_error(
                 "choices with a message, as a chat answers", response
             ) from None
-        if isinstance(content, list):
+        if isinstance(content, list):  # in pieces
             content = " ".join(
                 str(part.get("text", "")) for part in content if isinstance(part, dict)
             )
@@ -537,6 +541,7 @@ class AddressModel(models.RemoteNetwork):
                         failures.append(reason)
                     else:
                         retries.append(retry)
+            # After all responses of the wave, so that none is lost.
             if failures:
                 raise errors.ModelError(failures[0])
             if retries:
@@ -544,7 +549,7 @@ class AddressModel(models.RemoteNetwork):
                 delayed = [
                     replace(request, delay=2 * request.delay) for request in retries
                 ]
-                pending = delayed + pending
+                pending = delayed + pending  # they come first
 
     def _max_concurrent(self) -> int:
         """Return how many requests may be sent at once."""
@@ -581,7 +586,7 @@ class AddressModel(models.RemoteNetwork):
             spent = self._spent_by_limit
             reached = [name for name in spent if spent[name] >= self.limits[name]]
             if reached and count:
-                break
+                break  # those counted so far may be made
             if reached:
                 name = reached[0]
                 limit = self.limits[name]
@@ -639,7 +644,7 @@ class AddressModel(models.RemoteNetwork):
                     error.url, error.code, error.reason, error.headers, io.BytesIO(text)
                 )
             return error
-        # URLError is an OSError
+        # urllib's URLError is an OSError, too
         except (OSError, http.client.HTTPException, errors.ModelError) as error:
             return error
 
@@ -656,10 +661,11 @@ class AddressModel(models.RemoteNetwork):
             The reason, whether another try may succeed, and after how many seconds.
         """
         if not isinstance(error, urllib.error.HTTPError):
-            cause = getattr(error, "reason", error)
+            cause = getattr(error, "reason", error)  # what urllib's error wraps
             text = type(cause).__name__
             if str(cause):
                 text += f": {cause}"
+            # Later a refused connection may mean that the server is restarted.
             no_server = first and isinstance(cause, ConnectionRefusedError)
             is_final = isinstance(cause, (ssl.SSLCertVerificationError, ValueError))
             return self._clean(text), not no_server and not is_final, 0.0
@@ -702,19 +708,22 @@ class AddressModel(models.RemoteNetwork):
         key = models.read_key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)
-        if key:
+        if key:  # never sent on to another address
             request.add_unredirected_header("Authorization", f"Bearer {key}")
         handlers: list[Any] = [
             models.NoRedirect,
             _PlainHandler(deadline, connections),
             _SecureHandler(deadline, connections),
         ]
-        if models.is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
+        # without the port, and the brackets of an IPv6 address
+        host = request.host.rpartition(":")[0].strip("[]") or request.host
+        if models.is_local(host):  # no proxy leads to this machine
             handlers.append(urllib.request.ProxyHandler({}))
         opener = urllib.request.build_opener(*handlers)
         max_size = stored_files.scale_limit(MAX_ANSWER_BYTES)
         content = bytearray()
         with opener.open(request, timeout=self.limits["seconds"]) as response:
+            # Read in pieces: a server may send without end.
             while chunk := response.read1(1 << 16):
                 content += chunk
                 if len(content) > max_size:
@@ -764,6 +773,7 @@ class AddressModel(models.RemoteNetwork):
             isinstance(count, int) and not isinstance(count, bool) and count >= 0
             for count in counts
         )
+        # Tokens of a limit that nobody set, and of no price, need not be known.
         if is_stated:
             tokens_in, tokens_out = counts
             self.spent.update({"tokens_in": tokens_in, "tokens_out": tokens_out})

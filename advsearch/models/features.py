@@ -149,7 +149,7 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
     heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     last = (heads or usable)[-1]
     attribute = "input" if heads else "output"
-    if getattr(last, attribute) is None:
+    if getattr(last, attribute) is None:  # a head whose input is a weight
         return None
 
     def read(batch: Tensor) -> Tensor:

@@ -91,7 +91,7 @@ def load_file(path: Path) -> Source:
             )
         if path.suffix.lower() == ".onnx":
             return load_onnx(path)
-        if head[:2] != b"PK":
+        if head[:2] != b"PK":  # as every zip archive begins
             raise FileFormatError(f"model file {path}: {_describe_file(path, head)}")
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
         if _find_archive_kind(archive) == "torchscript":
@@ -150,19 +150,9 @@ def _find_archive_kind(archive: Archive) -> str:
     path = archive.path
     names = archive.members
     if any(name.startswith("models/") and name.endswith(".json") for name in names):
-        kinds = ("opaque_obj", "custom_obj")
-        compiled = [
-            n
-            for n in names
-            if n.startswith("data/aotinductor/") or Path(n).name.startswith(kinds)
-        ]
-        if compiled:
-            raise make_archive_error(
-                path,
-                f"holds {min(compiled)!r}, which is a pickled object "
-                "or compiled code and never loaded",
-            )
+        _check_no_code(archive)
         return "exported"
+    # older versions of torch.export
     if "serialized_exported_program.json" in names:
         return "exported"
     if "constants.pkl" in names and any(name.startswith("code/") for name in names):
@@ -178,6 +168,23 @@ def _find_archive_kind(archive: Archive) -> str:
     )
 
 
+def _check_no_code(archive: Archive) -> None:
+    """Raise FileFormatError if an exported program has pickles or compiled code."""
+    pickle_prefixes = ("opaque_obj", "custom_obj")
+    members_with_code = [
+        name
+        for name in archive.members
+        if name.startswith("data/aotinductor/")
+        or Path(name).name.startswith(pickle_prefixes)
+    ]
+    if members_with_code:
+        raise make_archive_error(
+            archive.path,
+            f"holds {min(members_with_code)!r}, which is a pickled object "
+            "or compiled code and never loaded",
+        )
+
+
 def _describe_file(path: Path, head: bytes) -> str:
     """Describe what a file may be that is no zip archive, and what to do about it.
 
@@ -185,7 +192,9 @@ def _describe_file(path: Path, head: bytes) -> str:
         path: path of the file, whose suffix is looked at.
         head: its first 16 bytes.
     """
-    if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30:
+    # Eight bytes with the length of a header in JSON, and the header.
+    is_safetensors = head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30
+    if is_safetensors:
         return (
             "safetensors hold weights but no network; name what builds it: "
             "'package.module:callable@weights.safetensors' or "
@@ -196,6 +205,7 @@ def _describe_file(path: Path, head: bytes) -> str:
             "is Python code; name what makes the network in it: "
             f"'{path.stem}:NAME', from the folder of the file"
         )
+    # The first byte of a pickle is 0x80.
     if head[:1] == b"\x80" or path.suffix.lower() in (
         ".pkl",
         ".pickle",
@@ -228,7 +238,10 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     inputs = [nodes[name].meta.get("val") for name in names]
     is_rig = _check_inputs(source, names, inputs)
     images = inputs[0]
-    if len(names) == 2 and names[1] in SIZE_INPUTS and inputs[1].shape[1] == 2:
+    takes_sizes = (
+        len(names) == 2 and names[1] in SIZE_INPUTS and inputs[1].shape[1] == 2
+    )
+    if takes_sizes:  # the height and width of each image, which are known
         size_type = inputs[1].dtype
         source = replace(source, size_type=size_type)
     else:

@@ -87,12 +87,10 @@ def find_label_set(
         InputError: no term, an unknown name (with near matches), a name of several
             classes (with their indices), an index that the model does not have.
     """
-    terms = (
-        [str(text)] if isinstance(text, (str, int)) else [str(term) for term in text]
-    )
-    terms = [
-        term.strip() for joined in terms for term in joined.split(",") if term.strip()
-    ]
+    texts: Sequence[str | int] = [text] if isinstance(text, (str, int)) else text
+    # Each text may have several terms itself.
+    joined_terms = ",".join(str(entry) for entry in texts)
+    terms = [term.strip() for term in joined_terms.split(",") if term.strip()]
     if not terms:
         raise InputError(
             f"label: expected at least one label name or class index, got {text!r}"
@@ -117,7 +115,7 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
     table = {
         name: indices
         for name, indices in _make_name_table(labels).items()
-        if "," not in name
+        if "," not in name  # full labels: their synonyms are in the table, too
     }
     synonym_groups = json.loads((DATA / "synonyms.json").read_text("utf-8"))
     key = _normalize_name(word)
@@ -152,11 +150,12 @@ def _find_class(
         InputError: there is no such class, or several.
     """
     indices = table.get(_normalize_name(term), [])
-    number = re.fullmatch(r"#\s*(-?\d+)", term)
-    if not number and not indices:
-        number = re.fullmatch(r"(-?\d+)", term)
-    if number:
-        index = int(number[1])
+    # "#504" is always an index, "504" only if no label has that name.
+    index_match = re.fullmatch(r"#\s*(-?\d+)", term)
+    if not index_match and not indices:
+        index_match = re.fullmatch(r"(-?\d+)", term)
+    if index_match:
+        index = int(index_match[1])
         if not 0 <= index < len(labels):
             raise InputError(
                 "label: expected a class index from 0 to "
@@ -384,17 +383,17 @@ def _read_file(path: Path) -> tuple[str, ...]:
     try:
         text = read_text(path, "a label file", MAX_FILE_BYTES)
     except OSError as error:
-        advice = (
-            ""
-            if path.suffix
-            else (", and several names have commas between them, such as 'mug,cup'")
-        )
+        # Without a suffix, the path may have been meant for a name.
+        advice = ""
+        if not path.suffix:
+            advice = ", and several names have commas between them, such as 'mug,cup'"
         raise FileFormatError(
             f"{where}: cannot be read ({error.strerror or error}){advice}"
         ) from None
     if not text.strip():
         raise FileFormatError(f"{where}: expected label names, got an empty file")
     names: Any = [line.strip() for line in text.strip("\r\n").splitlines()]
+    # Text has a name on each line, even on an empty one within it.
     if path.suffix.lower() == ".json" or text.lstrip()[0] in "[{":
         try:
             names = parse_json(text)

@@ -147,60 +147,32 @@ def load_model(
             f"{task.names_source}; leave `labels` out"
         )
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
+    # Only tasks that read texts have `tokens` and `times`.
     purpose = Purpose(
-        task.name if task else "classification",
-        names,
-        prompts,
-        getattr(task, "tokens", 16),
-        getattr(task, "times", 1),
-        ask or {},
+        task=task.name if task else "classification",
+        names=names,
+        prompts=prompts,
+        tokens=getattr(task, "tokens", 16),
+        times=getattr(task, "times", 1),
+        ask=ask or {},
     )
     source = _find_source(spec, purpose)
     switches = find_code_switches()
-    if isinstance(source, Source):
-        reads_text = source.reads_text
-    else:
-        reads_text = isinstance(source.module, RemoteNetwork)
-    if prompts is not None and (source is spec or not reads_text):
-        raise InputError(
-            f"prompt: model {source.name} has classes of its own and "
-            "reads no text; leave `prompt` out"
-        )
+    if prompts is not None:
+        _check_reads_text(source, spec)
     if isinstance(source, Source) and isinstance(source.module, nn.Module):
         call_with_switches(source.module, switches)
     if task:
         source = replace(source, module=task.wrap_network(source.module))
-    if (
-        isinstance(source, Source)
-        and source.takes_more
-        and not isinstance(source.module, WithState)
-    ):
-        raise ModelError(
-            f"model {source.name}: takes more than pictures; give task "
-            "command the `state` that it takes"
-        )
     if isinstance(source, Model):
-        if options:
-            raise InputError(
-                f"model {source.name} brings its own preprocessing: leave out "
-                f"{', '.join(options)}, or load its network anew"
-            )
-        is_unchanged = names is None and name is None
-        model = replace(
-            source,
-            name=name or source.name,
-            read=read or source.read,
-            spec=source.spec if is_unchanged else None,
-        )
-        if names is not None:
-            if model.read is None:  # other tasks count the classes by themselves
-                names = fit_labels(model.classes, names, origin, model.name)
-            model = replace(model, labels=names, named=True)
+        model = _adapt_model(source, options, read, name, names, origin)
     else:
+        _check_takes_images_alone(source)
         if read is not None and isinstance(source.module, nn.Module):
             source = _add_training_arguments(source)
         _check_max_batch(max_batch)
         model = _probe_source(source, options, read, name, names, origin)
+    # Only then the text alone stands for the model, in a file of a run for example.
     is_named_alone = not options and labels is None and name is None
     if isinstance(spec, (str, os.PathLike)) and is_named_alone:
         return replace(model, spec=os.fspath(spec))
@@ -237,6 +209,72 @@ def _check_max_batch(max_batch: object) -> None:
         )
 
 
+def _check_reads_text(source: Source | Model, spec: object) -> None:
+    """Raise InputError if a network reads no text, so that a prompt means nothing.
+
+    Nor does it for a `Model` that the user gave, which is ready: then `source` is
+    `spec` itself.
+    """
+    if isinstance(source, Source):
+        reads_text = source.reads_text
+    else:
+        reads_text = isinstance(source.module, RemoteNetwork)
+    if source is spec or not reads_text:
+        raise InputError(
+            f"prompt: model {source.name} has classes of its own and "
+            "reads no text; leave `prompt` out"
+        )
+
+
+def _check_takes_images_alone(source: Source) -> None:
+    """Raise ModelError if a network takes more than images and nothing provides it."""
+    if source.takes_more and not isinstance(source.module, WithState):
+        raise ModelError(
+            f"model {source.name}: takes more than pictures; give task "
+            "command the `state` that it takes"
+        )
+
+
+def _adapt_model(
+    model: Model,
+    options: Mapping[str, Any],
+    read: Read | None,
+    name: str | None,
+    names: tuple[str, ...] | None,
+    origin: LabelsOrigin,
+) -> Model:
+    """Return a ready model with another name, other names of classes, or to be read.
+
+    Args:
+        model: the model, whose preprocessing stays.
+        options: options of `load_model` that are set, of which there may be none.
+        read: reads the network's output; None for what the model has.
+        name: name of the model; None for its own.
+        names: names of classes; None for its own.
+        origin: origin of the names, for messages.
+
+    Raises:
+        InputError: there are options, or another number of names than of classes.
+    """
+    if options:
+        raise InputError(
+            f"model {model.name} brings its own preprocessing: leave out "
+            f"{', '.join(options)}, or load its network anew"
+        )
+    is_unchanged = names is None and name is None
+    adapted_model = replace(
+        model,
+        name=name or model.name,
+        read=read or model.read,
+        spec=model.spec if is_unchanged else None,
+    )
+    if names is None:
+        return adapted_model
+    if adapted_model.read is None:  # other tasks count the classes by themselves
+        names = fit_labels(adapted_model.classes, names, origin, adapted_model.name)
+    return replace(adapted_model, labels=names, named=True)
+
+
 def _probe_source(
     source: Source,
     options: Mapping[str, Any],
@@ -256,7 +294,7 @@ def _probe_source(
         origin: origin of the names, for messages.
     """
     min_batch, max_batch = source.batch_limits
-    max_batch = min(max_batch, options.get("max_batch") or max_batch)
+    max_batch = min(max_batch, options.get("max_batch") or max_batch)  # 0: not set
     preprocessing = _make_preprocessing(source, options)
     model = Model(
         module=_adapt_to_images_alone(source, preprocessing),
@@ -268,7 +306,8 @@ def _probe_source(
         device=source.device,
         read=read,
     )
-    return probe(model, source.labels if names is None else names, origin)
+    class_names = source.labels if names is None else names
+    return probe(model, class_names, origin)
 
 
 def _adapt_to_images_alone(
@@ -412,6 +451,7 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
                 raise InputError(
                     f"{key}: expected one of {', '.join(choices)}, got {options[key]!r}"
                 )
+    # What is empty has the default of `Preprocessing`.
     return Preprocessing(**{key: value for key, value in fields.items() if value})
 
 
@@ -434,6 +474,7 @@ def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
     for key in ("mean", "std"):
         value = options.get(key)
         if isinstance(value, str) and value.strip().lower() in PRESETS:
+            # A preset sets both, but does not replace what the user gave for the other.
             preset_mean, preset_std = PRESETS[value.strip().lower()]
             if key == "mean" or "mean" not in options:
                 fields["mean"] = preset_mean
@@ -442,7 +483,7 @@ def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
         elif value is not None:
             expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
             numbers = _parse_numbers(key, value, (1, 3), expected)
-            # One number is repeated.
+            # The first, middle and last of three; of one number three times this.
             fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
     return fields
 
@@ -489,7 +530,7 @@ def _parse_numbers(
     problem = InputError(f"{key}: expected {expected}, got {value!r}")
     if isinstance(value, str):
         value = value.split(",")
-    elif hasattr(value, "tolist"):
+    elif hasattr(value, "tolist"):  # a tensor or an array
         value = value.tolist()
     items = list(value) if isinstance(value, Sequence) else [value]
     try:

@@ -223,6 +223,7 @@ class Preprocessing:
 
     def _normalize(self, x: Tensor) -> Tensor:
         """Apply steps 2 to 4 to images (N, 3, H, W), as one gain and one offset."""
+        # (low + (high - low) x - mean) / std = gain x + offset
         low, high = self.value_range
         gain = [(high - low) / std for std in self.std]
         offset = [
@@ -230,7 +231,7 @@ class Preprocessing:
         ]
         if self.channels == "BGR":
             x = x.flip(1)
-        if gain == [1.0] * 3 and offset == [0.0] * 3:
+        if gain == [1.0] * 3 and offset == [0.0] * 3:  # nothing to do
             return x
         return torch.addcmul(
             x.new_tensor(offset).view(3, 1, 1), x, x.new_tensor(gain).view(3, 1, 1)
@@ -501,6 +502,7 @@ def check_images(images: Tensor) -> Tensor:
     if not images.is_floating_point():
         raise InputError(f"{expected}, got {images.dtype}; divide 8-bit values by 255")
     low, high = (float(limit) for limit in images.detach().aminmax())
+    # NaN and infinity pass: these are the search's to handle.
     is_too_low = -math.inf < low < -RANGE_TOLERANCE
     is_too_high = 1 + RANGE_TOLERANCE < high < math.inf
     if is_too_low or is_too_high:
@@ -604,6 +606,7 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.
     """
+    # The usual case, first because it is quick.
     if (
         isinstance(output, Tensor)
         and output.is_floating_point()
@@ -621,6 +624,7 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
         got = describe_output(output if tensor is None else tensor)
         raise ModelError(f"{expected}, got {got}; {advice}")
     likely_task = _guess_task(output)
+    # A map of scores for each pixel gets the advice on its shape below instead.
     is_map = tensor is not None and tensor.dim() == 4
     has_other_task = likely_task in ("detection", "segmentation", "depth", "similarity")
     if likely_task and has_other_task and not is_map:
@@ -712,7 +716,8 @@ def _advise_on_missing_scores(returned: Any) -> str:
     scores; "" for any other output.
     """
     values = list(returned.values()) if isinstance(returned, Mapping) else [returned]
-    if values and all(isinstance(x, Tensor) and x.ndim == 0 for x in values):
+    are_losses = all(isinstance(value, Tensor) and value.ndim == 0 for value in values)
+    if values and are_losses:
         return (
             "one number for all pictures is what a loss is: give the network as it "
             "is outside of training"
@@ -721,6 +726,7 @@ def _advise_on_missing_scores(returned: Any) -> str:
     if isinstance(returned, (list, tuple)):
         return ""
     tensor = _find_scores(returned)
+    # Chosen classes are integers, (N,) or for each pixel (N, H, W).
     if tensor is None or tensor.is_floating_point() or tensor.ndim not in (1, 3):
         return ""
     return (
@@ -766,8 +772,7 @@ def _advise_on_shape(shape: tuple[int, ...]) -> str:
     if len(shape) == 4:
         return (
             f"{_advise_other_task('segmentation')}. If these are a classifier's "
-            "feature "
-            "maps, wrap the network to pool them"
+            "feature maps, wrap the network to pool them"
         )
     if len(shape) > 2:
         return (

@@ -118,6 +118,7 @@ def probe(
         names = labels or ()
         probabilities = False
         _warn_of_pixel_probabilities(model, noise)
+    # The first row is that of the gray image, too.
     repeatable = _are_equal(model, rows[:1], repeated_rows)
     if repeatable and returns_logits and not probabilities:
         _warn_of_odd_scores(model, rows)
@@ -259,38 +260,50 @@ def _call_guarded(model: Model, call: Callable[[], Any]) -> Any:
     """
     network = _unwrap(model.module)
     try:
-        stop = getattr(network, "stop", None)
-        return (
-            run_within_limits(call, stop)
-            if stop or isinstance(network, PROGRAMS)
-            else call()
-        )
+        stop = getattr(network, "stop", None)  # a program that can be stopped has it
+        if stop or isinstance(network, PROGRAMS):
+            return run_within_limits(call, stop)
+        return call()
     except TimedOut as error:
         raise ModelError(f"model {model.name}: {error}") from None
     except Exception as error:  # any network may raise anything
-        (height, width) = model.input_size
-        preprocessing = model.preprocessing
-        made_for = ""
-        why = _describe_other_inputs(network, str(error))
-        if isinstance(model.module, WithState) and model.module.state:
-            sizes = ", ".join(
-                f"{name} (N, {len(numbers)})"
-                for name, numbers in model.module.state.items()
-            )
-            made_for = "`state`"
-            why = f"cannot be called with pictures and a state of {sizes[:200]}"
-        elif not why:
-            picture = (
-                f"{preprocessing.channels} image of {height} x {width} pixels "
-                "in "
-                f"layout {preprocessing.layout}"
-            )
-            made_for = "`input_size` and `layout`"
-            why = f"cannot be run on a {picture}"
-        advice = f". Give the {made_for} that it was made for" if made_for else ""
+        reason, advice = _explain_failed_call(model, network, error)
         raise ModelError(
-            f"model {model.name}: {why} ({get_first_line(error)}){advice}"
+            f"model {model.name}: {reason} ({get_first_line(error)}){advice}"
         ) from error
+
+
+def _explain_failed_call(
+    model: Model, network: object, error: Exception
+) -> tuple[str, str]:
+    """Explain why a network may have raised an error when it was called.
+
+    Args:
+        model: the model, with its options.
+        network: the user's network in it.
+        error: error that it raised.
+
+    Returns:
+        The reason, to follow the model's name; and advice, a further sentence or "".
+    """
+    reason = _describe_other_inputs(network, str(error))
+    if isinstance(model.module, WithState) and model.module.state:
+        sizes = ", ".join(
+            f"{name} (N, {len(numbers)})"
+            for name, numbers in model.module.state.items()
+        )
+        wrong_options = "`state`"
+        reason = f"cannot be called with pictures and a state of {sizes[:200]}"
+    elif reason:
+        return reason, ""
+    else:
+        height, width = model.input_size
+        wrong_options = "`input_size` and `layout`"
+        reason = (
+            f"cannot be run on a {model.preprocessing.channels} image of "
+            f"{height} x {width} pixels in layout {model.preprocessing.layout}"
+        )
+    return reason, f". Give the {wrong_options} that it was made for"
 
 
 def _unwrap(network: Any) -> Any:
@@ -319,6 +332,7 @@ def _describe_other_inputs(network: object, error: str) -> str:
         return ""
     parameters: list[inspect.Parameter] = []
     with suppress(TypeError, ValueError):  # it is not written in Python
+        # the first one is the images
         parameters = list(inspect.signature(network.forward).parameters.values())[1:]
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     required = {
@@ -327,6 +341,7 @@ def _describe_other_inputs(network: object, error: str) -> str:
         if parameter.kind not in variadic
         and parameter.default is inspect.Parameter.empty
     }
+    # Labels of training have a default, and yet a network may need them.
     named_in_error = LABEL_ARGUMENTS & set(re.findall(r"\w+", error))
     missing = [
         parameter.name
@@ -362,6 +377,7 @@ def _describe_odd_scores(model: Model, rows: Tensor) -> str:
     """
     is_non_negative = float(rows.min()) >= 0.0
     if is_non_negative and float(rows.max()) <= 1.0:
+        # More rows: a black image, and colors far outside of [0, 1].
         with torch.no_grad():
             height, width = model.input_size
             far = torch.linspace(0.0, FAR_COLOR, 3 * height * width).reshape(
@@ -393,6 +409,7 @@ def _check_range(model: Model, images: Tensor) -> None:
     returns no logits is not checked: if it is untrained, it looks the same.
     """
     preprocessing = model.preprocessing
+    # Whoever sets one of these knows which colors the network takes.
     is_declared = preprocessing.processor is not None or any(
         getattr(preprocessing, name) != default
         for name, default in (
@@ -420,6 +437,7 @@ def _check_range(model: Model, images: Tensor) -> None:
     ):
         return
     growth = float(wide.abs().amax(dim=0).mean() / narrow.abs().amax(dim=0).mean())
+    # Outputs that grow with the colors, as of untrained networks, are no sign.
     if 1.0 / MAX_GROWTH < growth < MAX_GROWTH:
         warn(
             f"outputs of model {model.name} hardly follow the picture: they differ by "
@@ -449,6 +467,7 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
             for tensor in list_tensors(returned)
             if tensor.is_floating_point()
         ]
+        # An empty tensor first, as there may be no numbers at all.
         rows.append(torch.cat([torch.zeros(0, device="cpu"), *numbers]))
     if len({len(row) for row in rows}) > 1 or len(rows[0]) == 0:
         return None
@@ -498,7 +517,7 @@ def _find_batch_limits(
     try:
         with torch.no_grad():
             batch_rows = _run(model, pair)
-    except ModelError:
+    except ModelError:  # it takes one image alone
         return 1, 1
     if rows is not None and not _are_equal(model, rows, batch_rows):
         warn(
@@ -648,7 +667,8 @@ def _check_gradient(
         gradient: (N, H, W, 3) of `_compute_checked_value`.
         detached: whether the network detaches tensors, for the message.
     """
-    # Suppression of boxes may make outputs jump in the larger step only.
+    # A gradient that holds for one of two steps is right. Suppression of boxes may make
+    # outputs jump in the larger one only.
     step_sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)
     min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
     if min_step > STEP:
@@ -665,10 +685,9 @@ def _check_gradient(
             if len(choices) > 1:
                 return  # outputs that jump cannot be compared with a gradient
         size = max(abs(change), abs(predicted))
-        if (
-            size <= MIN_CHANGE * total
-            or abs(change - predicted) <= MAX_GRADIENT_ERROR * size
-        ):
+        is_too_small_to_tell = size <= MIN_CHANGE * total
+        is_predicted = abs(change - predicted) <= MAX_GRADIENT_ERROR * size
+        if is_too_small_to_tell or is_predicted:
             return
     reason = "Steps that round, or a defence that masks gradients?"
     if detached:

@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from advsearch.errors import (
@@ -160,6 +160,27 @@ class Source:
     size_type: torch.dtype | None = None
 
 
+def _check_not_lazy(module: nn.Module, name: str) -> None:
+    """Raise ModelError if a layer of a network gets its weights with the first image.
+
+    `name` is the name of the model, for the message.
+    """
+    lazy_keys = [
+        key
+        for key, weights in (*module.named_parameters(), *module.named_buffers())
+        if is_lazy(weights)
+    ]
+    if not lazy_keys:
+        return
+    layer = lazy_keys[0].rpartition(".")[0]
+    raise ModelError(
+        f"model {name}: its layer {layer} "
+        f"({type(module.get_submodule(layer)).__name__}) has no weights before it "
+        "has seen a picture; call the network once with one, load its weights, and "
+        "give it then"
+    )
+
+
 def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
     """Return the source of a module, which is frozen.
 
@@ -172,21 +193,10 @@ def make_source(module: nn.Module, name: str, **fields: Any) -> Source:
     Raises:
         ModelError: it has lazy layers that have no weights yet.
     """
-    lazy = [
-        key
-        for key, weights in (*module.named_parameters(), *module.named_buffers())
-        if is_lazy(weights)
-    ]
-    if lazy:
-        layer = lazy[0].rpartition(".")[0]
-        raise ModelError(
-            f"model {name}: its layer {layer} "
-            f"({type(module.get_submodule(layer)).__name__}) has no weights before it "
-            "has seen a picture; call the network once with one, load its weights, and "
-            "give it then"
-        )
+    _check_not_lazy(module, name)
     tensors = (*module.parameters(), *module.buffers())
     first = next((tensor for tensor in tensors if tensor.is_floating_point()), None)
+    # What the caller gives wins over what is found here.
     if first is not None:
         fields = {"dtype": first.dtype, "device": first.device, **fields}
     if takes_image_size(module):
@@ -211,7 +221,7 @@ def freeze_network(module: nn.Module, name: str) -> nn.Module:
             RuntimeError,
             pickle.PickleError,
             copy.Error,
-        ) as error:  # locks, files
+        ) as error:  # it holds a lock or an open file, for example
             warn(
                 f"model {name} cannot be copied ({get_first_line(error)}): the module "
                 "itself is set to evaluation mode and "
@@ -238,9 +248,26 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
         FileFormatError: the file is missing or is not safetensors.
         ModelError: keys or shapes do not fit.
     """
+    state = _read_weights(path, name)
+    problems = _describe_misfit(module.state_dict(), state)
+    if problems:
+        raise ModelError(
+            f"weights {path} do not fit model {name}: {'; '.join(problems)}"
+        )
+    # Not strict, since counters of batch norms may be missing.
+    module.load_state_dict(state, strict=False)
+
+
+def _read_weights(path: Path, name: str) -> dict[str, Tensor]:
+    """Return the tensors in a safetensors file, by key.
+
+    `name` is the name of the model, for messages. Raises FileFormatError if the file is
+    missing or is not safetensors.
+    """
     try:
+        # a check: this opens regular files only, of limited size
         open_regular(path, "weights", LARGEST).close()
-        state = load_file(path)
+        return load_file(path)
     except FileNotFoundError:
         raise FileFormatError(f"weights {path} of model {name}: no such file") from None
     except (SafetensorError, OSError) as error:
@@ -249,7 +276,17 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
             f"({get_first_line(error)}); "
             "make one with safetensors.torch.save_file(module.state_dict(), path)"
         ) from None
-    expected = module.state_dict()
+
+
+def _describe_misfit(
+    expected: Mapping[str, Tensor], state: Mapping[str, Tensor]
+) -> list[str]:
+    """Describe why the tensors of a file do not fit a network; empty if they do.
+
+    Args:
+        expected: tensors of the network, by key.
+        state: tensors of the file, by key.
+    """
     missing = [
         key
         for key in expected
@@ -267,12 +304,7 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
         for what, keys in (("missing", missing), ("not in the network", unexpected))
         if keys
     ]
-    if problems or shapes:
-        raise ModelError(
-            f"weights {path} do not fit model {name}: "
-            f"{'; '.join([*problems, *shapes[:2]])}"
-        )
-    module.load_state_dict(state, strict=False)
+    return [*problems, *shapes[:2]]  # two examples are enough
 
 
 def split_weights(spec: str) -> tuple[str, Path | None]:
@@ -302,30 +334,10 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     target, weights = split_weights(spec)
     check_import(target)
     module_name, _, attribute = target.partition(":")
-    value: Any = _import_module(module_name, spec, libraries)
-    for part in attribute.split("."):
-        if not hasattr(value, part):
-            known = [
-                key
-                for key in vars(value)
-                if not key.startswith("_") and callable(getattr(value, key))
-            ]
-            raise UnknownNameError(
-                f"attribute of {module_name}", part, find_near_names(part, known)
-            )
-        value = getattr(value, part)
+    module = _import_module(module_name, spec, libraries)
+    value = _get_attribute(module, attribute, module_name)
     if not isinstance(value, (nn.Module, Model)):
-        if not callable(value):
-            raise ModelError(
-                f"model {spec}: expected a callable or an nn.Module, got "
-                f"{type(value).__name__}"
-            )
-        try:
-            value = value()
-        except Exception as error:  # the user's code may raise anything
-            raise ModelError(
-                f"model {spec}: calling it without arguments failed ({_where(error)})"
-            ) from error
+        value = _call_factory(value, spec)
     if isinstance(value, Model):
         if weights is not None:
             raise ModelError(
@@ -341,6 +353,48 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     if weights is not None:
         load_weights(value, weights, target)
     return make_source(value, spec)
+
+
+def _get_attribute(module: ModuleType, attribute: str, module_name: str) -> Any:
+    """Return an attribute of a module, or of a class in it: "Class.method".
+
+    Raises:
+        UnknownNameError: there is none; the message has near names.
+    """
+    value: Any = module
+    for name in attribute.split("."):
+        if not hasattr(value, name):
+            public_callables = [
+                key
+                for key in vars(value)
+                if not key.startswith("_") and callable(getattr(value, key))
+            ]
+            raise UnknownNameError(
+                f"attribute of {module_name}",
+                name,
+                find_near_names(name, public_callables),
+            )
+        value = getattr(value, name)
+    return value
+
+
+def _call_factory(factory: Any, spec: str) -> Any:
+    """Return what the user's function or class returns, called without arguments.
+
+    `spec` is what the user wrote, for messages. Raises ModelError if it cannot be
+    called, or fails.
+    """
+    if not callable(factory):
+        raise ModelError(
+            f"model {spec}: expected a callable or an nn.Module, got "
+            f"{type(factory).__name__}"
+        )
+    try:
+        return factory()
+    except Exception as error:  # the user's code may raise anything
+        raise ModelError(
+            f"model {spec}: calling it without arguments failed ({_where(error)})"
+        ) from error
 
 
 def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType:

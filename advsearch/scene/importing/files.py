@@ -216,7 +216,8 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
             f"#{format_name(part_name, quoted=False)}; leave it out"
         )
     conversion = None
-    if what != "environment":
+    if what != "environment":  # the advice is on programs that export meshes
+        # Without a # in the path, `file_part` is empty.
         conversion = find_advice(Path(file_part) if file_part else path)
     if conversion is not None:
         raise FileFormatError(f"{path}: {conversion} (read are {either(suffixes)})")

@@ -74,6 +74,7 @@ class TriangleSoup:
 
         Normals stay as they are.
         """
+        # Two corners of a turned face change places, with all that belongs to them.
         order = np.where(mask[:, None], [0, 2, 1], [0, 1, 2])
         rows = np.arange(len(order))[:, None]
         names = ["faces", "normals", "uvs", "colors"]
@@ -101,6 +102,22 @@ def compute_rotation(up: str, front: str) -> Float64Array:
     return np.stack([front_axis, side_axis, up_axis]) + 0.0
 
 
+def _check_extent(extent: float, source: str) -> None:
+    """Raise InputError if the extent of an object is 0, infinite or NaN.
+
+    `source` is the name of the file, for messages.
+    """
+    if 0.0 < extent < np.inf:
+        return
+    problem = "its extent is too large to compute with"
+    if extent == 0.0:
+        problem = "all vertices coincide"
+    raise InputError(
+        f"{source}: expected an object with a size, got a mesh in "
+        f"which {problem}; export it again"
+    )
+
+
 def join_parts(
     parts: Sequence[ImportedPart], source: str, turn: Float64Array
 ) -> TriangleSoup:
@@ -121,6 +138,7 @@ def join_parts(
     vertices = np.concatenate([part.vertices for part in parts])
     _check_finite(vertices, source)
     vertex_starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    # Faces count the vertices of all parts, not of their own.
     faces = np.concatenate(
         [
             part.faces + start
@@ -129,20 +147,14 @@ def join_parts(
     )
     lower_corner = vertices[find_used(faces, len(vertices))].min(axis=0)
     extent = compute_extent(parts)
-    if not 0.0 < extent < np.inf:
-        problem = "its extent is too large to compute with"
-        if extent == 0.0:
-            problem = "all vertices coincide"
-        raise InputError(
-            f"{source}: expected an object with a size, got a mesh in "
-            f"which {problem}; export it again"
-        )
+    _check_extent(extent, source)
     # Adding 0 turns -0.0 into 0.0, so that both are one point.
     points, point_of_vertex = _weld((vertices - lower_corner) / extent @ turn.T + 0.0)
     n_faces = [len(part.faces) for part in parts]
     normals = np.concatenate(
         [_gather_at_corners(part.normals, part.faces, 3) for part in parts]
     )
+    # White, which changes nothing, where a part has no colors.
     colors = [
         np.ones((len(part.faces), 3, 3)) if part.colors is None else part.colors
         for part in parts
@@ -208,7 +220,7 @@ def find_unique_rows(rows: npt.NDArray[Any]) -> tuple[IntArray, IntArray]:
         The index of the first row of each distinct one (U,), and which of these each
         row is (N,).
     """
-    order = np.lexsort(rows.T[::-1])
+    order = np.lexsort(rows.T[::-1])  # its last key, here the first column, counts most
     is_new = np.ones(len(rows), np.bool_)
     is_new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
     unique_of_row = np.empty(len(rows), np.int64)
@@ -325,6 +337,7 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
         and whether both faces run along it in the same direction, that is, disagree in
         winding.
     """
+    # The side k of a face runs from its corner k to the next one.
     start = faces.reshape(-1)
     end = np.roll(faces, -1, axis=1).reshape(-1)
     lower = np.minimum(start, end)
@@ -358,10 +371,31 @@ def _link_windings(
             one of them must be turned.
     """
     starts = np.concatenate([2 * left_face, 2 * left_face + 1])
+    # `same_direction` is 1 where the "as it is" of one agrees with the other "turned".
     ends = np.concatenate(
         [2 * right_face + same_direction, 2 * right_face + 1 - same_direction]
     )
     return starts, ends
+
+
+def _select_larger_choice(
+    as_is: IntArray, turned: IntArray, area: Float64Array
+) -> BoolArray:
+    """Return which faces (F,) to turn over, so that most area of each shell stays.
+
+    Args:
+        as_is: (F,) for each face the choice, for its shell, that leaves it as it is.
+        turned: (F,) the reverse choice, which turns it over.
+        area: (F,) twice the area of each face.
+    """
+    n_choices = int(max(as_is.max(), turned.max())) + 1
+    # the area that each choice leaves as it is
+    unturned_area = np.bincount(as_is, weights=area, minlength=n_choices)
+    reverse_keeps_more = unturned_area[turned] > unturned_area[as_is]
+    areas_are_equal = unturned_area[turned] == unturned_area[as_is]
+    # Of equal areas the first face's winding is kept: choices are numbered by their
+    # first face, which the lower one of two leaves as it is.
+    return reverse_keeps_more | (areas_are_equal & (turned < as_is))
 
 
 def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
@@ -379,18 +413,12 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     """
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
     area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
+    # Corner c is a corner of face c // 3.
     starts, ends = _link_windings(left_corner // 3, right_corner // 3, same_direction)
     component = find_components(2 * len(area), starts, ends)
     as_is = component[0::2]
     turned = component[1::2]
-    # The area that each choice leaves as it is. A face is turned if more area is left
-    # by the reverse choice; of equal areas, the first face's winding is kept.
-    component_area = np.bincount(
-        as_is, weights=area, minlength=int(component.max()) + 1
-    )
-    is_turned = (component_area[turned] > component_area[as_is]) | (
-        (component_area[turned] == component_area[as_is]) & (turned < as_is)
-    )
+    is_turned = _select_larger_choice(as_is, turned, area)
     # A shell is one component, or two that are each other's reverse.
     _, shell = np.unique(np.minimum(as_is, turned), return_inverse=True)
     return is_turned, shell.astype(np.int64), bool((as_is == turned).any())
@@ -446,7 +474,8 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     # Agreement with the file's normals; 0 if it has none.
     agreement = np.bincount(shell, weights=face_agreement, minlength=n_shells)
     lower, upper = _compute_shell_bounds(soup, shell, n_shells)
-    # Below, `is_inverted` is said of the object after it was turned as a whole.
+    # If most of the volume is negative, the whole object counts as turned first, and
+    # `is_inverted` is about what is inside out after that.
     mostly_negative = volume[is_closed].sum() < 0.0
     is_inverted = (volume < 0.0) ^ mostly_negative
     for index in np.flatnonzero(is_closed & is_inverted):
@@ -457,11 +486,13 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
         )
         if not is_enclosing.any():
             continue  # it stays inverted
-        # the wall of a hollow: by the file's normals, whose sense turned with the whole
+        # The wall of a hollow stays unless the file's normals point against it. Where
+        # the whole was turned, agreement before that is disagreement now.
         if mostly_negative:
             is_inverted[index] = agreement[index] > 0.0
         else:
             is_inverted[index] = agreement[index] < 0.0
+    # What is inverted after a turn of the whole is right without any turn.
     return np.where(is_closed, is_inverted ^ mostly_negative, agreement < 0.0)
 
 
@@ -509,13 +540,13 @@ def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     if is_known.any():
         known_area = np.where(is_known, area[:, None], 0.0)
         front_fraction = float((known_area * is_front).sum() / known_area.sum())
-        if front_fraction < 1.0 - MIN_NORMAL_AGREEMENT:
+        if front_fraction < 1.0 - MIN_NORMAL_AGREEMENT:  # most are on the back
             notes.warn("its normals pointed inwards and were turned around")
             normals = -normals
             is_front = is_known & ~is_front
         elif front_fraction < MIN_NORMAL_AGREEMENT:
             notes.warn("its normals contradict its faces and were computed anew")
-            is_front = np.zeros_like(is_front)
+            is_front = np.zeros_like(is_front)  # none is used
     if not is_front.all():
         computed = compute_smooth_normals(soup)
         if soup.is_flat is not None:
@@ -665,12 +696,12 @@ def triangulate(
         which some triangles may be outside, because they cross themselves or were too
         much work.
     """
-    starts = np.cumsum(counts) - counts
+    starts = np.cumsum(counts) - counts  # the first corner of each polygon
     triangles = []
     owners = []
     n_wrong = 0
-    budget = MOST_WORK
-    for count in np.unique(counts):
+    budget = MOST_WORK  # comparisons of points with ears, for all polygons
+    for count in np.unique(counts):  # those with as many corners are done at once
         if count < 3:
             continue
         polygons = np.flatnonzero(counts == count)
@@ -710,7 +741,7 @@ def _triangulate_equal(
     count = corners.shape[1]
     fan_tips = corners[:, :1].repeat(count - 2, axis=1)
     fans = np.stack([fan_tips, corners[:, 1:-1], corners[:, 2:]], axis=2)
-    if count == 3:
+    if count == 3:  # a triangle is its own fan
         return fans, 0, 0
     projected = _project_to_planes(points[corners])
     areas = _compute_doubled_areas(
@@ -736,15 +767,15 @@ def _project_to_planes(corners: Float64Array) -> Float64Array:
     """
     corners = corners - corners.mean(axis=1, keepdims=True)
     sizes = np.abs(corners).max(axis=(1, 2), keepdims=True)
-    corners = corners / np.maximum(sizes, 1e-300)
+    corners = corners / np.maximum(sizes, 1e-300)  # never by 0
     normal = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     # the axis that is the least parallel to the normal
     other_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
     x_axis = np.cross(other_axis, normal)
     x_axis /= np.maximum(np.linalg.norm(x_axis, axis=1, keepdims=True), 1e-300)
-    plane = np.stack([x_axis, np.cross(normal, x_axis)], axis=2)
-    return np.asarray(corners @ plane)
+    plane_axes = np.stack([x_axis, np.cross(normal, x_axis)], axis=2)
+    return np.asarray(corners @ plane_axes)
 
 
 def _compute_doubled_areas(
@@ -832,15 +863,15 @@ class _EarCutter:
         """
         active = self.active
         n_left = self.flat.shape[1] - self.n_cut[active]
-        is_cut = n_left == 3
+        is_cut = n_left == 3  # the last triangle
         is_hopeless = self.n_tries[active] >= n_left
         if self.n_compared < budget:
             dent_points = self.dent_points[active]
-            self.n_compared += dent_points.size // 2
+            self.n_compared += dent_points.size // 2  # points have two coordinates
             corners = [self.flat[active, corner] for corner in (a, b, c)]
             min_area = _MIN_AREA * self.area[active]
             is_cut |= _is_ear(corners, dent_points, self.is_present[active], min_area)
-        else:
+        else:  # the budget is spent: all others are cut unseen
             is_hopeless[:] = True
         self.is_failed[active] |= is_hopeless & ~is_cut
         return np.asarray(is_cut | is_hopeless)
@@ -855,7 +886,7 @@ class _EarCutter:
         self.is_present[rows] &= self.dent[rows] != b[:, None]
         self.next_corner[rows, a] = c
         self.previous_corner[rows, c] = a
-        self.n_tries[rows] = 0
+        self.n_tries[rows] = 0  # without b, other corners may be ears
         self.n_cut[rows] += 1
 
 

@@ -26,7 +26,14 @@ from advsearch.scene.importing.files import (
     find_kind,
     format_name,
 )
-from advsearch.scene.importing.gltf_entries import Asset, Entry, Header, Primitive
+from advsearch.scene.importing.gltf_entries import (
+    Accessor,
+    Asset,
+    Entry,
+    Header,
+    Primitive,
+    Sparse,
+)
 from advsearch.trust.named_files import References, normalize_name
 from advsearch.trust.stored_files import JsonBoundsError, check_most, parse_json
 
@@ -53,7 +60,23 @@ def read_header(path: Path, data: bytes) -> Header:
         header = Header.model_validate(content)
     except ValidationError as error:
         raise _make_entry_error(path, error) from None
-    extensions = _find_extensions(path, content)
+    present_extensions = _find_extensions(path, content)
+    _check_node_lights(path, header, content)
+    # Some files use extensions without listing them.
+    all_used = sorted({*header.extensionsUsed, *present_extensions})
+    header = header.model_copy(update={"extensionsUsed": all_used})
+    check_header(path, header)
+    return header
+
+
+def _check_node_lights(path: Path, header: Header, content: dict[str, Any]) -> None:
+    """Raise FileFormatError if a node has a light's extension that names no light.
+
+    Args:
+        path: path of the file, for messages.
+        header: header of the file, checked for its types.
+        content: the JSON from which the header was made.
+    """
     entries = zip(header.nodes, content.get("nodes", ()), strict=True)
     for index, (node, entry) in enumerate(entries):
         node_extensions = entry.get("extensions") or {}
@@ -64,10 +87,6 @@ def read_header(path: Path, data: bytes) -> Header:
                 f"glTF with nodes[{index}].extensions.KHR_lights_punctual.light",
                 "nothing",
             )
-    used = sorted({*header.extensionsUsed, *extensions})
-    header = header.model_copy(update={"extensionsUsed": used})
-    check_header(path, header)
-    return header
 
 
 def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
@@ -77,9 +96,11 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     upper bound of its values. Raises FileFormatError.
     """
     text = decode_text(chunk)
+    # Each value but the first of a list or an object follows a comma.
+    max_values = sum(map(text.count, ",[{"))
     check_most(
         path,
-        sum(map(text.count, ",[{")),
+        max_values,
         MOST_VALUES,
         "a glTF header of at most {} values",
         "more",
@@ -87,7 +108,7 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     try:
         content = parse_json(text)
     except ValueError as error:
-        got = find_kind(chunk)
+        got = find_kind(chunk)  # such as a web page; None if unknown
         if not got:
             is_over_limit = isinstance(error, JsonBoundsError)
             got = str(error) if is_over_limit else "something else"
@@ -100,12 +121,14 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
 def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
     """Return the error for the first entry of a header that is invalid."""
     first_error = error.errors(include_url=False)[0]
+    # As in "meshes[0].primitives[1].mode".
     keys = (
         f"[{key}]" if isinstance(key, int) else f".{key}" for key in first_error["loc"]
     )
     location = "".join(keys).lstrip(".")
     if first_error["type"] == "missing":
         return damaged(path, f"glTF with {location}", "nothing")
+    # pydantic's sentences, without their beginnings
     requirement = (
         first_error["msg"].removeprefix("Input should be ").removeprefix("Field ")
     )
@@ -130,6 +153,7 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
             entry_extensions = entry.get("extensions")
             if entry_extensions is None:
                 entry_extensions = {}
+            # Extensions that are not supported may be anything: nothing reads them.
             are_objects = isinstance(entry_extensions, dict) and all(
                 isinstance(entry_extensions.get(name) or {}, dict)
                 for name in SUPPORTED_EXTENSIONS
@@ -154,7 +178,8 @@ def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     if path.suffix.lower() == ".gltf":
         return data, None
     has_magic = data.startswith(b"glTF")
-    if not has_magic or len(data) < 20:
+    json_start = 20  # after the headers of the file (12) and of its first chunk (8)
+    if not has_magic or len(data) < json_start:
         got = "the first few bytes of one" if has_magic else describe_content(data)
         raise damaged(path, "a binary glTF file", got)
     version, length, json_size, kind = struct.unpack_from("<4xIII4s", data)
@@ -166,20 +191,21 @@ def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
             f"{length} bytes, as its header says",
             f"{len(data)}; the file is cut short",
         )
-    if kind != b"JSON" or 20 + json_size > length:
+    json_end = json_start + json_size
+    if kind != b"JSON" or json_end > length:
         raise damaged(
             path,
             "a chunk of JSON first",
             f"{json_size} bytes of {format_name(kind.decode('latin-1'))}",
         )
-    binary_start = 28 + json_size
+    binary_start = json_end + 8  # after the header of the second chunk
     binary = None
     if binary_start <= length:
         size, kind = struct.unpack_from("<I4s", data, binary_start - 8)
         if kind == b"BIN\0":
             binary = data[binary_start : min(binary_start + size, length)]
     # Some writers pad the JSON with zeros.
-    return data[20 : 20 + json_size].rstrip(b"\0"), binary
+    return data[json_start:json_end].rstrip(b"\0"), binary
 
 
 MAX_DATA_SIZE = 1 << 28
@@ -216,7 +242,7 @@ def _check_references(path: Path, header: Header) -> None:
     """
     for entry in header.iterate_entries():
         for kind, index in entry.iterate_references():
-            count = len(getattr(header, kind))
+            count = len(getattr(header, kind))  # such as `header.meshes`
             if index >= count:
                 raise damaged(
                     path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}"
@@ -255,6 +281,7 @@ def check_header(path: Path, header: Header) -> None:
         for entry in header.accessors
     )
     view_size = sum(view.byteLength for view in header.bufferViews)
+    # Accessors may share a view or have none (zeros), and views may hold images.
     check_most(
         path,
         max(view_size, sum(accessor_sizes)),
@@ -294,9 +321,47 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     and indices are unsigned integers. An accessor without numbers is an error if an
     extension that is not supported may have them, compressed.
     """
-    accessors = {
+    attributes = {
         name: header.accessors[index] for name, index in primitive.attributes.items()
     }
+    indices = None if primitive.indices is None else header.accessors[primitive.indices]
+    _check_attributes(path, header, primitive, attributes)
+    unsupported = find_unread_extensions(primitive)
+    # Gaussian splats are left out with a note instead.
+    may_be_compressed = unsupported and not any(map(is_splat_name, unsupported))
+    for accessor in (*attributes.values(), indices):
+        has_no_data = (
+            accessor is not None
+            and accessor.bufferView is None
+            and accessor.sparse is None
+        )
+        if has_no_data and may_be_compressed:  # with Draco, for example
+            raise _make_unsupported_error(path, unsupported)
+    if indices is not None and indices.type != "SCALAR":
+        raise damaged(path, "indices of type SCALAR", indices.type)
+    # unsigned integers of 1, 2 and 4 bytes
+    if indices is not None and indices.componentType not in (5121, 5123, 5125):
+        raise damaged(path, "indices that are unsigned integers", "other numbers")
+
+
+def _check_attributes(
+    path: Path,
+    header: Header,
+    primitive: Primitive,
+    attributes: dict[str, Accessor],
+) -> None:
+    """Check types and counts of the attributes of a primitive that are read.
+
+    Args:
+        path: path of the file, for messages.
+        header: header of the file.
+        primitive: entry of the primitive.
+        attributes: accessors of its attributes, by name.
+
+    Raises:
+        FileFormatError: one has a type that the format excludes, or not as many values
+            as there are positions.
+    """
     uv_name = "TEXCOORD_0"
     if primitive.material is not None:
         uv_name = header.materials[primitive.material].uv_attribute
@@ -306,31 +371,16 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
         "COLOR_0": ("VEC3", "VEC4"),
         uv_name: ("VEC2",),
     }
-    positions = accessors.get("POSITION")
+    positions = attributes.get("POSITION")
     for name, types in valid_types.items():
-        if name not in accessors:
+        if name not in attributes:
             continue
-        accessor = accessors[name]
+        accessor = attributes[name]
         if accessor.type not in types:
             raise damaged(path, f"{name} of type {' or '.join(types)}", accessor.type)
         if positions is not None and accessor.count != positions.count:
             expected = f"as many values of {name} as of POSITION, {positions.count:,}"
             raise damaged(path, expected, f"{accessor.count:,}")
-    indices = None if primitive.indices is None else header.accessors[primitive.indices]
-    unread = find_unread_extensions(primitive)
-    may_be_compressed = unread and not any(map(is_splat_name, unread))
-    for values in (*accessors.values(), indices):
-        has_no_data = (
-            values is not None and values.bufferView is None and values.sparse is None
-        )
-        if (
-            has_no_data and may_be_compressed
-        ):  # an extension has the numbers, such as Draco's
-            raise _make_unsupported_error(path, unread)
-    if indices is not None and indices.type != "SCALAR":
-        raise damaged(path, "indices of type SCALAR", indices.type)
-    if indices is not None and indices.componentType not in (5121, 5123, 5125):
-        raise damaged(path, "indices that are unsigned integers", "other numbers")
 
 
 def _check_tree(path: Path, header: Header) -> None:
@@ -340,29 +390,8 @@ def _check_tree(path: Path, header: Header) -> None:
     parent at most, no cycles, and are at most `DEEPEST_TREE` deep. Raises
     FileFormatError.
     """
-    triangles_of_mesh = [
-        sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
-        for mesh in header.meshes
-    ]
-    primitives_of_mesh = [len(mesh.primitives) for mesh in header.meshes]
-    instanced_meshes = [node.mesh for node in header.nodes if node.mesh is not None]
-    children: set[int] = set()
-    for node in header.nodes:
-        for child in node.children:
-            if child in children:
-                raise damaged(
-                    path, "nodes with one parent each", f"two for node {child}"
-                )
-            children.add(child)
-    n_instanced_triangles = sum(triangles_of_mesh[mesh] for mesh in instanced_meshes)
-    check_faces(path, max(n_instanced_triangles, sum(triangles_of_mesh)))
-    n_instanced = sum(primitives_of_mesh[mesh] for mesh in instanced_meshes)
-    check_most(
-        path,
-        max(n_instanced, sum(primitives_of_mesh), len(header.nodes)),
-        LARGEST_TREE,
-        "glTF of at most {} nodes and pieces",
-    )
+    children = _find_children(path, header)
+    _check_tree_sizes(path, header)
     # From the roots down, level by level. A cycle has no root, so it is never reached.
     level = [index for index in range(len(header.nodes)) if index not in children]
     n_reached = 0
@@ -374,6 +403,41 @@ def _check_tree(path: Path, header: Header) -> None:
         level = [child for index in level for child in header.nodes[index].children]
     if n_reached < len(header.nodes):
         raise damaged(path, "nodes that form trees", "a cycle")
+
+
+def _find_children(path: Path, header: Header) -> set[int]:
+    """Return all nodes that have a parent; raise FileFormatError if one has two."""
+    children: set[int] = set()
+    for node in header.nodes:
+        for child in node.children:
+            if child in children:
+                raise damaged(
+                    path, "nodes with one parent each", f"two for node {child}"
+                )
+            children.add(child)
+    return children
+
+
+def _check_tree_sizes(path: Path, header: Header) -> None:
+    """Raise FileFormatError if there are too many triangles, primitives or nodes.
+
+    A mesh counts as often as nodes draw it; all meshes count once at least.
+    """
+    triangles_of_mesh = [
+        sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
+        for mesh in header.meshes
+    ]
+    primitives_of_mesh = [len(mesh.primitives) for mesh in header.meshes]
+    instanced_meshes = [node.mesh for node in header.nodes if node.mesh is not None]
+    n_instanced_triangles = sum(triangles_of_mesh[mesh] for mesh in instanced_meshes)
+    check_faces(path, max(n_instanced_triangles, sum(triangles_of_mesh)))
+    n_instanced = sum(primitives_of_mesh[mesh] for mesh in instanced_meshes)
+    check_most(
+        path,
+        max(n_instanced, sum(primitives_of_mesh), len(header.nodes)),
+        LARGEST_TREE,
+        "glTF of at most {} nodes and pieces",
+    )
 
 
 def _count_max_triangles(header: Header, primitive: Primitive) -> int:
@@ -474,8 +538,7 @@ class GltfFile:
             name = normalize_name(uri or "")
             reason = self.references.refused.get(name, "is missing")
             message = (
-                f"{self.path}: needs {format_name(name)}, which {reason}; put "
-                "that "
+                f"{self.path}: needs {format_name(name)}, which {reason}; put that "
                 "file beside it"
             )
             raise FileFormatError(message) from None
@@ -525,9 +588,27 @@ class GltfFile:
             )
         if accessor.sparse is None or not accessor.sparse.count:
             return values
-        sparse_indices = accessor.sparse.indices
-        sparse_values = accessor.sparse.values
-        count = accessor.sparse.count
+        values = self._replace_rows(values, accessor, accessor.sparse)
+        self._sparse_filled[index] = values
+        return values
+
+    def _replace_rows(
+        self, dense_values: npt.NDArray[Any], accessor: Accessor, sparse: Sparse
+    ) -> npt.NDArray[Any]:
+        """Return a copy of values with the rows replaced that sparse values replace.
+
+        Args:
+            dense_values: (count, width) the values without the sparse ones.
+            accessor: the accessor that has them.
+            sparse: its sparse values, and the rows that they replace.
+
+        Raises:
+            FileFormatError: there are too many, or they are for rows that are not
+                there.
+        """
+        sparse_indices = sparse.indices
+        sparse_values = sparse.values
+        count = sparse.count
         if count > accessor.count:
             raise damaged(
                 self.path, f"at most {accessor.count:,} sparse values", f"{count:,}"
@@ -544,14 +625,14 @@ class GltfFile:
                 f"sparse values at places under {accessor.count:,}",
                 f"{int(sparse_rows.max()):,}",
             )
-        values = np.array(values)
+        # a copy, because these may be a view of the file's bytes
+        values = np.array(dense_values)
         values[sparse_rows] = self._make_array(
             sparse_values.bufferView,
             sparse_values.byteOffset,
             (count, accessor.width),
             values.dtype,
         )
-        self._sparse_filled[index] = values
         return values
 
     def _make_array(

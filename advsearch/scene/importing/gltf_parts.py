@@ -91,34 +91,55 @@ def note_left_out(header: Header, notes: Notes) -> None:
     materials, scenes, nodes and keys that are not read. It is the same whether one node
     of the file or all of it is the object.
     """
+    _note_converter_sentences(header, notes)
+    _note_extensions(header, notes)
+    for sentence in _count_phrases(_find_left_out_entries(header)):
+        notes.warn(sentence)
+    _note_unread(header, notes)
+
+
+def _note_converter_sentences(header: Header, notes: Notes) -> None:
+    """Note the sentences that our converter from OpenUSD wrote into a file."""
     is_converted = header.asset.generator == GENERATOR
-    if is_converted and isinstance(header.asset.extras, dict):
-        sentences = header.asset.extras.get("left_out")
-        for sentence in sentences if isinstance(sentences, list) else ():
-            notes.warn(
-                " "
-                + format_name(
-                    str(sentence), quoted=False, max_length=MAX_SENTENCE_LENGTH
-                )
-            )
+    if not is_converted or not isinstance(header.asset.extras, dict):
+        return
+    sentences = header.asset.extras.get("left_out")
+    if not isinstance(sentences, list):
+        return
+    for sentence in sentences:
+        text = format_name(str(sentence), quoted=False, max_length=MAX_SENTENCE_LENGTH)
+        notes.warn(f" {text}")
+
+
+def _note_extensions(header: Header, notes: Notes) -> None:
+    """Note the extensions of a file that are read in part only, or not at all."""
     used_extensions = {*header.extensionsUsed, *header.extensionsRequired}
     if any(map(is_splat_name, used_extensions)):
         notes.warn(
             f" has Gaussian splats, which are left out: a model that {SPLATS_ADVICE}"
         )
-    for name in sorted(
-        used_extensions & set(EXTENSION_NOTES)
-        | used_extensions - set(SUPPORTED_EXTENSIONS)
-    ):
+    # Of some supported extensions a part is left out: these have a note of their own.
+    partly_read = used_extensions & set(EXTENSION_NOTES)
+    unread = used_extensions - set(SUPPORTED_EXTENSIONS)
+    for name in sorted(partly_read | unread):
         if not is_splat_name(name):
             sentence = EXTENSION_NOTES.get(name, UNKNOWN_EXTENSION_NOTE)
             notes.warn(sentence.format(name=format_name(name, quoted=False)))
+
+
+def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
+    """Find the maps, materials, scenes and nodes of a file that are left out.
+
+    Returns:
+        A phrase about each kind, and for each entry whether it is left out; `{s}`
+        stands for the plural.
+    """
     roots: Iterable[int] = range(len(header.nodes))
     if header.scenes:
         roots = header.scenes[header.scene or 0].nodes
     scene_nodes = header.find_descendants(roots)
     materials = header.materials
-    counted_phrases = {
+    return {
         "occlusion map{s}: left out": (
             material.occlusionTexture is not None for material in materials
         ),
@@ -141,9 +162,6 @@ def note_left_out(header: Header, notes: Notes) -> None:
             if index not in scene_nodes
         ),
     }
-    for sentence in _count_phrases(counted_phrases):
-        notes.warn(sentence)
-    _note_unread(header, notes)
 
 
 ENTRY_KINDS = {
@@ -351,6 +369,7 @@ class GltfSurfaces:
         factor = np.array(stated_factor, np.float32).clip(0, 1)
         color_factor = factor[:3]
         has_alpha = material.alphaMode in TRANSPARENT_MODES
+        # Factors are linear in glTF.
         color = linear_to_srgb(color_factor)
         image_kind: ImageKind = "colours"
         if has_alpha:
@@ -370,6 +389,7 @@ class GltfSurfaces:
         if entry.baseColorTexture is not None and (color > 0.999).all():
             base_color = None  # plain white does not change a texture
         if has_alpha:
+            # "BLEND" keeps partial opacity, "MASK" cuts out what is below the cutoff.
             cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
             base_color = apply_opacity(base_color, factor[3:], cutoff)
             texture = apply_opacity(texture, factor[3:], cutoff)
@@ -398,6 +418,7 @@ class GltfSurfaces:
         image = self._load_image(
             use, "colours", "the texture {name} of the emission {why}; it is left out"
         )
+        # A texture that cannot be read leaves no emission: without it all would shine.
         if use is not None and image is None:
             return None
         return compute_radiance(factor, image, self.notes)
@@ -422,27 +443,8 @@ class GltfSurfaces:
         self.notes.warn(
             "textures of roughness and metallic are replaced by their means"
         )
-        mapped_parts = [
-            (piece.part, piece.packed_uvs)
-            for piece in pieces
-            if piece.packed_uvs is not None
-        ]
-        mean = np.asarray(image.mean(axis=(0, 1), dtype=np.float64), np.float32)
-        if mapped_parts:
-            corner_uvs = np.concatenate(
-                # v points up in an image that is averaged, and down in a file.
-                [
-                    uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0]
-                    for part, uvs in mapped_parts
-                ]
-            )
-            vectors = compute_area_vectors(
-                np.concatenate([part.vertices[part.faces] for part, _ in mapped_parts])
-            )
-            mean = average_over_faces(
-                image, corner_uvs, np.linalg.norm(vectors, axis=1)
-            )
-        _, green, blue = mean.tolist()
+        # The format has roughness in the green channel, metallic in the blue one.
+        _, green, blue = _average_where_visible(image, pieces).tolist()
         return entry.roughnessFactor * green, entry.metallicFactor * blue
 
     def _load_image(
@@ -474,13 +476,15 @@ class GltfSurfaces:
                 return b""
             return bytes(self.file.get_view(entry.bufferView))
 
+        # Several textures may show the same file, which is decoded once.
         texels = self._images.load(
             (entry.uri, entry.bufferView), load_content, kind, name, words
         )
-        is_sharp = self._get_sampler(use).magFilter == gltf_entries.NEAREST
-        if texels is None or not is_sharp or texels.shape[:2] == (1, 1):
+        is_unfiltered = self._get_sampler(use).magFilter == gltf_entries.NEAREST
+        is_single_texel = texels is not None and texels.shape[:2] == (1, 1)
+        if texels is None or not is_unfiltered or is_single_texel:
             return texels
-        # At this size, filtering is not visible.
+        # Each texel is repeated up to this size, where filtering is not visible.
         max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
         repeats = max_sharp_size // max(texels.shape[:2])
         if repeats < 2:
@@ -509,6 +513,7 @@ class GltfSurfaces:
         Returns:
             The surface, and the scale (2,) and shift (2,) of texture coordinates.
         """
+        # An empty array is added, since none at all cannot be concatenated.
         all_uvs = np.concatenate([*uvs, np.zeros((0, 2))])
         scale = np.ones(2)
         shift = np.zeros(2)
@@ -526,6 +531,7 @@ class GltfSurfaces:
         images = list(surface.images)
         if not images or not len(all_uvs) or not np.isfinite(all_uvs).all():
             return surface, scale, shift
+        # `images` has the texture first, if there is one, and then the normal map.
         normals_index = None
         if surface.normal_map is not None:
             normals_index = 0 if surface.texture is None else 1
@@ -538,8 +544,13 @@ class GltfSurfaces:
                 float(all_uvs[:, axis].min()),
                 float(all_uvs[:, axis].max()),
             )
+            # u, the first coordinate, runs along the second axis of an image.
             images, scale[axis], shift[axis] = self._fit_axis(
-                images, 1 - axis, wraps, bounds, normals_index
+                images,
+                axis=1 - axis,
+                wraps=wraps,
+                bounds=bounds,
+                normals_index=normals_index,
             )
         return surface.with_images(images), scale, shift
 
@@ -574,8 +585,10 @@ class GltfSurfaces:
         if reaches_out and len(set(wraps)) > 1:
             self.notes.warn(EDGES_NOTE)
         if first_wrap == gltf_entries.BORDER and reaches_out:
+            # Filtering blends the border with half a texel: texels become small.
             images = [_enlarge(image, axis) for image in images]
         if first_wrap == gltf_entries.MIRRORED and reaches_out:
+            # An image of twice the size, of which old coordinates cover a half.
             mirrored = [
                 np.concatenate([image, np.flip(image, axis)], axis=axis)
                 for image in images
@@ -642,12 +655,36 @@ class GltfSurfaces:
                 _pad(
                     image,
                     axis,
-                    units_before * texels_per_unit,
-                    units_after * texels_per_unit,
-                    border,
+                    before=units_before * texels_per_unit,
+                    after=units_after * texels_per_unit,
+                    border=border,
                 )
             )
         return padded, unit_size / total_units, units_before / total_units
+
+
+def _average_where_visible(
+    image: Float32Array, pieces: Sequence[PrimitiveData]
+) -> Float32Array:
+    """Return the mean (C,) of an image over the faces of some primitives that show it.
+
+    It is the mean of all texels if no primitive has texture coordinates for it.
+    """
+    mapped_parts = [
+        (piece.part, piece.packed_uvs)
+        for piece in pieces
+        if piece.packed_uvs is not None
+    ]
+    if not mapped_parts:
+        return np.asarray(image.mean(axis=(0, 1), dtype=np.float64), np.float32)
+    corner_uvs = np.concatenate(
+        # v points up in an image that is averaged, and down in a file.
+        [uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped_parts]
+    )
+    area_vectors = compute_area_vectors(
+        np.concatenate([part.vertices[part.faces] for part, _ in mapped_parts])
+    )
+    return average_over_faces(image, corner_uvs, np.linalg.norm(area_vectors, axis=1))
 
 
 def _edges_differ(image: Float32Array, axis: int) -> bool:
@@ -685,7 +722,7 @@ def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
     is not visible.
     """
     size = picture.shape[axis]
-    # rounded up
+    # twice negated, so that the quotient is rounded up
     factor = -(-SMALL_IMAGE_SIZE // size)
     if factor == 1:
         return picture
@@ -791,7 +828,7 @@ def _read_pieces(
     }
     pieces = dict[tuple[int, int], PrimitiveData | None]()
     for mesh in meshes:
-        assert mesh is not None
+        assert mesh is not None  # for mypy: these nodes have meshes
         entry = header.meshes[mesh]
         for index, primitive in enumerate(entry.primitives):
             pieces[mesh, index] = read_primitive(
@@ -920,9 +957,9 @@ def _pose_parts(
         file: the glTF file.
         instances: node, mesh and pose of everything that is drawn.
         parts_by_key: the primitives as parts, by the indices of mesh and primitive.
-        with_faces: their data.
+        with_faces: what the file stores of these primitives, by the same indices.
         skins: the skins of the nodes, by index.
-        skeleton: skeleton that of the file, None if nothing in it moves.
+        skeleton: skeleton of the file, None if nothing in it moves.
     """
     parts = []
     for node, mesh, pose in instances:
@@ -931,7 +968,7 @@ def _pose_parts(
         for primitive_index in range(len(file.header.meshes[mesh].primitives)):
             key = (mesh, primitive_index)
             if key not in parts_by_key:
-                continue
+                continue  # it has no faces
             vertex_joints = with_faces[key].vertex_joints
             part = parts_by_key[key]
             if skeleton is not None:
@@ -1024,7 +1061,7 @@ def read_primitive(
     Args:
         file: the glTF file.
         primitive: its entry in the header.
-        extras: those of its mesh.
+        extras: extras of its mesh, which may have the names of morph targets.
         is_skinned: whether a node with a skin draws it.
 
     Raises:
@@ -1155,10 +1192,11 @@ def _make_triangles(order: IntArray, mode: int) -> IntArray:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
     index = np.arange(max(0, len(order) - 2))
     if mode == STRIP:
+        # i, i + 1, i + 2 of an even face, and i, i + 2, i + 1 of an odd one
         corners = np.stack(
             [index, index + 1 + index % 2, index + 2 - index % 2], axis=1
         )
-    else:
+    else:  # all faces of a fan share the first vertex
         corners = np.stack([index + 1, index + 2, np.zeros_like(index)], axis=1)
     faces = order[corners]
     # Faces with a repeated vertex join strips that are far apart.

@@ -109,6 +109,7 @@ def read_vertex_joints(
     """
     attributes = primitive.attributes
     accessors = file.header.accessors
+    # A file has sets of four joints and weights a vertex: JOINTS_0, JOINTS_1, ...
     joints = list[IntArray]()
     weights = list[Float64Array]()
     while f"JOINTS_{len(joints)}" in attributes:
@@ -118,11 +119,11 @@ def read_vertex_joints(
             )
         joints_index = attributes[f"JOINTS_{len(joints)}"]
         weights_index = attributes.get(f"WEIGHTS_{len(joints)}")
-        count = accessors[attributes["POSITION"]].count
+        n_vertices = accessors[attributes["POSITION"]].count
         if (
             weights_index is None
-            or not _is_vec4(accessors[joints_index], count)
-            or not _is_vec4(accessors[weights_index], count)
+            or not _is_vec4(accessors[joints_index], n_vertices)
+            or not _is_vec4(accessors[weights_index], n_vertices)
         ):
             raise damaged(
                 file.path, "four joints and four weights of each vertex", "others"
@@ -216,7 +217,7 @@ def read_targets(
         file: the glTF file.
         primitive: its entry in the header.
         used: the vertices (V,) that are used.
-        extras: those of its mesh; exporters write names of targets to `targetNames`.
+        extras: extras of its mesh; exporters write names of targets to `targetNames`.
 
     Returns:
         The targets; and what each adds to the normals, (V, 3) or None.
@@ -231,7 +232,7 @@ def read_targets(
     normal_offsets = list[Float64Array | None]()
     for index, attributes in enumerate(primitive.targets):
         offsets = _read_offsets(file, primitive, attributes, "POSITION", used)
-        if offsets is None:
+        if offsets is None:  # the target moves normals alone
             offsets = np.zeros((len(used), 3))
         moved_vertices = np.flatnonzero(offsets.any(axis=1))
         name = f"target-{index}"
@@ -295,7 +296,7 @@ def apply_targets(
     ):
         if not weight:
             continue
-        vertices = np.array(vertices)
+        vertices = np.array(vertices)  # a copy, as the part itself stays
         vertices[target.rows] += weight * target.offsets
         if normals is not None and normal_offset is not None:
             normals = normals + weight * normal_offset
@@ -363,6 +364,21 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
     return n_targets
 
 
+def _name_nodes(header: Header) -> tuple[str, ...]:
+    """Return a unique name for each node: that of its bone, or else its own.
+
+    Bones have names in files of avatars: the extension VRM, version 0 or 1.
+    """
+    bone_names = {bone.node: bone.bone for bone in header.vrm_0} | {
+        bone.node: name for name, bone in header.vrm.items()
+    }
+    unique_names = UniqueNames()
+    return tuple(
+        unique_names.make_unique(bone_names.get(index) or node.name or f"node-{index}")
+        for index, node in enumerate(header.nodes)
+    )
+
+
 def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton | None:
     """Return the nodes and clips of a file; None if nothing moves its geometry.
 
@@ -381,14 +397,6 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
     clips = _read_clips(file, target_counts, skins)
     if not (skins or clips or any(target_counts.values())):
         return None
-    bone_names = {bone.node: bone.bone for bone in header.vrm_0} | {
-        bone.node: name for name, bone in header.vrm.items()
-    }
-    unique_names = UniqueNames()
-    node_names = [
-        unique_names.make_unique(bone_names.get(index) or node.name or f"node-{index}")
-        for index, node in enumerate(header.nodes)
-    ]
     # of nodes without a rotation the identity, (x, y, z, w)
     rotations = np.array(
         [node.rotation or [0.0, 0.0, 0.0, 1.0] for node in header.nodes]
@@ -396,7 +404,7 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
     lengths = np.linalg.norm(rotations, axis=1, keepdims=True)
     return Skeleton(
         source=file.path.name,
-        names=tuple(node_names),
+        names=_name_nodes(header),
         parents=np.array(header.parents),
         local_matrices=np.stack([compute_matrix(node) for node in header.nodes]),
         translations=np.array([node.translation or [0.0] * 3 for node in header.nodes]),
@@ -440,10 +448,10 @@ def _read_clips(
     def moves_geometry(channel: Channel) -> bool:
         """Return whether a channel sets something that moves geometry, see above."""
         node = channel.target.node
-        path = channel.target.path
-        if node is None or path not in VALUE_WIDTHS:  # it is of an extension
-            return False
-        if path == "weights":
+        property_name = channel.target.path
+        if node is None or property_name not in VALUE_WIDTHS:
+            return False  # an extension defines what it sets
+        if property_name == "weights":
             return target_counts.get(node, 0) > 0
         return node in moving_nodes
 
@@ -495,7 +503,7 @@ def _read_track(
     """
     path = file.path
     sampler = animation.samplers[channel.curve]
-    node = channel.target.node or 0
+    node = channel.target.node or 0  # always there: `_read_clips` has seen to that
     target_path = channel.target.path
     times = _read_times(file, sampler.input)
     if file.header.nodes[node].matrix is not None and target_path != "weights":
@@ -519,8 +527,9 @@ def _read_track(
         len(times), values_per_key, n_targets * width
     )
     if target_path == "rotation":
+        # the values themselves, which stand between the tangents of a spline
         lengths = np.linalg.norm(keys[:, values_per_key // 2], axis=1)
-        if not (lengths > MIN_QUATERNION_LENGTH).all():
+        if not (lengths > MIN_QUATERNION_LENGTH).all():  # they have no direction
             raise damaged(
                 path, "rotations of a clip that are unit quaternions", "one of length 0"
             )

@@ -95,20 +95,20 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
         FileFormatError: the file is corrupt, too large, deep, a cube map, or has no
             colors.
     """
-    if not data.startswith(b"\x76\x2f\x31\x01"):
+    if not data.startswith(b"\x76\x2f\x31\x01"):  # as every OpenEXR file begins
         raise damaged(file, "an OpenEXR picture", describe_content(data))
     try:
         with _suppress_output():
             header, planes, notes = _read_layer(file, data)
     except (AdvsearchError, MemoryError):
-        raise
-    except Exception as error:
+        raise  # our own errors say already what is wrong
+    except Exception as error:  # the library raises many kinds
         message = (
             f"{file}: cannot be read as OpenEXR; it is damaged or cut short, "
             "export it again"
         )
         raise FileFormatError(message) from error
-    # a number, or an enum with one
+    # The library returns a number, or an enum with one as its value.
     environment_map = header.get("envmap")
     if getattr(environment_map, "value", environment_map) == CUBE_MAP:
         raise FileFormatError(
@@ -118,14 +118,10 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
     _, size = _read_window(header, "dataWindow")
     _check_planes(file, planes, size)
     colors = planes if "R" in planes else _convert_luminance(planes, size)
-    primaries = header.get("chromaticities")
-    if primaries is not None:
-        primary_values = np.asarray(primaries, np.float64).ravel()
-        if not np.allclose(primary_values, PRIMARIES, atol=2e-3):
-            notes.append(
-                "its colours have primaries of their own and are taken for those of "
-                "sRGB"
-            )
+    if not _has_srgb_primaries(header):
+        notes.append(
+            "its colours have primaries of their own and are taken for those of sRGB"
+        )
     rgb = (colors["R"], colors["G"], colors["B"])
     return _crop_to_display_window(header, rgb, notes), notes
 
@@ -179,6 +175,16 @@ def _check_planes(
         )
 
 
+def _has_srgb_primaries(header: Mapping[str, Any]) -> bool:
+    """Return whether the primaries of a picture are those of sRGB, as by default."""
+    primaries = header.get("chromaticities")
+    if primaries is None:
+        return True
+    primary_values = np.asarray(primaries, np.float64).ravel()
+    # Files round them, to three digits for example.
+    return bool(np.allclose(primary_values, PRIMARIES, atol=2e-3))
+
+
 def _check_size(file: Path, picture: Any) -> None:
     """Raise FileFormatError for a picture that is deep, or over a limit.
 
@@ -195,6 +201,7 @@ def _check_size(file: Path, picture: Any) -> None:
             )
         _, (data_height, data_width) = _read_window(header, "dataWindow")
         _, (height, width) = _read_window(header, "displayWindow")
+        # In a corrupt file the end of a window may be before its start.
         n_pixels = max(data_width, 0) * max(data_height, 0)
         n_values += n_pixels * len(header["channels"])
         check_pixels(file, max(width, 0), max(height, 0))
@@ -250,9 +257,12 @@ def _select_layer(
             name_rank = MAIN_LAYER_NAMES.index(last_word)
         return name_rank, "R" not in channels
 
-    name, header, channels = min(layers, key=rank)
+    name, header, channels = min(layers, key=rank)  # the first of equal ones
     other_names = ", ".join(
-        format_name(other) for other, _, _ in layers[:20] if other != name
+        # not more, so that the note stays readable
+        format_name(other)
+        for other, _, _ in layers[:20]
+        if other != name
     )
     notes = []
     if other_names and name:
@@ -261,6 +271,7 @@ def _select_layer(
         )
     elif other_names:
         notes.append(f"layers are left out: {other_names}")
+    # colors, or luminance with its chroma if there is one
     channel_names = ("R", "G", "B") if "R" in channels else ("Y", "RY", "BY")
     return (
         header,
@@ -295,6 +306,7 @@ def _find_color_layers(
         part_name = str(header.get("name", "")) if len(parts) > 1 else ""
         for layer, layer_channels in channels_by_layer.items():
             names = set(layer_channels)
+            # both chroma channels or none
             is_luminance = (
                 "Y" in names
                 and ("RY" in names) == ("BY" in names)
@@ -419,12 +431,13 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
     Raises:
         FileFormatError: the size is none, or too large, or scanlines are missing.
     """
+    # A sign, an axis and a count of scanlines, and these three of pixels in a scanline.
     size_match = _RESOLUTION.match(body)
     if (
         not size_match
         or not int(size_match[3])
         or not int(size_match[6])
-        or size_match[2] == size_match[5]
+        or size_match[2] == size_match[5]  # twice the same axis
     ):
         line = body[:30].split(b"\n")[0].decode("latin-1")
         raise FileFormatError(
@@ -435,13 +448,13 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
     line_length = int(size_match[6])
     check_pixels(path, line_length, n_lines)
     pixels = _decode_scanlines(path, body[size_match.end() :], n_lines, line_length)
-    # Flip it so that it begins at the top and at the left.
+    # Flip it so that it begins at the top (y falls: -Y) and at the left (x grows: +X).
     line_step, pixel_step = (
         1 if sign + axis in (b"-Y", b"+X") else -1
         for sign, axis in (size_match.group(1, 2), size_match.group(4, 5))
     )
     pixels = pixels[::line_step, ::pixel_step]
-    if size_match[2] != b"Y":
+    if size_match[2] != b"Y":  # its scanlines are columns
         pixels = pixels.transpose(1, 0, 2)
     return pixels
 
@@ -590,6 +603,7 @@ def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
         position = position + 4
         if pixel[:3] == b"\x01\x01\x01":
             count = pixel[3] << count_shift
+            # There has to be a pixel to repeat, and room for the repeats.
             if n_filled == 0 or n_filled + count > width:
                 raise ValueError("a repeat that does not fit")
             line[n_filled : n_filled + count] = line[n_filled - 1]

@@ -92,16 +92,10 @@ class MtlReader:
         try:
             text = decode_text(self.references.get(name))
         except FileNotFoundError:
-            file_name = normalize_name(name)
-            missing_file = (
-                f"{format_name(file_name)}, which {self.references.refused[file_name]}"
-            )
-            self.notes.warn(
-                f" names the material file {missing_file}; neutral grey is used instead"
-            )
+            self._note_missing_library(name)
             return
         self.n_libraries += 1
-        file = normalize_name(name).rpartition("/")[2]
+        file = normalize_name(name).rpartition("/")[2]  # without its folder
         materials, stray_keywords = parse_mtl(text, file)
         for keyword in stray_keywords:
             self.notes.record(
@@ -109,6 +103,24 @@ class MtlReader:
                 "statement",
                 keyword,
             )
+        self._add_materials(materials)
+
+    def _note_missing_library(self, name: str) -> None:
+        """Note a material file that is missing, or that must not be read."""
+        file_name = normalize_name(name)
+        missing_file = (
+            f"{format_name(file_name)}, which {self.references.refused[file_name]}"
+        )
+        self.notes.warn(
+            f" names the material file {missing_file}; neutral grey is used instead"
+        )
+
+    def _add_materials(self, materials: Sequence[MtlMaterial]) -> None:
+        """Add the materials of one file by name; of equal names the first counts.
+
+        A second material of a name is noted, unless its statements are the same, or the
+        first is of another file.
+        """
         for material in materials:
             known_material = self._materials.setdefault(material.name, material)
             if (
@@ -116,8 +128,8 @@ class MtlReader:
                 and known_material.file == material.file
             ):
                 self.notes.warn(
-                    f"{file} has the material {format_name(material.name)} more "
-                    "than once; the first counts"
+                    f"{material.file} has the material {format_name(material.name)} "
+                    "more than once; the first counts"
                 )
         # A # may begin a comment or be part of a name: both are tried.
         for material in materials:
@@ -159,21 +171,12 @@ class MtlReader:
         material = self._find_material(name)
         if material is None:
             return []
-        uses = [self._parse_use(material, key) for key in UV_MAPS]
-        numbered_name = next(
-            (
-                use.name
-                for use in uses
-                if use is not None and find_square(use.name) is not None
-            ),
-            None,
-        )
+        numbered_name = self._find_numbered_name(material)
         if numbered_name is None:
             return []
+        named_square = find_square(numbered_name)  # 0 is the placeholder
         other_squares = [
-            square
-            for square in candidates
-            if square and square != find_square(numbered_name)
+            square for square in candidates if square and square != named_square
         ]
         if not other_squares:
             return []
@@ -183,16 +186,22 @@ class MtlReader:
             )
             for square in other_squares
         )
-        if find_square(numbered_name) == 0 or any(exists):
+        if named_square == 0 or any(exists):
             return [square for square in candidates if square]
         self.notes.warn(
             f"{format_name(numbered_name)} is named like one of several pictures (UDIM), "
-            "and "
-            "there is none for the "
+            "and there is none for the "
             f"faces in {', '.join(map(str, other_squares[:8]))}: it repeats there; put "
             "those pictures beside it"
         )
         return []
+
+    def _find_numbered_name(self, material: MtlMaterial) -> str | None:
+        """Return the first name of a material's images that has a UDIM square in it."""
+        for use in [self._parse_use(material, key) for key in UV_MAPS]:
+            if use is not None and find_square(use.name) is not None:
+                return use.name
+        return None
 
     def _make_surface(
         self, material: MtlMaterial, square: int, name: str
@@ -212,6 +221,8 @@ class MtlReader:
             material_id == id(material) for material_id, _ in self._surfaces
         )
         uses = self._parse_uses(material, square)
+        # The mesh has one layout of texture coordinates: that of its first image, or
+        # without images the one that changes nothing.
         first_use = next((uses[key] for key in UV_MAPS if key in uses), MapUse("", {}))
         self._drop_other_layouts(material, uses, first_use)
         color, texture = self._make_base_color(material, uses.get("map_kd"))
@@ -325,6 +336,7 @@ class MtlReader:
         zero_keys = {
             key
             for key in material.statements
+            # What has no numbers is not zero.
             if not any(parse_numbers(material.peek_argument(key)) or [1.0])
         }
         base_map = parse_map(without_comment(material.statements.get("map_kd", "")))
@@ -336,7 +348,7 @@ class MtlReader:
                 return True
             if key == "pcr" and "pc" in zero_keys:
                 return True
-            if key == "tf":
+            if key == "tf":  # a grey filter: all its numbers are equal
                 return len(set(rest.split())) == 1
             if key == "map_ka":
                 use = parse_map(rest)
@@ -373,13 +385,24 @@ class MtlReader:
             if isinstance(self.references.find(use_with_comment.name), bytes):
                 use = use_with_comment  # the # belongs to the name
         self._uses[id(material), key] = use
+        if use is not None:
+            self._note_unread_options(material, key, use)
+        return use
+
+    def _note_unread_options(
+        self, material: MtlMaterial, key: str, use: MapUse
+    ) -> None:
+        """Note the options of an image that are not read, unless they change nothing.
+
+        `key` is the keyword of the statement with the image, in lower case.
+        """
         has_colors = key in ("map_kd", "map_ke")
         read_options = ["s", "o", "mm", "clamp"]
         if key in NORMAL_MAPS:
             read_options.append("bm")
         elif not has_colors:
             read_options.append("imfchan")
-        options = TrackedKeys({} if use is None else use.options)
+        options = TrackedKeys(use.options)
         options.mark_read(*read_options)
 
         def is_quiet(option: str, value: str) -> bool:
@@ -387,14 +410,13 @@ class MtlReader:
             if option == "colorspace":
                 return value.lower() == ("srgb" if has_colors else "linear")
             is_default = value.lower() == DEFAULT_OPTIONS.get(option)
-            is_zero = not any(parse_numbers(value) or [1.0])
+            is_zero = not any(parse_numbers(value) or [1.0])  # 1: it has no numbers
             return (is_default or is_zero) and option != "imfchan"
 
         for option in options.find_unread(is_quiet):
             self.notes.record(
                 "texture option", f"-{option} of {material.spelling[key]}"
             )
-        return use
 
     def _apply_opacity(
         self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface
@@ -445,6 +467,7 @@ class MtlReader:
             f"the material {format_name(material.name)} has Tr {transparency:g}"
         )
         if opacity >= 0.0 and transparency >= 0.0:
+            # to two digits, since programs round
             agrees_as_opacity = abs(transparency - opacity) <= 0.01
             agrees_as_transparency = abs(1.0 - transparency - opacity) <= 0.01
             if not agrees_as_opacity and not agrees_as_transparency:
@@ -452,7 +475,7 @@ class MtlReader:
                     f"{material_phrase} beside d {opacity:g}, which it contradicts; d is "
                     "taken for its opacity"
                 )
-        elif opacity < 0.0 < transparency:
+        elif opacity < 0.0 < transparency:  # there is a Tr alone, and it is not 0
             self.notes.warn(
                 f"{material_phrase} and no d: it is taken for transparency, which makes its "
                 f"opacity {1.0 - transparency:g}; some programs"
@@ -483,7 +506,7 @@ class MtlReader:
             f"{material.spelling.get(f'map_{key}')} {{name}} {{why}}; it is left out"
         )
         image = self._load_image(use, "numbers", note_template)
-        number = parse_fraction(material.read_argument(key), -1.0)
+        number = parse_fraction(material.read_argument(key), -1.0)  # -1: none
         if use is not None and image is not None:
             self.notes.warn(
                 "textures of roughness and metallic are replaced by their means"
@@ -513,6 +536,7 @@ class MtlReader:
                 *(other for other in uses if uses[other].name == use.name)
             )
             if image is not None:
+                # These two keywords are for normals alone; bump maps may be either.
                 if key in ("norm", "map_kn") or has_normals(image):
                     return make_normal_map(image, use.bump)
                 self._images.note_missing(
@@ -528,7 +552,7 @@ class MtlReader:
         They are multiplied; without a map the radiance is (1, 1, 3). A map that cannot
         be read leaves no emission, with a note.
         """
-        values = parse_numbers(material.read_argument("ke") or "0")
+        values = parse_numbers(material.read_argument("ke") or "0")  # by default black
         if values is None or len(values) not in (1, 3) or min(values) < 0:
             self.notes.warn(
                 f"the emission {format_name(material.read_argument('ke'))} is no "
@@ -562,6 +586,7 @@ class MtlReader:
         image = self._images.load_file(use.name, kind, note_template)
         if image is None or use.range == (0.0, 1.0):
             return image
+        # -mm base gain: values are multiplied by the gain, then the base is added.
         base, gain = map(np.float32, use.range)
         colors = np.clip(image[:, :, :3] * gain + base, 0.0, 1.0)
         return np.concatenate([colors, image[:, :, 3:]], axis=2)
@@ -575,9 +600,10 @@ def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     """
     channel = CHANNELS.get(use.options.get("imfchan", "").lower())
     has_alpha = picture.shape[2] == 4
-    if channel is None and has_alpha and picture[:, :, 3].min() < 1.0:
-        channel = 3
-    if channel is None or (channel == 3 and not has_alpha):
+    alpha_index = 3
+    if channel is None and has_alpha and picture[:, :, alpha_index].min() < 1.0:
+        channel = alpha_index
+    if channel is None or (channel == alpha_index and not has_alpha):
         mean: Float32Array = picture[:, :, :3].mean(axis=2)
         return mean
     return picture[:, :, channel]
@@ -785,7 +811,7 @@ def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
         elif materials:
             material = materials[-1]
             value = argument.strip()
-            if material.statements.get(key, value) != value:
+            if material.statements.get(key, value) != value:  # an earlier one differs
                 material.overridden.append(keyword)
             material.statements[key] = value
             material.spelling[key] = keyword
@@ -809,6 +835,7 @@ def parse_map(argument: str) -> MapUse | None:
     options: dict[str, str] = {}
     for match in _OPTION.finditer(argument):
         for key in _OPTIONS:
+            # The group "s" is the option's name, the group "s_" its value.
             if match[key] is not None:
                 options[key] = match[f"{key}_"]
     name = " ".join(_OPTION.sub("", argument).split())

@@ -157,7 +157,7 @@ def check_facing(facing: str, up: str | None) -> str:
             "facing: expected an axis of the file, one of "
             f"{', '.join(FRONT_AXES)}, got {facing!r}"
         )
-    if axis[1] == up:
+    if axis[1] == up:  # the letter behind the sign
         raise InputError(
             f"facing: {facing} is along the axis that points up, {up}; "
             "give another one, or another `up`"
@@ -184,7 +184,7 @@ def find_front(path: Path, header: Header | None, up: str | None = None) -> File
 
     Args:
         path: the file.
-        header: header that of a glTF file, or of a file that was converted to glTF.
+        header: header of a glTF file, or of a file that was converted to glTF.
         up: the axis that points up, if the user named it.
     """
     suffix = path.suffix.lower()
@@ -241,12 +241,7 @@ def make_object(
     surfaces = [part.surface for part in parts]
     soup = repair(join_parts(parts, str(file), rotation), str(file), object_notes)
     soup, maps = apply_textures(soup, surfaces, object_notes)
-    opacity = None
-    if maps.color.shape[2] == 4:
-        opacity = np.ascontiguousarray(maps.color[:, :, 3])
-        if not opacity.any():
-            opacity = None
-            object_notes.warn("it is transparent all over; it is shown opaque")
+    opacity = _find_opacity(maps.color, object_notes)
     material = _compute_mean_material(soup, surfaces, object_notes)
     # The soup's extent is 1 but for faces that the repair has removed.
     extent = compute_extent(parts) * float(
@@ -299,12 +294,27 @@ def _find_up(
         return FileAxis(up)
     if file.suffix.lower() in GLTF_SUFFIXES:
         return FileAxis("y")
+    # the letter behind the sign: "y" of "-y"
     if front.axis[1] in UP_OF_FRONT:
         return FileAxis(UP_OF_FRONT[front.axis[1]])
     as_stored = join_parts(parts, str(file), np.eye(3))
     return guess_up(
         as_stored.points[find_used(as_stored.faces, len(as_stored.points))], file.name
     )
+
+
+def _find_opacity(color: Float32Array, notes: Notes) -> Float32Array | None:
+    """Return the opacity (H, W) in a map of colors (H, W, 3 or 4); None if opaque.
+
+    What is transparent all over would be invisible, and counts as opaque, with a note.
+    """
+    if color.shape[2] < 4:
+        return None
+    opacity = np.ascontiguousarray(color[:, :, 3])
+    if not opacity.any():
+        notes.warn("it is transparent all over; it is shown opaque")
+        return None
+    return opacity
 
 
 def _compute_mean_material(
@@ -320,6 +330,7 @@ def _compute_mean_material(
         weights=np.linalg.norm(soup.compute_face_vectors(), axis=1),
         minlength=len(surfaces),
     )
+    # What a surface does not state has the value of the default material.
     materials = [Material().with_values(vars(surface), "") for surface in surfaces]
     values = np.array(
         [[material.roughness, material.metallic] for material in materials]
@@ -354,9 +365,10 @@ def _make_mesh(
 ) -> Mesh:
     """Return the normalised mesh with its materials, and a rig if something moves it.
 
-    `turn` (3, 3) leads from the file's axes to ours.
+    Its largest extent becomes 1. `turn` (3, 3) leads from the file's axes to ours.
     """
     material_names, material_of_face = index_materials(soup, surfaces)
+    # Groups end with the last material that has faces.
     faces_by_material = zip(
         material_names, group_indices(material_of_face), strict=False
     )
@@ -411,6 +423,7 @@ def _compute_emitted(
     if emission is None or opacity is None:
         return emission
     rows, columns = emission.shape[:2]
+    # Pairs are compared by width first, then by height.
     width, height = max((columns, rows), (opacity.shape[1], opacity.shape[0]))
     resized_opacity = np.asarray(
         Image.fromarray(opacity).resize((width, height), Image.Resampling.BILINEAR)

@@ -52,7 +52,7 @@ def make_normal_map(picture: Float32Array, scale: float = 1.0) -> Float32Array:
         (H, W, 3) texels.
     """
     clamped_scale = min(max(scale, -MAX_NORMAL_SCALE), MAX_NORMAL_SCALE)
-    normals = picture * 2.0 - 1.0
+    normals = picture * 2.0 - 1.0  # stored as (n + 1) / 2
     normals[..., :2] *= clamped_scale
     normals[..., 2] = np.maximum(normals[..., 2], MIN_NORMAL_Z)
     return encode_normals(normals)
@@ -64,10 +64,11 @@ def has_normals(picture: Float32Array) -> bool:
     Normals are mostly blue, since they point out of the surface, and have a length of
     about 1. Black texels are ignored: no face shows them.
     """
-    visible_texels = picture[picture.any(axis=2)]
+    visible_texels = picture[picture.any(axis=2)]  # not black
     if not len(visible_texels):
         return False
     length_error = np.abs(np.linalg.norm(visible_texels * 2.0 - 1.0, axis=1) - 1.0)
+    # blue minus red: 0 where the image is grey
     blueness = float(
         (visible_texels[:, 2] - visible_texels[:, 0]).mean(dtype=np.float64)
     )
@@ -210,10 +211,11 @@ def apply_opacity(
     if cutoff is not None:
         opacity = (opacity >= cutoff).astype(np.float32)
     rgb = color[..., :3]
-    if opacity.min() >= 1.0:
+    if opacity.min() >= 1.0:  # opaque everywhere
         return rgb
     is_cut_out = opacity[..., 0] == 0.0
-    if color.ndim == 3 and not is_cut_out.all():
+    is_image = color.ndim == 3  # not a single color
+    if is_image and not is_cut_out.all():
         # for each texel the rows and columns of the nearest one that is not cut out
         nearest_visible = distance_transform_edt(
             is_cut_out, return_distances=False, return_indices=True

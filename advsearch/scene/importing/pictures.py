@@ -89,6 +89,7 @@ def load_display_image(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large images and odd metadata
         image.load()
+        # the factor by which the image becomes smaller; from 1 on it stays as it is
         shrink = 1.0 if limit is None else limit / max(height, width)
         # Tables of the 256 levels, which replace a computation for each pixel.
         display_of_level: Float32Array = np.arange(256, dtype=np.float32) / np.float32(
@@ -100,6 +101,7 @@ def load_display_image(
         linear_of_level = (
             display_of_level if is_raw else srgb_to_linear(display_of_level)
         )
+        # Transparent pixels do not count in the mean of colors.
         is_weighted = not is_raw and (keep_alpha or image.has_transparency_data)
 
         def load_band(top: int, end: int) -> Float32Array:
@@ -115,6 +117,7 @@ def load_display_image(
         averaged = average_in_bands(load_band, (height, width), target_shape)
         if is_raw:
             return averaged
+        # As `load_band` returns them: colors, opacity and their product.
         colors = averaged[:, :, :3]
         opacity = averaged[:, :, 3:4]
         if is_weighted:

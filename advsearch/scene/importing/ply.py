@@ -100,6 +100,7 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     ends_in_returns = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")
     header_end = _END.search(data.replace(b"\r", b"\n") if ends_in_returns else data)
     if not has_magic or header_end is None:
+        # Of bytes, the message says what kind of file they are.
         got = "half of one" if has_magic else data
         raise notes.damaged("a PLY file with a complete header", got)
     elements, comments, byte_order = _parse_header(
@@ -108,6 +109,7 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     notes.check_faces(elements["face"].count if "face" in elements else 0)
     body = data[header_end.end() :]
     position = 0
+    # `cells` are bytes to read from: of an ASCII file, those of its numbers as float64.
     if byte_order:
         cells = np.frombuffer(body, np.uint8)
         text = b""
@@ -135,13 +137,14 @@ def _parse_header(
     comments = list[str]()
     byte_order = None
     element = None
-    for line in header.splitlines()[1:]:
+    for line in header.splitlines()[1:]:  # the first line is "ply"
         match line.split():
             case ["format", kind, *_] if kind in _FORMATS:
                 byte_order = _FORMATS[kind]
             case ["comment" | "obj_info", *_]:
                 comments.append(line.strip().partition(line.split()[0])[2].strip())
             case ["element", name, count] if (
+                # no more digits than 64 bits have
                 count.isdecimal() and len(count) < 20 and name not in elements
             ):
                 element = Element(name, int(count))
@@ -231,7 +234,7 @@ def _read_rows(
         starts = {name: list[int]() for name in scalar_widths}
         byte = position
         # a longer list than the whole file could hold is damage
-        max_length = len(cells) // (8 if text else 1)
+        max_length = len(cells) // (8 if text else 1)  # float64 have 8 bytes
         for _ in range(n_rows):
             for name, width in scalar_widths.items():
                 starts[name].append(byte)
@@ -381,7 +384,7 @@ def _combine_colors(
     """
     if colors is None:
         return surface, None
-    if surface.texture is None:
+    if surface.texture is None:  # white, so that only these colors count
         return ImportedSurface(color=np.ones(3, np.float32)), colors
     if colors[group].min() < 1.0:
         notes.warn("colours of vertices or faces are left out where there is a texture")
@@ -560,7 +563,7 @@ class _Properties:
             triangles: (T, 3) corners.
         """
         wedges = self._find_list("face", WEDGE_UV_NAMES)
-        if wedges is None or not wedges.counts.any():
+        if wedges is None or not wedges.counts.any():  # all lists are empty
             vertex_uvs = self.read_columns("vertex", UV_NAMES)
             if vertex_uvs is None:
                 return None
@@ -674,8 +677,9 @@ class _Properties:
             return np.zeros(len(counts), np.int64)
         numbers = _to_integers(self.elements[element].scalars["texnumber"])
         if element == "face":
-            texture[: len(numbers)] = numbers
+            texture[: len(numbers)] = numbers  # triangles of strips keep -1
         else:
+            # The first corner of an empty polygon at the end would be out of range.
             first_corner = np.cumsum(counts) - counts
             texture = numbers[corners[np.minimum(first_corner, len(corners) - 1)]]
         n_wrong = int(((texture < -1) | (texture >= len(names))).sum())
@@ -729,7 +733,7 @@ def _find_scale(values: Float64Array, kind: np.dtype[np.generic]) -> float:
     """
     largest = float(np.nan_to_num(values).max(initial=0.0))
     if kind.kind == "f":
-        return 1.0 if largest <= 2.0 else 255.0
+        return 1.0 if largest <= 2.0 else 255.0  # some are a little over 1
     if kind.itemsize == 1 or (kind.itemsize > 2 and largest <= 255.0):
         return 255.0
     if kind.itemsize == 2 or largest <= 65535.0:

@@ -174,9 +174,9 @@ def _make_surrounding_meshes(
         header: header of the file.
         parts: what its nodes draw.
         object_nodes: the nodes of the object.
-        names: names from which the meshes get theirs.
+        names: names that are taken; those of the meshes are added.
         front: the axis of the file that is the front.
-        frame: frame that of the object.
+        frame: frame of the object.
         notes: warnings are added to it.
     """
     meshes: list[ScenePart] = []
@@ -265,10 +265,11 @@ def _make_surrounding_mesh(
         name: name of the part.
         parts: what the node draws.
         front: the axis of the file that is the front.
-        object_frame: object frame that of the object.
+        object_frame: frame of the object.
     """
     frame = _compute_frame(parts, object_frame.rotation)
     shape = make_object(parts, notes=[], file=path, name=name, up="y", front=front)
+    # Both are meshes of extent 1, so their sizes in the file make the scale.
     mesh_to_object = np.eye(4)
     mesh_to_object[:3, :3] *= frame.size / object_frame.size
     mesh_to_object[:3, 3] = object_frame.to_frame(frame.origin)
@@ -488,8 +489,8 @@ def _make_lamp(
         name: name of the lamp.
         light: its entry in the header.
         candela_per_unit: how many candela are one unit of radiant intensity.
-        pose: (4, 4) of its node.
-        frame: frame that of the object.
+        pose: pose (4, 4) of its node.
+        frame: frame of the object.
 
     Raises:
         InputError: it is too far away or too bright.
@@ -497,13 +498,14 @@ def _make_lamp(
     intensity = np.array(light.color) * light.intensity / candela_per_unit
     if light.type == "directional":
         direction = frame.rotation @ pose[:3, 2]  # it shines along its -z
-        length = max(float(np.linalg.norm(direction)), 1e-12)
+        length = max(float(np.linalg.norm(direction)), 1e-12)  # not 0
         position = gltf_parts.DIRECTIONAL_LIGHT_DISTANCE * direction / length
         intensity = intensity * gltf_parts.DIRECTIONAL_LIGHT_DISTANCE**2
     else:
         position = frame.to_frame(frame.rotation @ pose[:3, 3])
         intensity = intensity / frame.size**2
-    is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE  # NaN is not
+    # one limit for distances and intensities; NaN is out of range
+    is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE
     if not is_in_range.all():
         raise InputError(
             f"{path}: expected the light {name} within {MAX_DISTANCE:g} object sizes, "

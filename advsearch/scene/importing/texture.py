@@ -110,8 +110,8 @@ def apply_textures(
         if is_untinted and np.isfinite(soup.uvs).all():
             uvs, images = _crop_to_window(
                 _move_into_unit_square(soup),
-                first_surface.images,
-                first_surface.texture,
+                pictures=first_surface.images,
+                colors=first_surface.texture,
             )
             is_usable = _is_usable(soup, uvs)
             is_lit_twice = is_usable and _is_lit_twice(uvs, first_surface, images)
@@ -193,7 +193,7 @@ def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     )
     # Smallest and largest material on each texel: if they differ, it is shared. Texels
     # without a face have a largest one of -1.
-    first_material = np.full(size * size, len(uvs))
+    first_material = np.full(size * size, len(uvs))  # more than any index
     last_material = np.full(size * size, -1)
     np.minimum.at(first_material, row * size + column, material[face])
     np.maximum.at(last_material, row * size + column, material[face])
@@ -254,13 +254,15 @@ def _describe_reason(
     texture coordinates, unusable ones.
     """
     if not is_uniform:
+        # Materials without a name are told apart as objects.
         n_materials = len({surface.name or id(surface) for surface in used})
         if n_materials > 1:
             baked_things = f"the colours of its {n_materials} materials"
         else:
             baked_things = "the pictures of its material"
         return f"{baked_things} were baked into one texture"
-    if not has_uniform_factor or soup.colors.min() < 1.0:
+    is_tinted = soup.colors.min() < 1.0
+    if not has_uniform_factor or is_tinted:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
         substitute = "its normal map is left out"
@@ -271,8 +273,7 @@ def _describe_reason(
             f"{substitute}"
         )
     return (
-        "its texture coordinates repeat or hardly use the texture; it was "
-        "unwrapped "
+        "its texture coordinates repeat or hardly use the texture; it was unwrapped "
         "anew and its texture resampled"
     )
 
@@ -429,7 +430,7 @@ def bake(
     face, rows, columns, weights = rasterize_triangles(
         _to_texels(uvs, (size, size)), (size, size), tolerance=1e-9
     )
-    maps = _make_blank_maps(surfaces, size)
+    maps = _make_blank_maps(surfaces, size)  # filled in below
     # (T, 3) factor of the base color at each texel
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
     for surface, texel in zip(
@@ -443,7 +444,7 @@ def bake(
         texel_color = _sample_base_color(surface, file_uvs, soup, surfaces)
         maps.color[y, x, : texel_color.shape[1]] = _tint(texel_color, factor[texel])
         if not np.isfinite(file_uvs).all():
-            continue
+            continue  # no UVs in the file: neither bumps nor emission
         if maps.normals is not None and surface.normal_map is not None:
             maps.normals[y, x] = convert_normals(
                 sample_texture(surface.normal_map, file_uvs),
@@ -571,7 +572,7 @@ def average_over_faces(
     n_steps = int(np.clip(np.sqrt(_MAX_SAMPLES / len(areas)), 1, _MAX_STEPS))
     weights = _compute_sample_weights(n_steps)
     weighted_sum = np.zeros(texture.shape[2])
-    # rounded up; in batches, so that memory is bounded
+    # In batches, so that memory is bounded. Twice negated, the quotient is rounded up.
     n_batches = -(-len(areas) * len(weights) // _MAX_SAMPLES)
     for batch in np.array_split(np.arange(len(areas)), n_batches):
         sample_uvs = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
@@ -594,6 +595,7 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     grid_i, grid_j = np.meshgrid(np.arange(steps), np.arange(steps))
     i = grid_i.reshape(-1)
     j = grid_j.reshape(-1)
+    # grid points at which a small triangle of either kind begins within the large one
     is_up = i + j < steps
     is_down = i + j < steps - 1
     # of the second and the third corner: steps along the two sides, as fractions
@@ -644,6 +646,7 @@ def sample_texture(texture: Float32Array, uvs: Float64Array) -> Float32Array:
     height, width = texture.shape[:2]
     # Modulo comes first, since a huge number times a width is infinite.
     u, v = (uvs % 1.0).T
+    # Texel centers are at integers, and row 0 is at the top, where v is 1.
     return look_up_texture(texture, u * width - 0.5, (1.0 - v) * height - 0.5)
 
 
@@ -679,6 +682,7 @@ def _unmirror(
     mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
     if normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
         return soup, maps
+    # (almost) all faces are mirrored
     if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:
         # y -> 1 - y of stored texels in [0, 1] reverses the sign
         flipped_normals = normals * np.array([1, -1, 1], np.float32) + np.array(
@@ -694,6 +698,7 @@ def _unmirror(
         [1, 0, 0], np.float32
     )
     emission = maps.emission
+    # a single texel is one value everywhere
     if emission is not None and emission.shape != (1, 1, 3):
         emission = np.concatenate([emission, emission[:, ::-1]], axis=1)
     color = np.concatenate([maps.color, maps.color[:, ::-1]], axis=1)
@@ -731,7 +736,7 @@ def convert_normals(
     # the file's bitangent points up the image, also where UVs are mirrored
     handedness = np.sign(compute_doubled_areas(old_soup.uvs[face]))[:, None]
     old_bitangent = np.cross(normal, old_tangent) * handedness
-    x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)
+    x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)  # decoded
     in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent
     # along the renderer's tangent and bitangent, which is normal x tangent
     new_x = (in_plane * new_tangent).sum(axis=1)
@@ -752,6 +757,7 @@ def _compute_tangents(
     used_faces, used_index = np.unique(face, return_inverse=True)
     a, b, c = (soup.points[soup.faces[used_faces, k]] for k in range(3))
     uvs = soup.uvs[used_faces]
+    # v of the second and third corner, from the first one
     (_, v1) = (uvs[:, 1] - uvs[:, 0]).T
     (_, v2) = (uvs[:, 2] - uvs[:, 0]).T
     handedness = np.sign(compute_doubled_areas(uvs))[:, None]

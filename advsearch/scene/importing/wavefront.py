@@ -323,9 +323,10 @@ def _combine_colors(
         if is_tinted:
             notes.warn("colours of vertices are left out where there is a texture")
         return surface, None
-    if surface.color is None:
+    if surface.color is None:  # white, so that only the vertex colors count
         return replace(surface, color=np.ones(3, np.float32)), colors
-    if is_tinted and surface.color[:3].min() < 0.999:
+    is_white = surface.color[:3].min() >= 0.999
+    if is_tinted and not is_white:
         notes.warn("colours of vertices are multiplied by the Kd of their material")
     return surface, colors
 
@@ -358,6 +359,7 @@ def _parse_statements(
             smoothing_changes.append((row, clean_argument))
         elif key in NON_FACE_STATEMENTS:
             notes.record(f"{NON_FACE_STATEMENTS[key]}, statement", key)
+        # What only groups faces, or is switched off, changes nothing.
         elif key not in GROUPING and clean_argument not in ("off", "0"):
             notes.record("statement", keyword)
     return library_lines, material_changes, smoothing_changes
@@ -375,6 +377,7 @@ def _find_values_in_effect(
     values = list(dict.fromkeys(value for _, value in changes))
     index_of_value = {value: index for index, value in enumerate(values)}
     change_rows = np.array([row for row, _ in changes], dtype=np.int64)
+    # the last change on a row before; -1 if there is none
     last_change = np.searchsorted(change_rows, rows) - 1
     # Position -1, of rows before the first change, is the last entry.
     index_of_change = np.array([*(index_of_value[value] for _, value in changes), -1])
@@ -408,6 +411,7 @@ def _read_colors(
     if stored_colors is None:
         return None
     has_color = np.asarray(np.isfinite(stored_colors).all(axis=1))
+    # In [0, 1] a color may be a little over 1; in [0, 255] one of 2 is black.
     is_in_bytes = has_color.any() and stored_colors[has_color].max() > 2.0
     scale = 255.0 if is_in_bytes else 1.0
     colors = np.where(has_color[:, None], stored_colors / scale, NEUTRAL_GREY)
@@ -536,6 +540,7 @@ class ObjLines:
                 )
             if not all(map(is_number, words)):
                 raise self.notes.damaged(f"numbers {where}", got)
+        # No single line is wrong, and yet they could not be parsed together.
         raise self.notes.damaged(f"numbers after {kind!r}", "something else")
 
     def read_faces(self, counts: dict[str, int]) -> tuple[IntArray, IntArray, IntArray]:
@@ -579,7 +584,7 @@ class ObjLines:
                     f"at least {kind_indices.max()} {kind!r} lines",
                     f"{got} (is the file cut short?)",
                 )
-        return corners - 1, sizes, rows
+        return corners - 1, sizes, rows  # the file counts from 1, and has 0 for none
 
     def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:
         """Raise FileFormatError for a last face cut short, or faces over a limit.
@@ -593,6 +598,7 @@ class ObjLines:
             ((line_number, words),) = self._iterate_words(rows[-1:])
             got = f"{format_name(' '.join(['f', *words]))} (is the file cut short?)"
             raise self.notes.damaged(f"3 or more corners on line {line_number}", got)
+        # Rows count from 0, lines from 1.
         where = f"in the face on line {rows[sizes.argmax()] + 1}"
         self.notes.check_most(
             int(sizes.max()), MAX_CORNERS, f"at most {{}} corners {where}"
@@ -621,6 +627,7 @@ class ObjLines:
         count_before = np.repeat(count_before_line[rows], sizes)
         if (index < -count_before).any():
             self._raise_for_faces(rows)
+        # -1 is the last row above the line, whose number is their count.
         index[is_relative] += (count_before + 1)[is_relative]
 
     def read_zbrush_colors(self, count: int) -> Float64Array | None:
@@ -633,8 +640,9 @@ class ObjLines:
         digits = b"".join(
             re.findall(rb"^#MRGB[ \t]+([0-9a-fA-F]+)", self.text, re.MULTILINE)
         )
-        if len(digits) != 8 * count:
+        if len(digits) != 8 * count:  # not a color for each vertex
             return None
+        # two hexadecimal digits for each channel
         channels = np.frombuffer(bytes.fromhex(digits.decode()), np.uint8)
         # The first of four is a mask.
         return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
@@ -681,7 +689,9 @@ class ObjLines:
                         f"whole numbers in the face on line {line_number}",
                         format_name(word),
                     )
+                # What is left out, as in 1//3, is right: it counts as 1.
                 indices = [int(text or "1") for text in word.split("/")]
+                # A negative index counts backwards from the face's line.
                 is_wrong = any(
                     not index or index < -count
                     for index, count in zip(indices, counts, strict=False)
@@ -691,6 +701,7 @@ class ObjLines:
                         f"indices that count from 1 in the face on line {line_number}",
                         format_name(word),
                     )
+        # No single face is wrong, and yet they could not be parsed together.
         raise self.notes.damaged("whole numbers in faces", "something else")
 
 
@@ -706,6 +717,7 @@ def _normalize_lines(data: bytes) -> bytes:
     # A backslash continues a line, but not a comment.
     if _CONTINUED.search(text):
         text = _CONTINUED.sub(b" ", _COMMENTED.sub(rb"\1\n", text))
+    # Lines without their leading blanks.
     if b"\n " in text or b"\n\t" in text or text[:1] in b" \t":
         text = re.sub(rb"\n[ \t]+", b"\n", text.lstrip(b" \t"))
     # Old files have ``fo`` for a face.

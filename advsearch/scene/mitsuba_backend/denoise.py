@@ -54,6 +54,7 @@ def denoise(
         resolution = (radiance.shape[0], radiance.shape[1])
         buffers = _get_buffers(resolution, threading.get_ident())
         color_buffer, albedo_buffer, normal_buffer, output = buffers
+        # The image gets the brightness for which the filter was trained; then back.
         gain = _compute_gain(radiance.detach())
         color_buffer.copy_(radiance.detach() * gain)
         albedo_buffer.copy_(albedo.detach())
@@ -132,9 +133,10 @@ def _denoise_shade(
     # two box filters; the quotient is the mean change of what is visible nearby
     for _ in range(2):
         both = _average(both, FILL_RADIUS)
-    filled = both[..., :3] / both[..., 3:].clamp_min(1e-4)
-    full_change = (change + FILL_WEIGHT * filled) / (visible + FILL_WEIGHT)
-    # one more, since a change may be negative
+    mean_nearby = both[..., :3] / both[..., 3:].clamp_min(1e-4)
+    # the change itself where the plane is visible, and the mean nearby where it is not
+    full_change = (change + FILL_WEIGHT * mean_nearby) / (visible + FILL_WEIGHT)
+    # 1 is added for the filter, since a change may be negative
     clean = remove_noise((1.0 + full_change).clamp_min(0.0).contiguous()) - 1.0
     magnitude = _average(change.abs().mean(dim=-1, keepdim=True), FADE_RADIUS)
     return clean * visible * (magnitude / MIN_CHANGE).clamp_max(1.0)

@@ -98,6 +98,7 @@ def find_libraries(
     for pattern in patterns:
         matches = root.glob(pattern)
         paths += [path for path in matches if _NAME.fullmatch(path.name)]
+    # The dynamic loader knows only the real root, and may answer with a bare name.
     library = ctypes.util.find_library("LLVM") if root == Path("/") else None
     if library and os.sep in library:
         paths.append(Path(library))
@@ -144,7 +145,8 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
         return LibraryFile(path, (), f"it cannot be read: {error.strerror}")
     if interpreter_header and (header[:4] != b"\x7fELF" or len(header) < 20):
         return LibraryFile(path, (), "it is not a shared library")
-    # word size and byte order, and the processor
+    # Of an ELF header, bytes 4 and 5 are word size and byte order, 18 and 19 the
+    # processor: those of Python itself are right.
     if interpreter_header and (header[4:6], header[18:20]) != (
         interpreter_header[4:6],
         interpreter_header[18:20],

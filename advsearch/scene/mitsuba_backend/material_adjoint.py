@@ -230,6 +230,7 @@ def _sample_first_hits(
     column = cell % n_columns
     row = cell // n_columns
 
+    # twice negated, so that quotients are rounded up
     tiles_across = -(-n_columns // tile)
     n_tiles = tiles_across * -(-n_rows // tile)
     tile_index = row // tile * tiles_across + column // tile

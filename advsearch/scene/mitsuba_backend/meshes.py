@@ -124,6 +124,7 @@ def compute_sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
         if part.emission is not None:
             vertices = part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T
             vectors = compute_area_vectors(vertices[part.mesh.faces])
+            # In proportion to the power: only fractions of the total count.
             doubled_area = np.linalg.norm(vectors, axis=1).sum()
             powers[part.name] = float(part.emission.mean() * doubled_area)
     total = max(sum(powers.values()), 1e-30)  # of faces without area it is 0

@@ -60,9 +60,11 @@ def sample_raindrops(
         along y; `count` where there is none.
     """
     random = np.random.default_rng(seed)
+    # The sheet is wider than what the camera sees of it.
     half_width = SHEET_HALF_WIDTH * SHEET_DISTANCE * tangent
     centers = random.uniform(-half_width, half_width, (count, 2))
     radii = size * np.exp(
+        # no huge and no tiny ones
         LOG_RADIUS_SPREAD * random.standard_normal(count).clip(-2.5, 2.5)
     )
     contact_angles = np.radians(random.uniform(*CONTACT_ANGLES, count))

@@ -17,7 +17,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene import parts
 from advsearch.scene.backdrop import has_plane
-from advsearch.scene.camera_model import NUMBER_NAMES
+from advsearch.scene.camera_model import NUMBER_NAMES, CameraModel
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
@@ -132,6 +132,7 @@ def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
         ]
     owner = scene_input.owner
     if owner is not None:
+        # Mitsuba's properties of a parameter: the third is the object that has it.
         keys = [key for key in keys if parameters.properties[key][2] is owner]
     if len(keys) > 1:
         raise RuntimeError(
@@ -200,6 +201,7 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
             texture = mi.load_dict(
                 meshes.make_base_texture(part.base_color, options), optimize=False
             )
+            # The key is found by its owner: the surface may have other textures.
             inputs.append(
                 SceneInput(
                     f"{name}.base_color",
@@ -295,12 +297,13 @@ def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
         write = to_color
     else:
         write = to_flat_array
+    # the name that such a number has in our materials, at most one
     surface_parameters = [
         parameter
         for parameter, key in SURFACE_KEYS.items()
         if plugin_number.key.endswith(f".{key}")
     ]
-    rendered_range = None
+    rendered_range = None  # any number is rendered as it is
     if surface_parameters:
         rendered_range = meshes.RENDERED_RANGES.get(surface_parameters[0])
     return SceneInput(
@@ -398,7 +401,8 @@ def _translate_beam(part: parts.BeamLamp) -> Translation:
     slanted by it.
     """
     height, width = part.table.shape
-    # Middles of the table's cells, on a plane at distance 1.
+    # Centers of the table's cells, on a plane at distance 1: every second of the points
+    # that cut the plane into half cells. A field of view of 90 degrees is 2 wide there.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
@@ -497,6 +501,7 @@ def make_scene_dict(
     if description.environment is not None:
         radiance = description.environment.radiance
         rotation = description.get_number("environment.rotation")
+        # Mitsuba's maps have y up: turned to z up first, then about it.
         scene["environment"] = {
             "type": "envmap",
             "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32)),
@@ -528,6 +533,7 @@ def _make_ground(description: SceneDescription) -> Any:
         return None
     level = 0.0
     if description.backdrop_photograph is not None:
+        # A photograph has a ground of its own; the plane only takes the shadow.
         if not has_plane(description):
             return None
         level = description.get_number("ground.level")
@@ -537,7 +543,7 @@ def _make_ground(description: SceneDescription) -> Any:
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f()
         .translate([0.0, 0.0, level])
-        .scale(size / 2.0),
+        .scale(size / 2.0),  # Mitsuba's rectangle is 2 wide
         "bsdf": {
             "type": "twosided",
             "bsdf": {"type": "diffuse", "reflectance": reflectance},
@@ -564,12 +570,38 @@ def convert_refusals(description: SceneDescription) -> Iterator[None]:
             yield
     except (RuntimeError, TypeError, ValueError) as error:
         if not has_user_surface and not has_user_plugins:
-            raise
+            raise  # it is our own mistake
         reason = " ".join(str(error).split())
         raise InputError(
             f"{description.object_name}: Mitsuba refuses the scene: "
             f"{reason}; change it there"
         ) from error
+
+
+def _check_background(
+    description: SceneDescription, model: CameraModel, drops: float
+) -> None:
+    """Raise InputError if a background does not go with a lens and its raindrops.
+
+    Args:
+        description: the scene.
+        model: model of the camera's lens.
+        drops: number of raindrops before it.
+    """
+    if description.backdrop and drops > 0.0:
+        raise InputError(
+            "background: raindrops have no plain background behind them; "
+            "leave one of the two out"
+        )
+    has_plain_backdrop = description.backdrop and not description.backdrop_photograph
+    # A searched lens, which has no name, may fold, and leaves parts black then.
+    may_leave_black = model.black_fraction > 0.0 or not model.name
+    if has_plain_backdrop and may_leave_black:
+        raise InputError(
+            "background: it would show where the camera's lens sees nothing as well; "
+            "leave the plain background out, "
+            "or take a lens that fills the picture"
+        )
 
 
 def _make_lens(description: SceneDescription) -> Plugin:
@@ -590,21 +622,10 @@ def _make_lens(description: SceneDescription) -> Plugin:
             "fov": description.get_number("camera.fov"),
             "fov_axis": "larger",
         }
+        # Aperture and focus are inputs, which are set later.
         thin_lens = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
         return pinhole | thin_lens if description.thin_lens else pinhole
-    if description.backdrop and drops > 0.0:
-        raise InputError(
-            "background: raindrops have no plain background behind them; "
-            "leave one of the two out"
-        )
-    # a searched lens may fold
-    has_plain_backdrop = description.backdrop and not description.backdrop_photograph
-    if has_plain_backdrop and (model.black_fraction > 0.0 or not model.name):
-        raise InputError(
-            "background: it would show where the camera's lens sees nothing as well; "
-            "leave the plain background out, "
-            "or take a lens that fills the picture"
-        )
+    _check_background(description, model, drops)
     camera: Plugin = {
         "type": "advsearch_camera",
         "kind": model.kind,
@@ -617,6 +638,8 @@ def _make_lens(description: SceneDescription) -> Plugin:
             for name in ("drops", "drop_size", "drop_seed")
         }
         half_fov = math.radians(description.get_number("camera.fov")) / 2.0
+        # Drops cover what the lens sees; a searched lens, without a name, is taken for
+        # the pinhole with the same field of view.
         if model.name:
             camera["drop_tangent"] = max(model.visible_tangents)
         else:

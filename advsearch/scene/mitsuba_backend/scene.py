@@ -139,27 +139,14 @@ class MitsubaScene:
                 map(has_textured_emission, description.meshes.values())
             )
             self._freeze = "tracing" in leave_out and not unrecorded
-            self.integrator = integrator or "prb"
-            self.roulette_depth = NO_ROULETTE_DEPTH
-            self._gradient_roulette_depth = NO_ROULETTE_DEPTH
-            if is_enclosed(description):
-                self.integrator = integrator or "path"
-                self.roulette_depth = ROULETTE_DEPTH
-                self._gradient_roulette_depth = GRADIENT_ROULETTE_DEPTH
+            self._set_integrator(integrator)
             self._pinhole = (
                 not description.thin_lens and description.camera_model is None
             )
             self._backdrop = description.backdrop
             self.plane_radiance = compute_plane_radiance(description)
-            if description.backdrop and description.has_emission:
-                behind = "the plain background"
-                if description.backdrop_photograph is not None:
-                    behind = "the photograph"
-                raise InputError(
-                    "background: Mitsuba hides surfaces that emit light together with "
-                    f"the environment; leave {behind} out, or take an object and "
-                    "surroundings without emission"
-                )
+            _check_emission(description)
+            # what guides the denoiser; Mitsuba's own knows no cut-outs
             self._guides: Plugin = {
                 "type": "aov",
                 "aovs": "albedo:albedo,normal:sh_normal",
@@ -167,7 +154,7 @@ class MitsubaScene:
             if description.has_opacity:
                 self._guides = {"type": "advsearch_guides"}
             self.is_volumetric = any(part.volumetric for part in description.parts)
-            # entries of every path integrator
+            # entries of every path integrator, which `_load_scene` fills in
             self._path: Plugin = {}
             inputs = self._load_scene()
             self._sensor = self._scene.sensors()[0]
@@ -189,11 +176,26 @@ class MitsubaScene:
                 self.parameters,
                 media=self._find_media(),
             )
+            # the base values of all inputs, if all of them are set at each render
             self._every: dict[str, Tensor] = {}
             if "uploads" not in leave_out:
                 self._every = {
                     name: self.get_base_value(name) for name in sorted(self.input_names)
                 }
+
+    def _set_integrator(self, integrator: str | None) -> None:
+        """Set the integrator of images, and the lengths from which paths may end early.
+
+        In a room light is reflected many times: Russian roulette pays there alone.
+        `integrator` is Mitsuba's type, None for the default.
+        """
+        self.integrator = integrator or "prb"
+        self.roulette_depth = NO_ROULETTE_DEPTH
+        self._gradient_roulette_depth = NO_ROULETTE_DEPTH
+        if is_enclosed(self.definition[0]):
+            self.integrator = integrator or "path"
+            self.roulette_depth = ROULETTE_DEPTH
+            self._gradient_roulette_depth = GRADIENT_ROULETTE_DEPTH
 
     def _load_scene(self) -> list[parts.SceneInput]:
         """Load Mitsuba's scene, and return the inputs that it may have."""
@@ -216,6 +218,7 @@ class MitsubaScene:
                 for part in description.parts:
                     if isinstance(part, Lamp) and part.dark:
                         lamp = plugins[part.name]
+                        # a lamp is an emitter, or a shape that has one
                         lamp.get("emitter", lamp)["sampling_weight"] = 0.0
             self._scene = mi.load_dict(plugins, optimize=False)
         inputs = list(parts.make_scene_inputs(self.resolution))
@@ -240,6 +243,7 @@ class MitsubaScene:
             for name, (_, scene_input) in self.declared_inputs.items()
             if scene_input.is_interior
         )
+        # Vertices and normals, which are written into the memory that they have.
         self._buffers = frozenset(
             name
             for name, (key, _) in self.declared_inputs.items()
@@ -273,7 +277,7 @@ class MitsubaScene:
         other = MitsubaScene(
             description, self.resolution, filter=filter_name, **settings
         )
-        # An integrator that is loaded later makes the recordings of all scenes stale.
+        # Load both now: one that is loaded later makes the recordings of all scenes stale.
         for method in ("path", "guides"):
             other._integrator(method)
         return other
@@ -397,11 +401,13 @@ class MitsubaScene:
                 if self._freeze:
                     key = (method, spp, self.depth, self.window)
                     function = self._recorded.get_or_record(key, render, media)
+                # opaque: a literal seed would be part of the kernel
                 drjit_image = function(
                     self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
                 )
                 image = drjit_image.torch().clone()
                 if method == "guides":
+                    # the last six channels are albedo and normal
                     image = image[..., -6:]
                     image[..., :3].clamp_(0.0, 1.0)
                 images.append(image)
@@ -464,6 +470,7 @@ class MitsubaScene:
                     on_glass = hits.visible_mask(part.name)
                     carrier_face = torch.from_numpy(part.face_of_carrier)
                     hits.face[on_glass] = carrier_face[hits.face[on_glass]]
+                    # ids count from 1, and 0 is no surface
                     hits.id[on_glass] = hits.names.index(part.carrier) + 1
             return hits
 
@@ -507,16 +514,10 @@ class MitsubaScene:
             if "boundary" not in self._leave_out and has_boundary:
                 method = "boundary"
                 extra = extra | self._buffers
+            # What renders the images may have no adjoint; `prb` has.
             if method == "path" and self.integrator != "prb":
                 method = "adjoint"
-            image_gradient = cotangent.detach().to(torch.float32)
-            color_gradient = image_gradient[..., :3]
-            if self._backdrop:  # coverage has no derivative
-                n_others = 1 if self.plane_radiance is None else 4
-                others = torch.zeros(*image_gradient.shape[:2], n_others)
-                others[..., 1:] = image_gradient[..., 4:]
-                color_gradient = torch.cat([color_gradient, others], dim=-1)
-            image_gradient = color_gradient.contiguous()
+            image_gradient = self._make_image_gradient(cotangent)
             self._set(inputs)
             names = (*sorted(extra - set(requested)), *requested)
             with self._tracked(names, inputs) as tracked, self._crop_film():
@@ -535,6 +536,21 @@ class MitsubaScene:
                     .reshape(inputs[name].shape)
                     for name in requested
                 }
+
+    def _make_image_gradient(self, cotangent: Tensor) -> Tensor:
+        """Return a cotangent with the channels of the image that Mitsuba renders.
+
+        That is 3; with a backdrop also coverage, whose cotangent is 0 as it has no
+        derivative here; and with a plane in a photograph also the 3 of its change.
+        """
+        gradient = cotangent.detach().to(torch.float32)
+        color_gradient = gradient[..., :3]
+        if self._backdrop:
+            n_others = 1 if self.plane_radiance is None else 4
+            others = torch.zeros(*gradient.shape[:2], n_others)
+            others[..., 1:] = gradient[..., 4:]
+            color_gradient = torch.cat([color_gradient, others], dim=-1)
+        return color_gradient.contiguous()
 
     @contextmanager
     def _tracked(
@@ -687,10 +703,12 @@ class MitsubaScene:
         """
         self._check_known(inputs)
         if self._every:
+            # All inputs are written at each call, as if none were set.
             inputs = {**self._every, **inputs}
             self._applied.clear()
         changes = self._find_changes(inputs)
-        population.changes += not self._literals.isdisjoint(changes)
+        changes_literal = not self._literals.isdisjoint(changes)
+        population.changes += changes_literal
         for name, fresh in changes.items():
             self._write(name, fresh)
             if fresh is None:
@@ -752,6 +770,7 @@ class MitsubaScene:
                 )
         if name not in self._base:
             is_buffer = name in self._buffers
+            # a copy of what is overwritten in place below
             base = current.torch().clone() if is_buffer else current
             self._base[name] = type(current)(base)
         if fresh is None:
@@ -764,7 +783,7 @@ class MitsubaScene:
             address = current.torch().data_ptr()
             dr.scatter(current, value, dr.arange(mi.UInt32, len(current)))
             dr.eval(current)
-            # Dr.Jit copies what has a second owner
+            # Dr.Jit copies what has a second owner; then recordings know another memory
             population.changes += current.torch().data_ptr() != address
             self.parameters.set_dirty(key)
         else:
@@ -809,6 +828,20 @@ class MitsubaScene:
             self._integrators[key] = mi.load_dict(recipes[method])
             population.changes += 1
         return self._integrators[key]
+
+
+def _check_emission(description: SceneDescription) -> None:
+    """Raise InputError if a scene has both a backdrop and surfaces that emit light."""
+    if not description.backdrop or not description.has_emission:
+        return
+    backdrop = "the plain background"
+    if description.backdrop_photograph is not None:
+        backdrop = "the photograph"
+    raise InputError(
+        "background: Mitsuba hides surfaces that emit light together with "
+        f"the environment; leave {backdrop} out, or take an object and "
+        "surroundings without emission"
+    )
 
 
 def _to_repeating(

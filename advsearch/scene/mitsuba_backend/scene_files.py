@@ -121,6 +121,7 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
             "spectrum",
         )
         if isinstance(value, Mapping) and not is_color:
+            # Errors name the plugin at the top of the scene.
             inner_where = where
             if plugin["type"] == "scene":
                 inner_where = f"{where}: {format_name(key, quoted=False)}"
@@ -216,6 +217,7 @@ def import_mitsuba_scene(
     surface = shapes.read_surface(_find_surface(shape, plugins))
     mesh, has_uvs = shapes.load_shape_mesh(shape, object_id)
     frame = _ObjectFrame(mesh, object_id, z_up=_is_z_up(plugins))
+    # A haze replaces the plugins that it is made of.
     haze, haze_names = shapes.find_haze(plugins, frame.matrix) or (
         None,
         frozenset[str](),
@@ -229,6 +231,7 @@ def import_mitsuba_scene(
         f"{where}: {clause}"
         for clause in (*left_out_clauses, *surface.notes, *missing_clauses)
     ]
+    # upright, as all our meshes
     rotation = frame.rotation.astype(np.float32)
     mesh = replace(
         mesh, vertices=mesh.vertices @ rotation.T, normals=mesh.normals @ rotation.T
@@ -266,6 +269,7 @@ def _find_shape(
     """
 
     def letters_of(name: str) -> str:
+        """Return the letters and digits of a name, without case."""
         return "".join(filter(str.isalnum, name.casefold()))
 
     ids = [name for name, plugin in named.items() if plugin["type"] in SHAPE_TYPES]
@@ -290,6 +294,7 @@ def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
     ]
     if not posed_sensors:
         return False
+    # A camera's own upward axis is its y axis, the second column.
     upwards = abs(shapes.get_pose(posed_sensors[0])[:3, 1])
     return bool(upwards[2] > upwards[1])
 
@@ -339,7 +344,9 @@ def _paint(
         file_uvs = file_uvs @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
         uvs = (file_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
         return replace(mesh, uvs=uvs), surface.base_color
-    keeps_uvs = has_uvs and kind not in ("cube", "sphere", "cylinder", "disk")
+    # On these, several points have the same texture coordinates.
+    has_shared_uvs = kind in ("cube", "sphere", "cylinder", "disk")
+    keeps_uvs = has_uvs and not has_shared_uvs
     surface_color = ImportedSurface(color=surface.base_color[0, 0])
     part = ImportedPart(
         vertices=mesh.vertices.astype(np.float64),
@@ -546,6 +553,7 @@ class _ObjectFrame:
             -(lower[1] + upper[1]) / 2,
             -lower[2],
         )
+        # z up first, then centered on the ground, then of extent 1
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ translation @ to_z_up
 
     def move_plugin(
@@ -658,18 +666,11 @@ def _scale_spectrum(value: Mapping[str, object], factor: float) -> Plugin | None
     return None
 
 
-def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCamera:
-    """Return a sensor's pose and field of view along the larger side.
+def _read_film_size(film: Mapping[str, object]) -> tuple[float, float]:
+    """Return the width and height of a film in pixels, by default Mitsuba's.
 
-    The field of view is along the axis that the sensor states, or the diagonal of a
-    focal length; its tangent is proportional to the film's length along it. Mitsuba's
-    default film is 768 x 576.
+    Raises InputError if it has less than one pixel.
     """
-    matrix = frame.matrix @ shapes.get_pose(sensor)
-    # without the scale of the object's frame
-    matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
-    entries = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
-    film = next((plugin for plugin in entries if "film" in str(plugin["type"])), {})
     width = float(np.asarray(film.get("width", 768)))
     height = float(np.asarray(film.get("height", 576)))
     if not min(width, height) >= 1.0:
@@ -677,9 +678,24 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCa
             "camera: expected a film of at least 1 x 1 pixels, got "
             f"{width:g} x {height:g}"
         )
+    return width, height
+
+
+def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCamera:
+    """Return a sensor's pose and field of view along the larger side.
+
+    The field of view is along the axis that the sensor states, or the diagonal of a
+    focal length; its tangent is proportional to the film's length along it.
+    """
+    matrix = frame.matrix @ shapes.get_pose(sensor)
+    # without the scale of the object's frame
+    matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
+    entries = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
+    film = next((plugin for plugin in entries if "film" in str(plugin["type"])), {})
+    width, height = _read_film_size(film)
     axis = str(sensor.get("fov_axis", "x"))
     fov = float(np.asarray(sensor.get("fov", 0.0)))
-    if not fov:
+    if not fov:  # the sensor states a focal length, or nothing
         axis = "diagonal"
         fov = _compute_diagonal_fov(str(sensor.get("focal_length", "50mm")))
     larger_side = max(width, height)

@@ -118,6 +118,7 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     has_uvs = uvs is not None
     is_flat = normals is None or bool(shape.get("face_normals"))
     if uvs is None or normals is None or is_flat:
+        # Every corner of a face becomes a vertex of its own.
         corners = faces.reshape(-1)
         attributes = _select_vertices(attributes, corners)
         vertices = vertices[corners]
@@ -141,10 +142,11 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     normal_sign = -1.0 if shape.get("flip_normals") else 1.0
     # NaN where a face has no area
     normals = np.nan_to_num(normals)[used_vertices] * normal_sign
-    if (
-        np.einsum("fk,fck->", compute_area_vectors(vertices[faces]), normals[faces])
-        < 0.0
-    ):
+    # summed over the corners of all faces, weighted by area
+    agreement = np.einsum(
+        "fk,fck->", compute_area_vectors(vertices[faces]), normals[faces]
+    )
+    if agreement < 0.0:
         # Mitsuba shades by the normals, in whatever order the corners of faces are
         faces = faces[:, ::-1]
     mesh = Mesh(
@@ -203,6 +205,7 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
     attributes: dict[str, Float32Array] = {}
     counts = {"vertex": len(vertices), "face": len(faces)}
     for key in parameters.keys():
+        # Names of attributes begin with what they belong to, such as "vertex_color".
         count = counts.get(key.split("_")[0], 0)
         is_attribute = key not in (POSITIONS, NORMALS, TEXCOORDS) and "." not in key
         if count and is_attribute:
@@ -228,35 +231,13 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     Raises:
         InputError: its pose has no volume.
     """
+    vertices, faces, normals, uvs = _make_unit_shape(kind)
     shape_pose = np.eye(4)
-    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
-    normals = None
     if kind == "sphere":
-        uvs, faces = _make_grid(fractions, fractions[::2])
-        polar = np.pi * uvs[:, 1]
-        vertices = np.stack(
-            [*(np.sin(polar) * _compute_circle_points(uvs[:, 0])), np.cos(polar)],
-            axis=1,
-        )
-        normals = vertices
         shape_pose[:3, :3] *= _get_radius(shape)
         shape_pose[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
-    elif kind == "cylinder":  # open at both ends, as Mitsuba's
-        uvs, faces = _make_grid(fractions, np.array([0.0, 1.0]))
-        vertices = np.stack([*_compute_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
-        normals = vertices * (1.0, 1.0, 0.0)
+    elif kind == "cylinder":
         shape_pose = _compute_cylinder_pose(shape)
-    elif kind == "disk":
-        uvs, faces = _make_grid(fractions[::8], fractions)
-        vertices = np.stack(
-            [*(uvs[:, 0] * _compute_circle_points(uvs[:, 1])), np.zeros(len(uvs))],
-            axis=1,
-        )
-    else:
-        uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-        vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
-    if normals is None:
-        normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1))
     # without faces that have no area, such as those at a pole
     faces = faces[np.linalg.norm(compute_area_vectors(vertices[faces]), axis=1) > 1e-9]
     matrix = get_pose(shape) @ shape_pose
@@ -268,6 +249,43 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     # normals are transformed by the inverse transpose
     normals = _normalize(normals @ np.linalg.inv(matrix[:3, :3]))
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
+
+
+def _make_unit_shape(
+    kind: str,
+) -> tuple[Float64Array, IntArray, Float64Array, Float64Array]:
+    """Return the triangles of one of `TESSELLATED_SHAPES` as Mitsuba's unit shape.
+
+    Returns:
+        Vertices (V, 3), faces (F, 3), normals (V, 3) and texture coordinates (V, 2).
+    """
+    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
+    normals = None
+    if kind == "sphere":
+        # half as many segments from pole to pole as around
+        uvs, faces = _make_grid(fractions, fractions[::2])
+        polar = np.pi * uvs[:, 1]
+        vertices = np.stack(
+            [*(np.sin(polar) * _compute_circle_points(uvs[:, 0])), np.cos(polar)],
+            axis=1,
+        )
+        normals = vertices
+    elif kind == "cylinder":  # open at both ends, as Mitsuba's
+        uvs, faces = _make_grid(fractions, np.array([0.0, 1.0]))
+        vertices = np.stack([*_compute_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
+        normals = vertices * (1.0, 1.0, 0.0)
+    elif kind == "disk":  # u is the radius, which needs few segments
+        uvs, faces = _make_grid(fractions[::8], fractions)
+        vertices = np.stack(
+            [*(uvs[:, 0] * _compute_circle_points(uvs[:, 1])), np.zeros(len(uvs))],
+            axis=1,
+        )
+    else:  # a rectangle
+        uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+        vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
+    if normals is None:
+        normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1))
+    return vertices, faces, normals, uvs
 
 
 def _get_radius(shape: Mapping[str, object]) -> float:
@@ -285,7 +303,7 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     end = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), np.float64)
     radius = _get_radius(shape)
     length = float(np.linalg.norm(end - start))
-    axis = (end - start) / max(length, 1e-30)
+    axis = (end - start) / max(length, 1e-30)  # not by 0
     x, y, z = axis
     sign = np.copysign(1.0, z)
     # axes as in Mitsuba's `coordinate_system` (Duff et al. 2017), which has float32
@@ -365,9 +383,9 @@ def find_haze(
     scene_radius = float(_parse_numbers(ball.get("radius", 1.0))[0])
     # the cube root of the determinant is the scale of lengths
     radius = scene_radius * float(np.cbrt(abs(np.linalg.det(pose[:3, :3]))))
-    if not (
-        radius > 0.0 and float(np.linalg.norm(center[:3])) <= MAX_CENTER_OFFSET * radius
-    ):
+    # Ours is a ball around the object.
+    is_centered = float(np.linalg.norm(center[:3])) <= MAX_CENTER_OFFSET * radius
+    if not (radius > 0.0 and is_centered):
         return None
 
     coefficients = _read_haze_medium(named[medium_name], matrix)
@@ -388,8 +406,10 @@ def _read_haze_medium(
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
     # how many lengths of the object one length of the scene has
+    # (the cube root of the determinant is the scale of lengths)
     object_size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / object_size
+    # one value for all channels, and in range
     is_grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MAX_EXTINCTION
     albedo = np.broadcast_to(_parse_numbers(medium.get("albedo", 0.75)), (3,)).tolist()
     if not (is_grey and MIN_ALBEDO <= min(albedo) and max(albedo) <= 1.0):
@@ -526,7 +546,8 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
         )
         color = _Color(grey, {})
     linear = color.linear
-    # A texture of one color counts as constant only if it has the size of one.
+    # Only what has the size of a constant color may be one: a larger image, even of one
+    # color, is a texture.
     is_constant = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE) and not bool(
         np.ptp(linear, axis=(0, 1)).any()
     )
@@ -583,6 +604,7 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
             f"it has no base colour that can be searched ({reason}): not for "
             "texture, patch and material"
         )
+    # with a tolerance for rounding; NaN is out of range too
     if not (linear.min() >= 0.0 and linear.max() <= 1.0 + 1e-4):
         notes.append("its base colour is cut to reflectances from 0 to 1")
     return notes
@@ -700,8 +722,9 @@ def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
     """
     image = value.get("bitmap")
     if isinstance(image, np.ndarray):
-        if image.ndim == 2:
+        if image.ndim == 2:  # grey
             image = image[:, :, None]
+        # without alpha, the second or the fourth channel
         image = image[:, :, :1] if image.shape[2] == 2 else image[:, :, :3]
         return np.broadcast_to(image, (*image.shape[:2], 3)).astype(np.float32)
     if image is None and "filename" not in value:
@@ -710,7 +733,7 @@ def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
         bitmap = mi.Bitmap(str(value["filename"]) if image is None else image)
     except (RuntimeError, TypeError):
         return None  # Mitsuba gives the reason when the scene is loaded
-    if value.get("raw"):
+    if value.get("raw"):  # its values are taken as linear
         bitmap.set_srgb_gamma(False)
     return np.array(
         bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False),

@@ -559,8 +559,9 @@ def _make_camera_numbers(
     half_tangent = 0.0
     if "camera.fov" in inputs:
         half_tangent = math.tan(math.radians(float(inputs["camera.fov"])) / 2.0)
-    larger = max(height, width)
-    extent = [half_tangent * size / larger for size in (width, height)]
+    larger_side = max(height, width)
+    # The field of view is along the larger side.
+    extent = [half_tangent * size / larger_side for size in (width, height)]
     shifts = [float(inputs.get(f"camera.shift_{axis}", 0.0)) for axis in "xy"]
     center = [1.0 - 2.0 * shift for shift in shifts]
     return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, center])
@@ -574,14 +575,15 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
     Samples without weight are left out.
     """
     with mitsuba_lock:
-        # each (rays x layers,), all layers of a ray side by side
+        # Three channels for each layer, after the four of the image. Each becomes
+        # (rays x layers,), all layers of a ray side by side.
         u, v, weight = (
             np.stack(
                 [layer.numpy() for layer in channels[first_channel::3]], axis=1
             ).ravel()
             for first_channel in (4, 5, 6)
         )
-        (hits,) = np.nonzero(weight)
+        (hits,) = np.nonzero(weight)  # index of ray times layers plus the layer
         n_layers = len(weight) // (math.prod(size) * RAYS_PER_PIXEL)
         radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
         return ViewSamples(

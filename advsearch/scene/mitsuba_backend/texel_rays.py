@@ -66,7 +66,7 @@ def trace_texel_rays(
 
     Args:
         scene: the scene, with its inputs set.
-        grids: those of all surfaces.
+        grids: grids of texels of all surfaces.
         sky_shape: rows and columns of the cells of the environment.
         positions, normals: (n, 3) of the texels, with unit shading normals.
         n_rays: rays from each texel.

@@ -104,6 +104,7 @@ def write_scene(
         # without the copied columns at both ends, which only the loaded scene has
         padded = remaining_inputs["environment.padded"]
         remaining_inputs["environment.padded"] = padded[:, 1:-1]
+    # The ground's vertices are in a file, written with those of the other meshes.
     if description.photograph is not None:
         xml_scene[GROUND_NAME] = {
             "type": "ply",
@@ -111,19 +112,7 @@ def write_scene(
         }
     for part in (description.meshes[OBJECT], *description.parts):
         _put_part(xml_scene, description, part, remaining_inputs)
-    unset_names = [
-        name
-        for name in sorted(remaining_inputs)
-        # it puts the input into the dictionary; False if there is no place for it
-        if not _put_input(
-            xml_scene, scene.declared_inputs[name][0].split("."), remaining_inputs[name]
-        )
-    ]
-    if unset_names:
-        raise InputError(
-            f"out: stock Mitsuba has nothing for {', '.join(unset_names)}; "
-            "export another run"
-        )
+    _put_all_inputs(xml_scene, scene, remaining_inputs)
     meshes = {
         shape.id(): shape
         for shape in scene.set_inputs(inputs).shapes()
@@ -154,6 +143,32 @@ def _put_part(
     if not isinstance(xml_scene.get(part.name, {}), Mapping):
         raise InputError(
             f"out: stock Mitsuba has nothing for {part.name}; export a run without it"
+        )
+
+
+def _put_all_inputs(
+    xml_scene: Plugin, scene: MitsubaScene, inputs: Mapping[str, Float32Array]
+) -> None:
+    """Put inputs into a scene's dictionary by Mitsuba's keys.
+
+    Args:
+        xml_scene: the dictionary, which is changed.
+        scene: the scene, which knows Mitsuba's key of each input.
+        inputs: values of the inputs by name.
+
+    Raises:
+        InputError: the dictionary has no place for an input.
+    """
+    unset_names = []
+    for name in sorted(inputs):
+        key, _ = scene.declared_inputs[name]
+        was_put = _put_input(xml_scene, key.split("."), inputs[name])
+        if not was_put:
+            unset_names.append(name)
+    if unset_names:
+        raise InputError(
+            f"out: stock Mitsuba has nothing for {', '.join(unset_names)}; "
+            "export another run"
         )
 
 
@@ -202,14 +217,17 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
     """
     name, *inner_parts = key_parts
     if name.startswith("brdf_") and name not in plugin:
-        # the surface of both sides is the only inner plugin
+        # Mitsuba calls the surfaces of both sides "brdf_0" and "brdf_1"; in a
+        # dictionary they are one, the only inner plugin.
         inner_names = [
             inner for inner, entry in plugin.items() if isinstance(entry, Mapping)
         ]
         name = inner_names[0] if inner_names else name
+    # A loaded texture has its texels as "data".
     name = "bitmap" if name == "data" else name
     entry = plugin.get(name)
     if isinstance(entry, Mapping):
+        # The key leads on into a copy of the inner plugin.
         plugin[name] = dict(entry)
         return bool(inner_parts) and _put_input(plugin[name], inner_parts, value)
     if inner_parts or (entry is None and name not in OPTIONAL_ENTRIES):
@@ -307,7 +325,9 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
     for entry in root.findall("*[@type]"):
         entry.set("id", entry.attrib.pop("name"))
     text = ElementTree.tostring(root, encoding="unicode")
-    path.write_text(f"<!-- {note.replace('--', '- -')} -->\n{text}\n", "utf-8")
+    # XML allows no double hyphen in a comment.
+    comment = note.replace("--", "- -")
+    path.write_text(f"<!-- {comment} -->\n{text}\n", "utf-8")
 
 
 class _SceneFiles:

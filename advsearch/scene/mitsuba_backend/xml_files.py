@@ -78,11 +78,33 @@ def read_scene(path: Path) -> Plugin:
         )
     text.fill_element(root)
     root.set("version", "3.0.0")
+    state = _parse_with_mitsuba(path, text, root)
+    referred: set[str] = set()
+    scene = _convert_plugin(path, state, 0, referred)  # 0 is the scene itself
+    # plugins with ids that stand within others, to which the rest of the file may refer
+    for name in sorted(referred):
+        if _make_plain_name(name) not in scene and name in state.id_to_index:
+            index = state.id_to_index[name]
+            scene[_make_plain_name(name)] = _convert_plugin(path, state, index, set())
+    return scene
+
+
+def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element) -> Any:
+    """Parse a scene with Mitsuba's parser, and return the parser's state.
+
+    Args:
+        path: path of the file, for errors.
+        text: text of the scene, which knows what it includes.
+        root: root of its tree, in which nothing is to be filled in any more.
+
+    Raises:
+        FileFormatError: Mitsuba rejects it; the message has the line if it is known.
+    """
     config = mi.parser.ParserConfig(VARIANT)
     config.unused_parameters = mi.LogLevel.Debug
     try:
         with suppress_warnings():
-            state = mi.parser.parse_string(
+            return mi.parser.parse_string(
                 config, ElementTree.tostring(root, encoding="unicode")
             )
     except RuntimeError as error:
@@ -94,14 +116,6 @@ def read_scene(path: Path) -> Plugin:
         raise FileFormatError(
             f"{path}: {where}{_ERROR_LINE.sub('', str(error))}; correct it"
         ) from error
-    referred: set[str] = set()
-    scene = _convert_plugin(path, state, 0, referred)
-    # plugins with ids that stand within others, to which the rest of the file may refer
-    for name in sorted(referred):
-        if _make_plain_name(name) not in scene and name in state.id_to_index:
-            index = state.id_to_index[name]
-            scene[_make_plain_name(name)] = _convert_plugin(path, state, index, set())
-    return scene
 
 
 @dataclass
@@ -183,7 +197,7 @@ class _SceneText:
 
         def start(tag: str, attributes: dict[str, str]) -> None:
             nonlocal depth
-            if not self.elements:
+            if not self.elements:  # the root
                 self.lines_before = parser.CurrentLineNumber - 1
             depth += 1
             self.elements += 1
@@ -306,6 +320,7 @@ def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> P
     for key in props.keys():
         kind = props.type(key)
         value = props[key]
+        # The parser calls what has no name in the file "_arg_0", "_arg_1", ...
         argument = "" if key.startswith("_arg_") else key
         if kind == types.ResolvedReference:
             node = state.nodes[value.index()]
@@ -361,6 +376,7 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
         pairs = list(zip(value.wavelengths, value.values, strict=False))
         numbers = pairs or value.values
         entry = {"type": "spectrum", "value": pairs or value.values[0]}
+    # NaN is not below either
     if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
         raise FileFormatError(
             f"{where}: expected a finite number, got "
@@ -473,8 +489,7 @@ class _FileReader:
         if kind not in STOCK_PLUGINS:
             raise FileFormatError(
                 f"{self._path}: {format_name(kind)} is no plugin that comes with "
-                "Mitsuba; "
-                "leave it out of the file"
+                "Mitsuba; leave it out of the file"
             )
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
             raise FileFormatError(
