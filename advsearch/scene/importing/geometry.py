@@ -395,7 +395,8 @@ def _select_larger_choice(
     areas_are_equal = unturned_area[turned] == unturned_area[as_is]
     # Of equal areas the first face's winding is kept: choices are numbered by their
     # first face, which the lower one of two leaves as it is.
-    return reverse_keeps_more | (areas_are_equal & (turned < as_is))
+    is_turned: BoolArray = reverse_keeps_more | (areas_are_equal & (turned < as_is))
+    return is_turned
 
 
 def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
