@@ -58,7 +58,7 @@ class Disorder:
                 raise KeyboardInterrupt
             if self.lose in [query.index for _, _, query in items]:
                 for one in items:
-                    lost = "no answer: 3 workers died of it" if one[2].number == self.lose else ""
+                    lost = "no answer: 3 workers died of it" if one[2].index == self.lose else ""
                     yield BatchResult([one], None if lost else self.call([one]), lost=lost)
             else:
                 yield BatchResult(items, self.call(items), f"worker {count % 2}")
@@ -104,7 +104,7 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
     class Two(Disorder):
         def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
             for done in super().compute(batches):
-                yield replace(done, machine="ab12" if done.items[0][2].number < 4 else None)
+                yield replace(done, machine="ab12" if done.items[0][2].index < 4 else None)
 
     job = load_job(CONFIG)
     stats = WorkerStats(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
