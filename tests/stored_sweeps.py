@@ -33,6 +33,12 @@ def rows_of(run: Path) -> list[Row]:
         return list(store.rows("sweep"))
 
 
+def all_rows(run: Path) -> list[dict[str, Any]]:
+    """All rows of a run, but for times."""
+    with Store(run / NAME, read_only=True) as store:
+        return [{**vars(row), "seconds": None, "time": None} for row in store.rows()]
+
+
 def described(value: float | str, unit: str = "") -> Value:
     """A value as a row has it."""
     return {"value": value, "unit": unit}

@@ -14,8 +14,8 @@ from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve, make_chains
-from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import read_configuration
+from stored_sweeps import all_rows
 
 SMALL = AttackConfig(
     object="mug,bowl", controls={"pose": {"yaw": [-30, 30]}}, policy="random", resolution=16, denoise="none", spp=1,
@@ -46,11 +46,6 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch, lost: str = "") -> None:
     monkeypatch.setattr(parts, "open_workers", opened)
 
 
-def rows(path: Path) -> list[Any]:
-    with Store(path / NAME, read_only=True) as store:
-        return [{**vars(row), "seconds": None, "time": None} for row in store.rows()]
-
-
 @pytest.mark.medium
 def test_a_shared_study_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = run_and_save(curve, RunContext(SMALL.model_copy(update={"run": str(tmp_path / "alone")})))
@@ -62,7 +57,7 @@ def test_a_shared_study_is_the_one_that_was_made_here(tmp_path: Path, monkeypatc
     assert [row.average and row.average.configurations for row in shared.table] == [6, 6]
     for name in (part.name for (part,) in make_chains(SMALL)):
         here, there = (tmp_path / one / "parts" / name for one in ("alone", "shared"))
-        assert rows(there) == rows(here) and (read_configuration(there) == read_configuration(here)).all()
+        assert all_rows(there) == all_rows(here) and (read_configuration(there) == read_configuration(here)).all()
         assert {one.name for one in there.iterdir()} >= {"run.yaml", "summary.json", "report.html", "images"}
         assert "advsearch-part-" not in (there / "summary.json").read_text()
         assert str(there) in [one.run for one in shared.table]

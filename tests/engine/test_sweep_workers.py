@@ -22,7 +22,7 @@ from advsearch.questions.sweep.job import SceneLoader
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.store import NAME, Store
+from stored_sweeps import all_rows
 
 pytestmark = pytest.mark.medium
 
@@ -64,11 +64,6 @@ class Disorder:
                 yield BatchResult(items, self.call(items), f"worker {count % 2}")
 
 
-def rows(path: Path) -> list[Any]:
-    with Store(path / NAME, read_only=True) as store:
-        return [{**vars(row), "seconds": None, "time": None} for row in store.rows()]
-
-
 def summary(result: Any) -> dict[str, Any]:
     times = ("seconds", "run", "renders_per_second", "shared", "warnings", "command_line")
     return {name: value for name, value in result.summary.to_dict().items() if name not in times}
@@ -85,12 +80,12 @@ def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_p
     job = load_job(CONFIG)
     with RunDirectory.create(tmp_path / "alone") as run:
         alone = Sweep(job, run, NullProgress()).execute()
-    assert alone.summary.shared is None and len(rows(tmp_path / "alone")) == 12
+    assert alone.summary.shared is None and len(all_rows(tmp_path / "alone")) == 12
     path = tmp_path / "shared"
     first = shared(path, seed=1, stop=3)
-    assert first.summary.configurations == len(rows(path)) == 6 and first.summary.ending == "interrupted"
+    assert first.summary.configurations == len(all_rows(path)) == 6 and first.summary.ending == "interrupted"
     again = shared(path, resumed=True, seed=7)
-    assert rows(path) == rows(tmp_path / "alone") and summary(again) == summary(alone)
+    assert all_rows(path) == all_rows(tmp_path / "alone") and summary(again) == summary(alone)
 
 
 def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path: Path) -> None:
@@ -128,6 +123,6 @@ def test_two_workers_have_the_rows_of_none(tmp_path: Path, capfd: pytest.Capture
     words += ["--resolution", "32", "--spp", "2", "--batch", "2", "--trials", "0", "--quiet"]
     assert main([*words, "--run", str(tmp_path / "alone")]) == 0
     assert main([*words, "--run", str(tmp_path / "shared"), "--workers", "2"]) == 0
-    assert len(rows(tmp_path / "alone")) == 8 and rows(tmp_path / "shared") == rows(tmp_path / "alone")
+    assert len(all_rows(tmp_path / "alone")) == 8 and all_rows(tmp_path / "shared") == all_rows(tmp_path / "alone")
     out, err = capfd.readouterr()
     assert "workers" in out and "at most, busy" in out and not err

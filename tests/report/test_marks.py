@@ -67,7 +67,6 @@ def test_a_payload_of_a_stranger_is_no_error(payload: dict[str, object]) -> None
         ("detection", "no cup", "missed", "finds no cup", "finding no cup"),
         ("detection", "dog elsewhere", "phantom", "sees a dog elsewhere, and none where this mug is",
          "seeing a dog elsewhere, and none where it is"),
-        
     ],
 )  # fmt: skip
 def test_what_a_detector_does_follows_its_outcome(task: str, label: str, outcome: str, does: str, doing: str) -> None:

@@ -267,9 +267,8 @@ def test_an_attack_that_goes_on_is_followed_step_by_step(browser: Browser, tmp_p
             page.get_by_label("step of the search").fill("2")
             evaluated(run, 7)
             until(page, lambda: "8 of search" in page.locator("#state").inner_text())
-            assert (
-                status.inner_text() == "step 2, objective 2.00, prediction mug"
-            )  # whoever looks back is not interrupted
+            # whoever looks back is not interrupted
+            assert status.inner_text() == "step 2, objective 2.00, prediction mug"
             page.get_by_role("button", name="Play").click()
             until(page, lambda: status.inner_text().startswith("step 4"))
             page.get_by_role("button", name="Stop").click()
