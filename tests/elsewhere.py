@@ -27,9 +27,13 @@ class Away(Tensor):
     @staticmethod
     def __new__(cls, held: Tensor) -> Away:
         made = Tensor._make_wrapper_subclass(
-            cls, held.size(), strides=held.stride(), storage_offset=held.storage_offset(), dtype=held.dtype,
+            cls,
+            held.size(),
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
             device=ELSEWHERE,
-        )  # fmt: skip
+        )
         made.held = held
         return made
 

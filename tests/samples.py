@@ -76,8 +76,13 @@ SWEEP: dict[str, Any] = {
     "sampler": None, "spp": 16, "renders": {"sweep": 8, "verification": 0}, "renders_per_second": None,
 }  # fmt: skip
 STUDY: dict[str, Any] = {
-    **RUN, "schema": 1, "model": "reference", "task": "classification", "policy": "auto", "parts": ["a"],
-}  # fmt: skip
+    **RUN,
+    "schema": 1,
+    "model": "reference",
+    "task": "classification",
+    "policy": "auto",
+    "parts": ["a"],
+}
 CURVE: dict[str, Any] = {
     **STUDY, "command": "attack", "run": "runs/mug-texture-001", "objects": ["mug", "bowl"], "controls": ["texture"],
     "epsilons": [0.01, 0.1],
@@ -265,8 +270,14 @@ def write_photograph_folder(folder: Path, name: str = "obj_000002", **entries: A
             photograph.write_bytes(item.photograph.read_bytes())
             camera = item.camera
             matrix = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
-            stated = {"image_width": 128, "image_height": 96, "camera_matrix": matrix, "part": [16, 0, 96, 96],
-                      "object_to_camera": item.pose.tolist(), **entries}  # fmt: skip
+            stated = {
+                "image_width": 128,
+                "image_height": 96,
+                "camera_matrix": matrix,
+                "part": [16, 0, 96, 96],
+                "object_to_camera": item.pose.tolist(),
+                **entries,
+            }
             photograph.with_suffix(".json").write_text(json.dumps(stated), "utf-8")
     return folder
 

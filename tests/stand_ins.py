@@ -138,11 +138,20 @@ def rows(folder: Path) -> list[tuple[Any, ...]]:
     with RunDirectory.resume(folder) as run:
         return [
             (
-                r.id, r.kind, r.step, r.seed, r.spp, r.objective, r.success, r.label, r.probability, r.renders,
+                r.id,
+                r.kind,
+                r.step,
+                r.seed,
+                r.spp,
+                r.objective,
+                r.success,
+                r.label,
+                r.probability,
+                r.renders,
                 str(r.values),
             )
             for r in run.store.rows()
-        ]  # fmt: skip
+        ]
 
 
 class Impatient(NullProgress):

@@ -62,10 +62,12 @@ def make_sweep(
         for step, (environment, yaw, elevation, power) in enumerate(points):
             wrong = environment == "noon" and elevation > 30
             values: dict[str, Value] = {
-                "environment": described(environment), "model": described("reference"),
-                "pose.yaw": described(yaw, "degrees"), "camera.elevation": described(elevation, "degrees"),
+                "environment": described(environment),
+                "model": described("reference"),
+                "pose.yaw": described(yaw, "degrees"),
+                "camera.elevation": described(elevation, "degrees"),
                 "light.power": described(power + step / 1000, "1"),
-            }  # fmt: skip
+            }
             rows.append(
                 Row("sweep", step, correct=not wrong, margin=-2.0 - step / 100 if wrong else 3.0, probability=0.9,
                     label="cup" if wrong else label, values=values, payload=payload)
@@ -77,8 +79,11 @@ def make_sweep(
         if ended:
             right = sum(bool(one.correct) for one in rows)
             counts = {
-                "configurations": len(rows), "correct": right, "accuracy": right / len(rows), "interval": (0.5, 0.9),
-            }  # fmt: skip
+                "configurations": len(rows),
+                "correct": right,
+                "accuracy": right / len(rows),
+                "interval": (0.5, 0.9),
+            }
             axis = {"axis": "pose.yaw", "unit": "degrees", "value": 45.0, **counts}
             summary = sweep(**counts, planned=len(rows), run=str(path), **{"axes": [axis], **summarised})
             run.write_summary(summary)

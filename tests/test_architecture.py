@@ -24,9 +24,23 @@ PACKAGE = ROOT / "advsearch"
 
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
 COMMON = {
-    "calls", "catalog", "copies", "distributions", "described", "errors", "files", "interrupts", "options", "pictures",
-    "registry", "seeds", "threads", "progress", "trust", "version",
-}  # fmt: skip
+    "calls",
+    "catalog",
+    "copies",
+    "distributions",
+    "described",
+    "errors",
+    "files",
+    "interrupts",
+    "options",
+    "pictures",
+    "registry",
+    "seeds",
+    "threads",
+    "progress",
+    "trust",
+    "version",
+}
 """Small modules, and the room of guards, that anyone may import and that import nobody but each other."""
 
 
@@ -96,9 +110,13 @@ BROUGHT_ALONG = {"drjit": "mitsuba", "typing_extensions": "pydantic"}
 pydantic's classes are written with its own typing_extensions."""
 
 OPTIONAL = {
-    "pyarrow": "parquet", "textual_image": "terminal", "distributed": "dask", "dask": "dask", "ribs": "archive",
+    "pyarrow": "parquet",
+    "textual_image": "terminal",
+    "distributed": "dask",
+    "dask": "dask",
+    "ribs": "archive",
     "shtab": "completion",
-}  # fmt: skip
+}
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 

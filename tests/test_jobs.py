@@ -138,9 +138,18 @@ def test_test(tmp_path: Path) -> None:
 
 def test_check(tmp_path: Path) -> None:
     run_command(
-        "check", "--object", "mug", "--control", "light.power", "--loss", "linear", "--resolution", "32", "--run",
+        "check",
+        "--object",
+        "mug",
+        "--control",
+        "light.power",
+        "--loss",
+        "linear",
+        "--resolution",
+        "32",
+        "--run",
         tmp_path / "check",
-    )  # fmt: skip
+    )
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,10 +17,21 @@ NETWORK = "torchvision:ssdlite320_mobilenet_v3_large"
 SMALL = {
     "render": ["--spp", "2", "--denoise", "none"],
     "attack": [
-        "--spp", "2", "--verify-spp", "2", "--trials", "6", "--steps", "6", "--denoise", "none", "--measure", "no",
+        "--spp",
+        "2",
+        "--verify-spp",
+        "2",
+        "--trials",
+        "6",
+        "--steps",
+        "6",
+        "--denoise",
+        "none",
+        "--measure",
+        "no",
     ],
     "sweep": ["--samples", "12", "--spp", "2", "--denoise", "none", "--trials", "0"],
-}  # fmt: skip
+}
 
 
 @pytest.mark.docs

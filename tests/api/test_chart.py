@@ -41,9 +41,11 @@ def photographed(path: Path, *, lamp: tuple[float, float, float], slope: float, 
     # the output's corners (0, 0), (w, 0), (w, h), (0, h) show these places of the sheet
     wide, high, away = width + 200, height + 200, slant * width
     source = [
-        (-100.0, -100.0), (width + 100.0, -100.0), (width + 100.0 + away, height + 100.0),
+        (-100.0, -100.0),
+        (width + 100.0, -100.0),
+        (width + 100.0 + away, height + 100.0),
         (-100.0 - away, height + 100.0),
-    ]  # fmt: skip
+    ]
     rows = []
     for (x, y), (u, v) in zip([(0, 0), (wide, 0), (wide, high), (0, high)], source, strict=True):
         rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]

@@ -92,11 +92,12 @@ def test_an_ensemble_answers_as_its_models_do() -> None:
 @pytest.mark.parametrize(
     ("logits", "score", "right"),
     [
-        ([[0.0, 2.0], [0.0, 1.0]], 1.0, False), ([[0.0, 2.0], [3.0, 0.0]], -3.0, False),
+        ([[0.0, 2.0], [0.0, 1.0]], 1.0, False),
+        ([[0.0, 2.0], [3.0, 0.0]], -3.0, False),
         ([[1.0, 0.0], [3.0, 0.0]], -3.0, True),
     ],
     ids=["both wrong", "one wrong", "both right"],
-)  # fmt: skip
+)
 def test_a_prediction_counts_where_it_does_for_each_model(logits: list[list[float]], score: float, right: bool) -> None:
     """One model that errs is neither a success nor a right answer."""
     tasks = (Classification(labels=("mug", "vase")), Classification(labels=("cup", "jar")))

@@ -18,9 +18,19 @@ from advsearch.runs.summary import read_configuration
 from stored_sweeps import all_rows
 
 SMALL = AttackConfig(
-    object="mug,bowl", controls={"pose": {"yaw": [-30, 30]}}, policy="random", resolution=16, denoise="none", spp=1,
-    steps=2, trials=6, verify_spp=2, average=6, baseline=False, deterministic=True,
-)  # fmt: skip
+    object="mug,bowl",
+    controls={"pose": {"yaw": [-30, 30]}},
+    policy="random",
+    resolution=16,
+    denoise="none",
+    spp=1,
+    steps=2,
+    trials=6,
+    verify_spp=2,
+    average=6,
+    baseline=False,
+    deterministic=True,
+)
 
 
 class Backwards:

@@ -34,11 +34,13 @@ def brute_force(u: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
         jac=lambda p: 2 * (p - u),
         bounds=[(0.0, 1.0)] * len(u),
         constraints={
-            "type": "ineq", "fun": lambda p: radius**2 - ((p - centre) ** 2).sum(), "jac": lambda p: -2 * (p - centre),
+            "type": "ineq",
+            "fun": lambda p: radius**2 - ((p - centre) ** 2).sum(),
+            "jac": lambda p: -2 * (p - centre),
         },
         method="SLSQP",
         options={"ftol": 1e-12, "maxiter": 500},
-    )  # fmt: skip
+    )
     return np.asarray(answer.x)
 
 
@@ -93,9 +95,12 @@ def test_linf_projection_is_a_clip_of_ball_and_box() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.integers(0, 10_000), st.integers(1, 40), st.floats(1e-3, 3.0), st.floats(1e-3, 100.0),
+    st.integers(0, 10_000),
+    st.integers(1, 40),
+    st.floats(1e-3, 3.0),
+    st.floats(1e-3, 100.0),
     st.sampled_from(["linf", "l2"]),
-)  # fmt: skip
+)
 def test_projection_lies_inside_is_idempotent_and_nonexpansive(
     seed: int, d: int, epsilon: float, scale: float, norm: str
 ) -> None:

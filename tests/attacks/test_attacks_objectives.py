@@ -88,18 +88,24 @@ def test_targeted_dlr_is_the_published_ratio_where_the_right_label_leads() -> No
 
 
 FORMS = {
-    "plain": Classification(), "targeted": Classification(target=(2, 4)), "minimised": Classification(minimise=True),
-}  # fmt: skip
+    "plain": Classification(),
+    "targeted": Classification(target=(2, 4)),
+    "minimised": Classification(minimise=True),
+}
 RIGHT = (0, 3)
 LARGE = (1.0, 1e3, 1e4)
 
 EXTREMES = {
-    "all equal": [0.0] * 6, "a tie at the top": [5.0, 5.0, 0.0, 1.0, 2.0, 3.0],
-    "a tie of the wrong": [5.0, 3.0, 3.0, 0.0, 3.0, 3.0], "a tie of the right": [5.0, 3.0, 1.0, 5.0, 0.0, 2.0],
-    "sure and right": [10.0, 1.0, 0.0, -2.0, 2.0, 3.0], "sure and wrong": [0.0, 10.0, 1.0, -2.0, 2.0, 3.0],
-    "sure of the target": [0.0, 1.0, 10.0, -2.0, 2.0, 3.0], "all others tied": [10.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    "all equal": [0.0] * 6,
+    "a tie at the top": [5.0, 5.0, 0.0, 1.0, 2.0, 3.0],
+    "a tie of the wrong": [5.0, 3.0, 3.0, 0.0, 3.0, 3.0],
+    "a tie of the right": [5.0, 3.0, 1.0, 5.0, 0.0, 2.0],
+    "sure and right": [10.0, 1.0, 0.0, -2.0, 2.0, 3.0],
+    "sure and wrong": [0.0, 10.0, 1.0, -2.0, 2.0, 3.0],
+    "sure of the target": [0.0, 1.0, 10.0, -2.0, 2.0, 3.0],
+    "all others tied": [10.0, 0.0, 0.0, 0.0, 0.0, 0.0],
     "a tie above the target": [5.0, 5.0, 0.0, 5.0, 0.0, 5.0],
-}  # fmt: skip
+}
 
 
 def form(name: str, chosen: str) -> Callable[[Tensor, tuple[int, ...]], Tensor]:

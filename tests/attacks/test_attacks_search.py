@@ -248,9 +248,13 @@ def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
         return Evaluation(0.5, value, True, non_finite=1)
 
     result = search(
-        partial(map, evaluate), DOMAIN, Script((at(0.0), at(0.1)), gradient=True), steps=2, seed=0,
+        partial(map, evaluate),
+        DOMAIN,
+        Script((at(0.0), at(0.1)), gradient=True),
+        steps=2,
+        seed=0,
         on_step=lambda record, u, evaluation: gradients.append(evaluation.gradient),
-    )  # fmt: skip
+    )
     assert gradients[0] is not None and gradients[0].tolist() == [0.0, 1.0, 0.0]
     assert result.history[0].non_finite == 3  # two here and one that the renderer had found
     assert result.non_finite_elements == 3 + 1 + 4  # the last step and four ranking renders report one each

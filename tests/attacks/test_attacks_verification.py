@@ -149,8 +149,11 @@ def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
     choice = choose_spp({"clean": drifting(-3.0, 0.0, 0.1), "adversarial": drifting(2.0, 0.0, 0.1)}, seed=0)
     assert (choice.spp, choice.converged, choice.renders) == (16, True, 16), "the first look is enough"
     assert [(r.name, r.spp) for r in choice.table] == [
-        ("clean", 4), ("clean", 16), ("adversarial", 4), ("adversarial", 16),
-    ]  # fmt: skip
+        ("clean", 4),
+        ("clean", 16),
+        ("adversarial", 4),
+        ("adversarial", 16),
+    ]
     assert math.isnan(choice.table[0].drift)
 
 
@@ -446,8 +449,10 @@ def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
     found = verify(evaluate, DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
     assert made == ["control"] * 20 + ["verification"] * 2, "what nobody asks for any more is not made"
     assert (found.adversarial_counts.successes, found.adversarial_counts.trials, found.ending) == (
-        0, 2, Ending.BUDGET_SPENT,
-    )  # fmt: skip
+        0,
+        2,
+        Ending.BUDGET_SPENT,
+    )
 
 
 @pytest.mark.parametrize(
@@ -563,7 +568,13 @@ def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> 
 def test_every_ending_has_a_value_for_json_and_a_sentence() -> None:
     values = {ending.value for ending in Ending}
     assert values >= {
-        "found", "budget spent", "not verified", "stalled", "non-finite objective", "interrupted", "already wrong",
-    }  # fmt: skip
+        "found",
+        "budget spent",
+        "not verified",
+        "stalled",
+        "non-finite objective",
+        "interrupted",
+        "already wrong",
+    }
     for ending in Ending:
         assert ending.explanation.endswith(".")

@@ -30,16 +30,24 @@ def aliases(levels: int, merge: bool) -> str:
 
 
 YAML = {
-    "many hexadecimal digits": "seed: 0x" + "f" * 6000, "a binary number without digits": "seed: 0b_",
-    "a date that does not exist": "seed: 2026-02-30", "a number by tag": "seed: !!int abc",
-    "a Python object": "seed: !!python/object/apply:os.mkdir [executed]", "nested lists": "seed: " + "[" * 100_000,
-    "aliases": aliases(12, merge=False), "an alias of itself": "seed: &a [*a]",
-    "a long list": "seed: [" + "x," * 200_000 + "x]", "a zero byte": "seed: \0",
-    "a list as key": "controls: {? [a] : 1}", "a long name": "x" * 5000 + ": 1",
-    "a long object": "object: " + "x" * 5000, "a base with a zero byte": 'base: "a\\0b"',
-    "a base that is a device": "base: /dev/zero", "a name that steers the terminal": '"\\e[2J": 1',
+    "many hexadecimal digits": "seed: 0x" + "f" * 6000,
+    "a binary number without digits": "seed: 0b_",
+    "a date that does not exist": "seed: 2026-02-30",
+    "a number by tag": "seed: !!int abc",
+    "a Python object": "seed: !!python/object/apply:os.mkdir [executed]",
+    "nested lists": "seed: " + "[" * 100_000,
+    "aliases": aliases(12, merge=False),
+    "an alias of itself": "seed: &a [*a]",
+    "a long list": "seed: [" + "x," * 200_000 + "x]",
+    "a zero byte": "seed: \0",
+    "a list as key": "controls: {? [a] : 1}",
+    "a long name": "x" * 5000 + ": 1",
+    "a long object": "object: " + "x" * 5000,
+    "a base with a zero byte": 'base: "a\\0b"',
+    "a base that is a device": "base: /dev/zero",
+    "a name that steers the terminal": '"\\e[2J": 1',
     "a schema of another type": "schema: {a: 1}",
-}  # fmt: skip
+}
 
 
 @pytest.mark.medium

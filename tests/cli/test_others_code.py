@@ -98,20 +98,25 @@ IMPORTING = {
     "replay": ["replay theirs", "replay theirs --model reference"],
     "sweep": ["sweep --adversarial-of theirs --control light --samples 2"],
     "export": [
-        "export theirs --format gltf --out a.glb", "export theirs --format mitsuba --out folder",
-        "export patched --format print --out a.pdf", "export kept --format coco --out b",
+        "export theirs --format gltf --out a.glb",
+        "export theirs --format mitsuba --out folder",
+        "export patched --format print --out a.pdf",
+        "export kept --format coco --out b",
     ],
     "explain": ["explain swept --confirm 0 --pairs 0 --clusters 4"],
     "compare": ["compare swept beside"],
     "test": ["test suite.yaml", "test beside.yaml", "test mine.yaml --add theirs"],
     "recipe": ["recipe ./recipe.yaml"],
-}  # fmt: skip
+}
 """Commands that load what a run, a suite or a recipe names."""
 
 READING = {
-    "show": ["show theirs", "show stopped"], "view": ["view theirs", "view swept --bundle site"], "runs": ["runs"],
-    "report": ["report theirs swept --evidence"], "export": ["export swept", "export kept --format 3db --out a"],
-}  # fmt: skip
+    "show": ["show theirs", "show stopped"],
+    "view": ["view theirs", "view swept --bundle site"],
+    "runs": ["runs"],
+    "report": ["report theirs swept --evidence"],
+    "export": ["export swept", "export kept --format 3db --out a"],
+}
 """And those that look at them."""
 
 ALONE = (

@@ -24,9 +24,17 @@ from stored_sweeps import make_sweep
 
 MANY = 100_000
 POWERS: dict[str, Any] = {
-    "cluster": "tcp://127.0.0.1:1", "workers": MANY, "log": "wandb", "run": "/tmp/elsewhere", "overwrite": True,
-    "junit": "precious", "sarif": "precious", "markdown": "precious", "add": "theirs", "update": True,
-}  # fmt: skip
+    "cluster": "tcp://127.0.0.1:1",
+    "workers": MANY,
+    "log": "wandb",
+    "run": "/tmp/elsewhere",
+    "overwrite": True,
+    "junit": "precious",
+    "sarif": "precious",
+    "markdown": "precious",
+    "add": "theirs",
+    "update": True,
+}
 """A value of each setting that has such power."""
 
 HARMLESS: dict[str, Any] = {

@@ -167,8 +167,14 @@ def test_a_scheduler_and_workers_of_their_own(tmp_path: Path, monkeypatch: pytes
     port = free_port()
     scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
     worker = (
-        "worker", f"tcp://127.0.0.1:{port}", "--nthreads", "1", "--no-dashboard", "--local-directory", str(tmp_path),
-    )  # fmt: skip
+        "worker",
+        f"tcp://127.0.0.1:{port}",
+        "--nthreads",
+        "1",
+        "--no-dashboard",
+        "--local-directory",
+        str(tmp_path),
+    )
     told: list[str] = []
     added = tmp_path / "added.txt"
     added.write_text("7")
@@ -209,9 +215,11 @@ def test_a_scheduler_that_went_and_came_back_between_two_looks_is_noticed(monkey
     """Its client runs at both, over another connection: what was under way is lost all the same."""
     connection = object()
     client = SimpleNamespace(
-        status="running", scheduler_comm=connection, scheduler=SimpleNamespace(ncores=None),
+        status="running",
+        scheduler_comm=connection,
+        scheduler=SimpleNamespace(ncores=None),
         sync=lambda function, *args, **__: {"a": compute_version()},
-    )  # fmt: skip
+    )
     now = time.monotonic()
     executor = executor_of_nobody(
         _client=client, _connection=connection, _counted_at=now, _alone_since=now, _looked_at=float("-inf")

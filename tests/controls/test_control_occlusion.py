@@ -129,9 +129,10 @@ def test_it_comes_in_without_a_jump(scene: SceneDescription) -> None:
 
 def test_it_follows_the_camera_and_the_pose_whatever_the_order(scene: SceneDescription) -> None:
     occlusion, camera, pose = (
-        OcclusionControl(coverage=[0, 0.4], direction=180.0), CameraControl(azimuth=[0, 360]),
+        OcclusionControl(coverage=[0, 0.4], direction=180.0),
+        CameraControl(azimuth=[0, 360]),
         PoseControl(x=[-0.3, 0.3]),
-    )  # fmt: skip
+    )
     space = make_space([occlusion, camera, pose], scene)
     u = torch.tensor([1.0, 0.8, 0.9])
     inputs = space.inputs(u)

@@ -123,8 +123,10 @@ def test_it_starts_as_what_is_underneath(scene: SceneDescription) -> None:
 @pytest.mark.medium
 def test_two_patches_and_a_texture_compose(scene: SceneDescription) -> None:
     controls = [
-        PatchControl("left", azimuth=20, size=0.2), TextureControl(), PatchControl("right", azimuth=70, size=0.2),
-    ]  # fmt: skip
+        PatchControl("left", azimuth=20, size=0.2),
+        TextureControl(),
+        PatchControl("right", azimuth=70, size=0.2),
+    ]
     space = make_space(controls, scene)
     u = space.start
     before = space.inputs(u)[BASE_COLOR]

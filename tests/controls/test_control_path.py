@@ -307,11 +307,17 @@ def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
 
 TUM_ROW = "1 6 0 1 -0.5 -0.5 0.5 0.5\n"
 NO_WAYS = [
-    "", "time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n", "time,x,y,z\n0,1,1," + 200_000 * "1" + "\n",
-    "time,x,y,z\n0,1,1,1\n", "time,x,y,z\n0,1,1,1\n1,a,1,1\n", "time,x,y,z\n0,1,1,1\n0,1,1,1\n",
-    "time,x,y,z\nnan,1,1,1\n1,1,1,1\n", "time,x,y,z\n0,1,1,1\n1e300,1,1,1\n", "time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n",
+    "",
+    "time,x,y,z,look_x\n0,1,1,1,0\n1,1,1,1,0\n",
+    "time,x,y,z\n0,1,1," + 200_000 * "1" + "\n",
+    "time,x,y,z\n0,1,1,1\n",
+    "time,x,y,z\n0,1,1,1\n1,a,1,1\n",
+    "time,x,y,z\n0,1,1,1\n0,1,1,1\n",
+    "time,x,y,z\nnan,1,1,1\n1,1,1,1\n",
+    "time,x,y,z\n0,1,1,1\n1e300,1,1,1\n",
+    "time,x,y,z\n0,1,1,1\n1e-30,1,1,1\n",
     "time,x,y,z\n0,1,1,1\n1,1e300,1,1\n",
-]  # fmt: skip
+]
 NO_TRAJECTORIES = [
     "0 6 0 1 -0.5 -0.5 0.5 0.7\n" + TUM_ROW,
     "0 6 0 1 nan 0 0 1\n" + TUM_ROW,
@@ -324,7 +330,7 @@ NO_TRAJECTORIES = [
     HEADER.replace("[ns]", "[h]") + "\n1,6,0,1,0.5,-0.5,-0.5,0.5\n" * 2,
     "1 0 0 0 0 1 0 0 0 0 2 0\n" * 2,
     1_100 * "1 " + "\n",
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("text", NO_WAYS + NO_TRAJECTORIES)

@@ -147,9 +147,10 @@ def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str,
 def test_beside_moving_lamps_and_textures_its_light_counts_once() -> None:
     scene = advsearch.load_scene("mug")
     controls = [
-        make_control("projector", {"resolution": 8}), make_control("light", {"power": [0, 8]}),
+        make_control("projector", {"resolution": 8}),
+        make_control("light", {"power": [0, 8]}),
         make_control("texture", {"resolution": 8}),
-    ]  # fmt: skip
+    ]
     renderer = scene.renderer(controls, resolution=24)
     basis = make_predictor(renderer, renderer.start, seed=1)
     assert isinstance(basis, BasisRenderer)

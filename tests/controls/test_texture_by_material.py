@@ -32,9 +32,12 @@ CAR: dict[str, list[Box]] = {
 }
 """Boxes from corner to corner by material, z up."""
 COLOURS = {
-    "Body Paint": (0.7, 0.1, 0.1), "roof": (0.6, 0.6, 0.65), "glass": (0.1, 0.2, 0.25), "tyres": (0.05, 0.05, 0.05),
+    "Body Paint": (0.7, 0.1, 0.1),
+    "roof": (0.6, 0.6, 0.65),
+    "glass": (0.1, 0.2, 0.25),
+    "tyres": (0.05, 0.05, 0.05),
     "plate": (0.9, 0.9, 0.7),
-}  # fmt: skip
+}
 SIDES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
 
 

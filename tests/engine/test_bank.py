@@ -19,9 +19,16 @@ from advsearch.scene.surface import renderer as surface_renderer
 from stand_ins import Impatient, rows
 
 SMALL: dict[str, Any] = {
-    "resolution": 32, "controls": {"texture": {"resolution": 4}}, "over": ["camera", "environment"], "draws": 2,
-    "steps": 18, "trials": 6, "verify_spp": 2, "baseline": False, "deterministic": True,
-}  # fmt: skip
+    "resolution": 32,
+    "controls": {"texture": {"resolution": 4}},
+    "over": ["camera", "environment"],
+    "draws": 2,
+    "steps": 18,
+    "trials": 6,
+    "verify_spp": 2,
+    "baseline": False,
+    "deterministic": True,
+}
 
 
 def test_conditions_are_stratified_and_numbered() -> None:

@@ -25,10 +25,21 @@ from advsearch.scene.window import Window
 from stand_ins import Impatient, rows
 
 SMALL: dict[str, Any] = {
-    "object": "mug", "environment": "noon", "controls": {"material": {"roughness": [0.1, 0.9]}}, "resolution": 64,
-    "set": {"camera.distance": 0.8}, "spp": 4, "steps": 22, "policy": "pgd", "measure": "no",
-    "label": "bowl", "minimise": True, "baseline": False, "trials": 6, "verify_spp": 1,
-}  # fmt: skip
+    "object": "mug",
+    "environment": "noon",
+    "controls": {"material": {"roughness": [0.1, 0.9]}},
+    "resolution": 64,
+    "set": {"camera.distance": 0.8},
+    "spp": 4,
+    "steps": 22,
+    "policy": "pgd",
+    "measure": "no",
+    "label": "bowl",
+    "minimise": True,
+    "baseline": False,
+    "trials": 6,
+    "verify_spp": 1,
+}
 
 
 def make_problem(**changes: Any) -> Problem:

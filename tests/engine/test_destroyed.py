@@ -158,9 +158,10 @@ def test_a_task_from_a_function_and_the_facts_that_it_gets() -> None:
 
     mask = torch.ones(2, 2, dtype=torch.bool)
     facts = Facts(
-        "mug", describe_values=lambda: {"pose.yaw": 1.0},
+        "mug",
+        describe_values=lambda: {"pose.yaw": 1.0},
         compute_sight=lambda: Sight(mask, torch.ones(2, 2), torch.ones(2, 2)),
-    )  # fmt: skip
+    )
     task, output = make_task(judge), LOGITS.clone()
     assert [one.margin for one in task.judge(output, facts)] == [1.0, 3.5]
     assert torch.equal(output, LOGITS) and mask.all() and facts.depth.eq(1).all() and facts.z_depth.eq(1).all()

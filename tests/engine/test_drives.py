@@ -214,9 +214,15 @@ def test_pictures_of_a_longer_sweep_of_the_same_seed_are_not_counted_twice(tmp_p
 def test_an_attack_over_a_path_keeps_its_adversarial_scene_along_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "run"
     size: dict[str, Any] = {
-        "resolution": 16, "spp": 1, "verify_spp": 1, "steps": 3, "policy": "pgd", "epsilon": 0.5, "trials": 6,
+        "resolution": 16,
+        "spp": 1,
+        "verify_spp": 1,
+        "steps": 3,
+        "policy": "pgd",
+        "epsilon": 0.5,
+        "trials": 6,
         "draws": 1,
-    }  # fmt: skip
+    }
     model = advsearch.load_model(Dark(), labels=("mug", "vase"), input_size=16, name="dark")
     over = {"path": {"seconds": 5.0, "reach": 1.5}}
     found = advsearch.attack(

@@ -24,9 +24,16 @@ from stand_ins import Impatient, rows, shared
 pytestmark = pytest.mark.medium
 
 SMALL: dict[str, Any] = {
-    "resolution": 32, "controls": {"texture": {"resolution": 8}}, "over": ["camera", "environment"], "draws": 2,
-    "steps": 18, "trials": 6, "verify_spp": 4, "baseline": False, "deterministic": True,
-}  # fmt: skip
+    "resolution": 32,
+    "controls": {"texture": {"resolution": 8}},
+    "over": ["camera", "environment"],
+    "draws": 2,
+    "steps": 18,
+    "trials": 6,
+    "verify_spp": 4,
+    "baseline": False,
+    "deterministic": True,
+}
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -119,9 +119,20 @@ def rows_of(run: Path) -> list[tuple[Any, ...]]:
 
 
 COMPARED = (
-    "kind", "step", "seed", "spp", "objective", "score", "success", "correct", "margin", "label", "label_index",
-    "probability", "renders",
-)  # fmt: skip
+    "kind",
+    "step",
+    "seed",
+    "spp",
+    "objective",
+    "score",
+    "success",
+    "correct",
+    "margin",
+    "label",
+    "label_index",
+    "probability",
+    "renders",
+)
 TIMES = ("seconds", "renders_per_second", "run", "command_line")
 
 
@@ -315,9 +326,13 @@ def test_the_worst_is_the_smallest_margin_and_is_rendered_again(tmp_path: Path) 
 def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
     models = [model(0.5, "strict"), model(0.9, "easy")]
     result = advsearch.sweep(
-        ["mug", "bowl"], models, {"pose.yaw": [0, 90, 180]}, environment="studio,noon", label="mug",
+        ["mug", "bowl"],
+        models,
+        {"pose.yaw": [0, 90, 180]},
+        environment="studio,noon",
+        label="mug",
         run=tmp_path / "run",
-    )  # fmt: skip
+    )
     rows = list(result.rows())
     places = [
         (row.values["object"]["value"], row.values["environment"]["value"], row.values["model"]["value"])
@@ -353,9 +368,13 @@ def test_outputs_that_are_not_finite_are_counted_and_not_right() -> None:
 
 
 SURVIVES: dict[str, Any] = {
-    "grid": {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]}, "controls": {"camera": {"azimuth": [0, 90]}},
-    "samples": 3, "batch": 4, "trials": 6, "environment": "studio,noon",
-}  # fmt: skip
+    "grid": {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]},
+    "controls": {"camera": {"azimuth": [0, 90]}},
+    "samples": 3,
+    "batch": 4,
+    "trials": 6,
+    "environment": "studio,noon",
+}
 
 
 PICTURES, WHOLE = 2 * 6 * 3 * 3, 108 + 8 + 6 + 1

@@ -8,9 +8,12 @@ from fuzz.mutations import damaged
 
 HEAD = b"BLENDER-v405" + b"REND" + bytes(60) + b"ENDB"
 SAID = (
-    b"", b"Error: File written by newer Blender\n", b"\x1b]0;owned\x07\x1b[31mError\n", b"x" * 100_000 + b"\n",
+    b"",
+    b"Error: File written by newer Blender\n",
+    b"\x1b]0;owned\x07\x1b[31mError\n",
+    b"x" * 100_000 + b"\n",
     b"\xff\xfe\x00\n\n \n",
-)  # fmt: skip
+)
 
 
 def blend(random: Random) -> Case:

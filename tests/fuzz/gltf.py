@@ -118,12 +118,21 @@ def everything() -> tuple[dict[str, Any], bytes]:
         ],
         "cameras": [{"type": "perspective", "perspective": {"yfov": 0.8, "aspectRatio": 1.5}}],
         "extensionsUsed": ["KHR_lights_punctual", "KHR_texture_transform", "ACME_paint"],
-        "extensions": {"KHR_lights_punctual": {"lights": [
-            {"type": kind, "intensity": 3.0, "color": [1, 0.5, 0.2], "range": 9.0,
-             "spot": {"innerConeAngle": 0.2, "outerConeAngle": 0.6}}
-            for kind in ("spot", "point", "directional")
-        ]}},
-    }  # fmt: skip
+        "extensions": {
+            "KHR_lights_punctual": {
+                "lights": [
+                    {
+                        "type": kind,
+                        "intensity": 3.0,
+                        "color": [1, 0.5, 0.2],
+                        "range": 9.0,
+                        "spot": {"innerConeAngle": 0.2, "outerConeAngle": 0.6},
+                    }
+                    for kind in ("spot", "point", "directional")
+                ]
+            }
+        },
+    }
     header["meshes"][0]["weights"] = [0.5]
     for texture in header["textures"]:
         texture["sampler"] = 0
@@ -191,12 +200,13 @@ def bombs(random: Random) -> Case:
         "views": lambda: header["bufferViews"].extend([whole_view] * many),
         "a count": lambda: header["accessors"][0].update(count=random.choice((*INTEGERS, -1, 10**12))),
         "a count without a view": lambda: (
-            header["accessors"][0].pop("bufferView"), header["accessors"][0].update(count=random.choice((10**7, 10**9)))
+            header["accessors"][0].pop("bufferView"),
+            header["accessors"][0].update(count=random.choice((10**7, 10**9))),
         ),
         "extensions": lambda: header.update(extensionsUsed=[f"ACME_{k}" for k in range(many)]),
         "skins": lambda: header.update(skins=[{"joints": [10**9, -1]}] * many),
         "lights": lambda: header.update(extensions={"KHR_lights_punctual": {"lights": [{"type": "spot"}] * many}}),
-    }  # fmt: skip
+    }
     what = random.choice(sorted(kinds))
     kinds[what]()
     return case(random, what, header, binary + bytes(1_000_000 if what == "views" else 0))
@@ -224,5 +234,9 @@ def images(random: Random) -> Case:
 
 
 MAKERS: tuple[Maker, ...] = (
-    bytes_damaged, *([types_confused] * 4), bombs, images, text,
-)  # fmt: skip
+    bytes_damaged,
+    *([types_confused] * 4),
+    bombs,
+    images,
+    text,
+)

@@ -104,9 +104,11 @@ def load_run(path: Path) -> None:
 
 
 QUESTIONS = (
-    ("show", "{run}"), ("show", "{run}", "--json"), ("report", "{run}", "--evidence", "--out", "made/report"),
+    ("show", "{run}"),
+    ("show", "{run}", "--json"),
+    ("report", "{run}", "--evidence", "--out", "made/report"),
     ("view", "{run}", "--bundle", "made/site"),
-)  # fmt: skip
+)
 EXPORTS = (("export", "{run}", "--out", "made/rows.csv"), ("export", "{run}", "--out", "made/rows.json"))
 OF_SWEEPS = (
     ("export", "{run}", "--format", "3db", "--out", "made/3db"),
@@ -114,9 +116,11 @@ OF_SWEEPS = (
     ("explain", "{run}", "--confirm", "0", "--pairs", "0", "--clusters", "0", "--run", "made/explain"),
 )
 ASKED = {
-    "study": QUESTIONS, "attack": (*QUESTIONS, *EXPORTS), "detection": (*QUESTIONS, *EXPORTS),
+    "study": QUESTIONS,
+    "attack": (*QUESTIONS, *EXPORTS),
+    "detection": (*QUESTIONS, *EXPORTS),
     "sweep": (*QUESTIONS, *EXPORTS, *OF_SWEEPS),
-}  # fmt: skip
+}
 """What is asked of a whole run, by its kind in `fuzz.run_folders`."""
 
 PAGES = (
@@ -244,11 +248,21 @@ def load_threedb(path: Path) -> None:
 
 
 LOADERS: dict[str, Callable[[Path], object]] = {
-    "object": load_object, "node": load_node, "mitsuba": load_mitsuba, "environment": load_environment,
-    "picture": load_picture, "rig": load_rig, "model": load_model, "labels": load_labels, "settings": load_settings,
-    "run": load_run, **{f"whole {kind}": partial(load_whole_run, kind) for kind in ASKED}, "answer": load_answer,
-    "blend": load_blend, "3db": load_threedb,
-}  # fmt: skip
+    "object": load_object,
+    "node": load_node,
+    "mitsuba": load_mitsuba,
+    "environment": load_environment,
+    "picture": load_picture,
+    "rig": load_rig,
+    "model": load_model,
+    "labels": load_labels,
+    "settings": load_settings,
+    "run": load_run,
+    **{f"whole {kind}": partial(load_whole_run, kind) for kind in ASKED},
+    "answer": load_answer,
+    "blend": load_blend,
+    "3db": load_threedb,
+}
 """Each gets the path of a case's main file, and returns or raises an `AdvsearchError`."""
 
 

@@ -165,10 +165,15 @@ def environment(random: Random) -> Case:
     if draw < 0.3:
         box = random.choice(
             (
-                (0, 0, 19_999, 9_999), (0, 0, 2**31 - 1, 2**31 - 1), (-(2**31), -(2**31), 2**31 - 1, 2**31 - 1),
-                (0, 0, 1_000_000, 10), (0, 0, 10, 1_000_000), (5, 5, 0, 0), (1_000, 1_000, 1_015, 1_007),
+                (0, 0, 19_999, 9_999),
+                (0, 0, 2**31 - 1, 2**31 - 1),
+                (-(2**31), -(2**31), 2**31 - 1, 2**31 - 1),
+                (0, 0, 1_000_000, 10),
+                (0, 0, 10, 1_000_000),
+                (5, 5, 0, 0),
+                (1_000, 1_000, 1_015, 1_007),
             )
-        )  # fmt: skip
+        )
         name = random.choice((b"dataWindow", b"dataWindow", b"displayWindow"))
         what, data = f"{name.decode()} {box}", _window(data, name, box)
     elif draw < 0.45:  # the bits that say tiled, deep, long names, multipart

@@ -139,9 +139,14 @@ class _Worker:
             fault = reason or f"the process died with status {code}"
             return Outcome(number, case.what, ending, (fault,), spent[0] - cpu, max(0, spent[1] - resident))
         return Outcome(
-            number, case.what, answer["ending"], tuple(_faults(answer, case, path)), answer["cpu"], answer["growth"],
+            number,
+            case.what,
+            answer["ending"],
+            tuple(_faults(answer, case, path)),
+            answer["cpu"],
+            answer["growth"],
             " ".join((answer["message"], answer.get("where", ""))).strip(),
-        )  # fmt: skip
+        )
 
     def _started(self) -> subprocess.Popen[bytes]:
         if self._process is not None and self._process.poll() is None:
@@ -150,13 +155,18 @@ class _Worker:
         home.mkdir(exist_ok=True)
         here = Path(__file__).resolve().parents[1]
         environment = {
-            **os.environ, "HOME": str(home), "PYTHONPATH": f"{here}{os.pathsep}{here.parent}",
+            **os.environ,
+            "HOME": str(home),
+            "PYTHONPATH": f"{here}{os.pathsep}{here.parent}",
             "PYTHONDONTWRITEBYTECODE": "1",
-        }  # fmt: skip
+        }
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "fuzz.worker", str(self._folder), self._loaders], stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, cwd=self._folder / "runs", env=environment,
-        )  # fmt: skip
+            [sys.executable, "-m", "fuzz.worker", str(self._folder), self._loaders],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            cwd=self._folder / "runs",
+            env=environment,
+        )
         if not self._line(self._process, time.monotonic() + 300):
             raise RuntimeError("the process that loads the cases did not start")
         return self._process

@@ -181,10 +181,12 @@ def links(random: Random) -> Case:
     up = "../" * len(PurePosixPath(name).parts)
     outside = f"outside/{kind}/{name}"
     leads = {
-        "away": {name: up + outside}, "in a chain": {name: f"{up[3:]}hop", "hop": f"../{outside}"},
-        "to itself": {name: PurePosixPath(name).name}, "to the folder above": {name: ".."},
+        "away": {name: up + outside},
+        "in a chain": {name: f"{up[3:]}hop", "hop": f"../{outside}"},
+        "to itself": {name: PurePosixPath(name).name},
+        "to the folder above": {name: ".."},
         "to the settings": {name: f"{up[3:]}run.yaml"},
-    }  # fmt: skip
+    }
     if random.random() < 0.1:
         return _case(kind, f"{name} a pipe", files, pipes=(name,))
     how = random.choice(list(leads))

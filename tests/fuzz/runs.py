@@ -22,10 +22,15 @@ from fuzz.models import Planted
 from fuzz.mutations import as_json, confused, damaged
 
 SUMMARY = {
-    "schema": 1, "command": "attack", "object": "mug", "controls": ["pose"], "ending": "interrupted",
+    "schema": 1,
+    "command": "attack",
+    "object": "mug",
+    "controls": ["pose"],
+    "ending": "interrupted",
     "clean": {"label": "mug", "successes": 0, "trials": 6},
-    "verified": {"successes": 5, "trials": 6, "interval": [0.4, 1.0]}, "seconds": {"total": 3.0},
-}  # fmt: skip
+    "verified": {"successes": 5, "trials": 6, "interval": [0.4, 1.0]},
+    "seconds": {"total": 3.0},
+}
 SETTINGS = f"{HEADER}schema: 2\ncommand: attack\nobject: mug\ncontrols: {{pose: {{}}}}\n".encode()
 
 
@@ -97,8 +102,9 @@ def threedb(random: Random) -> Case:
         what, line = "confused", confused(random, LINE)
     files = {
         "details.log": b"\n".join([as_json(LINE), as_json(line)]),
-        "class_maps.json": json.dumps(["cup", "mug"]).encode(), "images/one_rgb.png": picture,
-    }  # fmt: skip
+        "class_maps.json": json.dumps(["cup", "mug"]).encode(),
+        "images/one_rgb.png": picture,
+    }
     if random.random() < 0.5:
         name = random.choice(("details.log", "class_maps.json"))
         what, files[name] = damaged(random, files[name])

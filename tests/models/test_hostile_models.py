@@ -381,11 +381,12 @@ def exported_program(module: nn.Module, path: Path) -> Path:
 @pytest.mark.parametrize(
     ("module", "save"),
     [
-        (NeverEnds(), scripted), (NeverEndsLoading(), scripted),
+        (NeverEnds(), scripted),
+        (NeverEndsLoading(), scripted),
         pytest.param(SumsForYears(), exported_program, marks=pytest.mark.slow),
     ],
     ids=["loop", "loop while loading", "sum"],
-)  # fmt: skip
+)
 def test_a_model_without_an_end_ends_with_one_sentence(
     module: nn.Module, save: Callable[[nn.Module, Path], Path], tmp_path: Path
 ) -> None:

@@ -64,14 +64,16 @@ def sized_onnx(folder: Path, name: str = "orig_target_sizes") -> Path:
         onnx_files.node("Cast", ["nothing"], ["labels"], onnx_files.number("to", onnx_files.INT64)),
     ]
     stored = [
-        onnx_files.integers("column", -1, 1), onnx_files.integers("one", 1),
+        onnx_files.integers("column", -1, 1),
+        onnx_files.integers("one", 1),
         onnx_files.floats("part", [0.0, 0.0, 0.5, 1.0], (1, 1, 4)),
-    ]  # fmt: skip
+    ]
     inputs = [onnx_files.value("images", ["N", 3, HEIGHT, WIDTH]), onnx_files.value(name, ["N", 2], onnx_files.INT64)]
     outputs = [
-        onnx_files.value("labels", ["N", 1], onnx_files.INT64), onnx_files.value("boxes", ["N", 1, 4]),
+        onnx_files.value("labels", ["N", 1], onnx_files.INT64),
+        onnx_files.value("boxes", ["N", 1, 4]),
         onnx_files.value("scores", ["N", 1]),
-    ]  # fmt: skip
+    ]
     path = folder / "net.onnx"
     path.write_bytes(onnx_files.model(onnx_files.graph(nodes, stored, inputs, outputs)))
     return path
@@ -114,9 +116,10 @@ def eight_bit_onnx(folder: Path) -> Path:
         onnx_files.node("Mul", ["d", "signs"], ["y"]),
     ]
     stored = [
-        onnx_files.integers("column", -1, 1), onnx_files.floats("half", [127.5]),
+        onnx_files.integers("column", -1, 1),
+        onnx_files.floats("half", [127.5]),
         onnx_files.floats("signs", [-1.0, 1.0], (1, 2)),
-    ]  # fmt: skip
+    ]
     inputs = [onnx_files.value("x", ["N", HEIGHT, WIDTH, 3], 2)]
     path = folder / "net.onnx"
     path.write_bytes(onnx_files.model(onnx_files.graph(nodes, stored, inputs, [onnx_files.value("y", ["N", 2])])))

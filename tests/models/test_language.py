@@ -29,9 +29,14 @@ WORDS = "user assistant what is on the this table ? : mug cup bowl tea coffee an
 KNOWN = {word: number for number, word in enumerate([*SPECIAL, *WORDS])}
 SIZES = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "intermediate_size": 16}
 READS = {
-    **SIZES, "num_key_value_heads": 1, "vocab_size": 48, "max_position_embeddings": 64, "pad_token_id": 0,
-    "bos_token_id": 2, "eos_token_id": 3,
-}  # fmt: skip
+    **SIZES,
+    "num_key_value_heads": 1,
+    "vocab_size": 48,
+    "max_position_embeddings": 64,
+    "pad_token_id": 0,
+    "bos_token_id": 2,
+    "eos_token_id": 3,
+}
 TEMPLATE = (
     "{% for message in messages %}{{ message.role }} : {% for part in message.content %}"
     "{% if part.type == 'image' %}PICTURE{% else %}{{ part.text }}{% endif %}{% endfor %} {% endfor %}"
@@ -70,9 +75,12 @@ def qwen_config() -> Any:
     turned = {"rope_type": "default", "mrope_section": [1, 1, 2]}
     ends = {f"vision_{end}_token_id": KNOWN[f"<|vision_{end}|>"] for end in ("start", "end")}
     return transformers.Qwen2_5_VLConfig(
-        vision_config=seen, text_config={**READS, "rope_parameters": turned}, image_token_id=KNOWN["<|image_pad|>"],
-        video_token_id=KNOWN["<|video_pad|>"], **ends,
-    )  # fmt: skip
+        vision_config=seen,
+        text_config={**READS, "rope_parameters": turned},
+        image_token_id=KNOWN["<|image_pad|>"],
+        video_token_id=KNOWN["<|video_pad|>"],
+        **ends,
+    )
 
 
 def qwen() -> tuple[Any, Any]:
@@ -160,9 +168,12 @@ def test_a_prompt_that_is_read_both_ways_does_not_see_the_name(tmp_path: Path) -
     """PaliGemma reads picture and prompt in both directions, and what is said after them in one."""
     config = transformers.PaliGemmaConfig(
         vision_config={"image_size": 16, "patch_size": 8, **SIZES},
-        text_config={"model_type": "gemma", "head_dim": 8, **READS}, image_token_index=KNOWN["<image>"],
-        projection_dim=16, hidden_size=16, vocab_size=READS["vocab_size"],
-    )  # fmt: skip
+        text_config={"model_type": "gemma", "head_dim": 8, **READS},
+        image_token_index=KNOWN["<image>"],
+        projection_dim=16,
+        hidden_size=16,
+        vocab_size=READS["vocab_size"],
+    )
     prepared = transformers.SiglipImageProcessor(size={"height": 16, "width": 16})
     prepared.image_seq_length = 4
     words = tokenizer(extra_special_tokens={"image_token": "<image>"})

@@ -197,11 +197,15 @@ def test_probabilities_become_log_odds_with_one_warning() -> None:
 @pytest.mark.parametrize(
     "answer",
     [
-        torch.sigmoid, lambda z: -z.log_softmax(1), lambda z: z + torch.rand_like(z), lambda z: z - 0.5 * z.mean(0),
-        lambda z: torch.from_numpy(z.detach().numpy()), lambda z: 0.0 * z + torch.arange(3.0),
+        torch.sigmoid,
+        lambda z: -z.log_softmax(1),
+        lambda z: z + torch.rand_like(z),
+        lambda z: z - 0.5 * z.mean(0),
+        lambda z: torch.from_numpy(z.detach().numpy()),
+        lambda z: 0.0 * z + torch.arange(3.0),
     ],
     ids=["sigmoid", "costs", "random", "mixes its batch", "no gradient", "zero gradient"],
-)  # fmt: skip
+)
 def test_outputs_that_are_doubtful_logits_are_warned_of(answer: Callable[[Tensor], Tensor]) -> None:
     with pytest.warns(ModelWarning, match="Answering"):
         model = load_model(Answering(answer), input_size=8)

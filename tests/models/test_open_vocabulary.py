@@ -165,10 +165,16 @@ def test_its_gradient_is_that_of_differences(tmp_path: Path, family: str) -> Non
 @pytest.mark.parametrize("family", ["Owlv2", "GroundingDino"])
 def test_it_is_attacked_by_name(tmp_path: Path, family: str) -> None:
     result = advsearch.attack(
-        "mug", published(tmp_path / "net", family), labels=list(NAMES), label="mug",
-        task={"name": "detection", "confidence": 0.001, "iou": 0.0001}, objective="vanish", policy="random",
-        **SMALL_ATTACK, run=tmp_path / "run",
-    )  # fmt: skip
+        "mug",
+        published(tmp_path / "net", family),
+        labels=list(NAMES),
+        label="mug",
+        task={"name": "detection", "confidence": 0.001, "iou": 0.0001},
+        objective="vanish",
+        policy="random",
+        **SMALL_ATTACK,
+        run=tmp_path / "run",
+    )
     assert result.summary.ending != "already wrong", "the clean picture is right, and the answer was judged"
     assert len(list(result.rows("verification"))) == 6
     assert "labels: mug,coffee cup,bowl" in (tmp_path / "run" / "run.yaml").read_text()

@@ -63,9 +63,11 @@ class Finds(Net):
     def found(self, image: Tensor) -> dict[str, Tensor]:
         _, height, width = image.shape
         return {
-            "boxes": torch.tensor([[0.0, 0.0, width, height]]), "labels": torch.tensor([1]),
-            "scores": image.mean()[None], "masks": image[None, :1],
-        }  # fmt: skip
+            "boxes": torch.tensor([[0.0, 0.0, width, height]]),
+            "labels": torch.tensor([1]),
+            "scores": image.mean()[None],
+            "masks": image[None, :1],
+        }
 
 
 def expected(scale: float, shift: float, bias: Tensor) -> Tensor:
@@ -99,9 +101,12 @@ def torchvision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         return networks[name]()
 
     networks: dict[str, Callable[[], nn.Module]] = {
-        "tiny_net": Net, "tiny_pixels": Pixels, "tiny_rcnn": lambda: Finds(None, (16, 24)),
-        "tiny_fcos": lambda: Finds(None, 20), "tiny_ssd": lambda: Finds((12, 10), (10,)),
-    }  # fmt: skip
+        "tiny_net": Net,
+        "tiny_pixels": Pixels,
+        "tiny_rcnn": lambda: Finds(None, (16, 24)),
+        "tiny_fcos": lambda: Finds(None, 20),
+        "tiny_ssd": lambda: Finds((12, 10), (10,)),
+    }
 
     library: Any = types.ModuleType("torchvision")
     library.models = types.ModuleType("torchvision.models")

@@ -70,8 +70,12 @@ def run_commands(folder: Path, *commands: list[str]) -> tuple[list[str], list[tu
     command the status, the output and the messages."""
     done = subprocess.run(
         [sys.executable, "-c", RUN, json.dumps(commands)],
-        cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     configurations, *results = json.loads(done.stdout)
     return configurations, [tuple(result) for result in results]

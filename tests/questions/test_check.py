@@ -28,9 +28,13 @@ from advsearch.runs.summary import read_result
 
 FLAGS = "check --object mug --control camera.azimuth,environment.rotation --loss linear --resolution 16 --spp 1"
 SMALL: dict[str, Any] = {
-    "object": "mug", "controls": {"camera.azimuth": {}, "environment.rotation": {}}, "loss": "linear", "resolution": 16,
-    "spp": 1, "threads": 1,
-}  # fmt: skip
+    "object": "mug",
+    "controls": {"camera.azimuth": {}, "environment.rotation": {}},
+    "loss": "linear",
+    "resolution": 16,
+    "spp": 1,
+    "threads": 1,
+}
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +89,11 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
 
 
 PLANNED: dict[str, Any] = {
-    **SMALL, "loss": "model", "estimators": {"*": "differences"},
+    **SMALL,
+    "loss": "model",
+    "estimators": {"*": "differences"},
     "controls": {"camera.azimuth": {}, "environment.rotation": {}},
-}  # fmt: skip
+}
 
 
 class Stop(NullProgress):

@@ -75,9 +75,11 @@ def stored(
                 for model, (name, right) in enumerate(models.items()):
                     is_right = right(elevation, luck) and not (half and luck < 0.5)
                     values: dict[str, Value] = {
-                        "object": described(config.object), **({"answer": described(answer)} if answer else {}),
-                        "model": described(name), "camera.elevation": described(elevation, "degrees"),
-                    }  # fmt: skip
+                        "object": described(config.object),
+                        **({"answer": described(answer)} if answer else {}),
+                        "model": described(name),
+                        "camera.elevation": described(elevation, "degrees"),
+                    }
                     rows.append(
                         Row("sweep", place * len(models) + model, correct=is_right, values=values, seconds=0.25,
                             margin=1.0 if is_right else -1 - luck, label="mug" if is_right else "bowl")

@@ -42,9 +42,10 @@ def stored(path: Path, wrong: Any, rows: int = 600, model: str = "reference", se
             elevation, power = generator.uniform(5.0, 85.0), generator.uniform(0.0, 2.0)
             is_wrong = bool(wrong(elevation)) ^ (generator.random() < 0.03)
             values = {
-                "camera.elevation": described(elevation, "degrees"), "light.power": described(power, "1"),
+                "camera.elevation": described(elevation, "degrees"),
+                "light.power": described(power, "1"),
                 "model": described("reference"),
-            }  # fmt: skip
+            }
             label = "bowl" if is_wrong else "mug"
             made.append(Row("sweep", step, correct=not is_wrong, margin=0.5, label=label, values=values))
         run.append_rows(*made, *(Row("verification", step, correct=False, label="bowl") for step in range(20)))

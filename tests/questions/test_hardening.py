@@ -195,9 +195,11 @@ def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -
         save_lesson_images(run, 1, pupils()[:2], ["wine glass", "mug"])
     pictures = tmp_path / "run" / IMAGE_DIRECTORY
     assert sorted(one.relative_to(pictures).as_posix() for one in pictures.glob("*/*")) == [
-        "0000-wine-glass/001-00000-plain.png", "0000-wine-glass/001-00000-worst.png", "0001-mug/001-00001-plain.png",
+        "0000-wine-glass/001-00000-plain.png",
+        "0000-wine-glass/001-00000-worst.png",
+        "0001-mug/001-00001-plain.png",
         "0001-mug/001-00001-worst.png",
-    ]  # fmt: skip
+    ]
     with tarfile.open(pictures.with_suffix(".tar")) as tar:
         names = tar.getnames()
         assert [name.rpartition(".")[2] for name in names] == ["png", "cls", "json"] * 4

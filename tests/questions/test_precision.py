@@ -204,9 +204,15 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
 ) -> None:
     folder = tmp_path / "run"
     config = PrecisionConfig(
-        object="mug", controls={"environment.rotation": {}}, samplers="independent", resolution=(8, 8), seconds=1.0,
-        rounds=3, threads=1, run=str(folder),
-    )  # fmt: skip
+        object="mug",
+        controls={"environment.rotation": {}},
+        samplers="independent",
+        resolution=(8, 8),
+        seconds=1.0,
+        rounds=3,
+        threads=1,
+        run=str(folder),
+    )
     stopped = precision.run(config, progress=Stop("gradient of environment: references"))
     assert stopped.ending == "interrupted" and {one.quantity for one in stopped.points} == {"picture", "margin"}
     kept = read_result(folder)

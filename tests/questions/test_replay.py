@@ -134,8 +134,15 @@ def test_photographs_are_counted_where_the_clean_scene_is_right() -> None:
 def test_a_texture_of_a_room_is_tried_in_photographs(tmp_path: Path) -> None:
     folder = samples.write_photograph_folder(tmp_path / "desk", set={"ground.size": 0.0})
     box = str(samples.PHOTOGRAPHS / "models" / "obj_000002.ply")
-    settings = {"object": box, "unit": "mm", "label": "mug", "controls": {"texture": {"epsilon": 0.8}}, "steps": 8,
-                "resolution": 48, "spp": 4}  # fmt: skip
+    settings = {
+        "object": box,
+        "unit": "mm",
+        "label": "mug",
+        "controls": {"texture": {"epsilon": 0.8}},
+        "steps": 8,
+        "resolution": 48,
+        "spp": 4,
+    }
     in_room = {"environment": "room", "set": {"camera.azimuth": 40.0}, "over": {"camera": {"roll": [0, 9]}}}
     in_photograph = {"backdrop": str(folder / "000001.jpg")}
     transfers = []

@@ -23,9 +23,11 @@ def planted(law: str, seed: int = 0, rows: int = 2000) -> pd.DataFrame:
     numbers = generator.uniform((5.0, 0.0, 0.0, 1.0, 0.0), (85.0, 2.0, 360.0, 4.0, 3.0), (rows, 5))
     elevation, power, yaw, distance, colour = numbers.T
     wrong = {
-        "dim from above": (elevation > 60.0) & (power < 0.8), "red": colour >= 2.0,
-        "either but not both": (yaw > 180.0) != (distance > 2.5), "none": np.zeros(rows, dtype=bool),
-    }[law]  # fmt: skip
+        "dim from above": (elevation > 60.0) & (power < 0.8),
+        "red": colour >= 2.0,
+        "either but not both": (yaw > 180.0) != (distance > 2.5),
+        "none": np.zeros(rows, dtype=bool),
+    }[law]
     names = np.array(["blue", "green", "red"])[colour.astype(int)]
     values = {"camera.elevation": elevation, "light.power": power, "pose.yaw": yaw, "camera.distance": distance}
     return seen({**values, "colour": names}, ~(wrong ^ (generator.random(rows) < NOISE)))
@@ -79,9 +81,11 @@ def around(law: str, seed: int, rows: int = 2000) -> pd.DataFrame:
     azimuth, distance = generator.uniform((0.0, 5.0), (360.0, 60.0), (rows, 2)).T
     aside = np.abs((azimuth + 90.0) % 180.0 - 90.0)
     wrong = {
-        "in front": (azimuth > 335.0) | (azimuth < 25.0), "end-on": aside < 20.0,
-        "end-on and far": (aside < 30.0) & (distance > 30.0), "none": np.zeros(rows, dtype=bool),
-    }[law]  # fmt: skip
+        "in front": (azimuth > 335.0) | (azimuth < 25.0),
+        "end-on": aside < 20.0,
+        "end-on and far": (aside < 30.0) & (distance > 30.0),
+        "none": np.zeros(rows, dtype=bool),
+    }[law]
     values = {"camera.azimuth": azimuth, "camera.distance": distance}
     return seen(values, ~(wrong ^ (generator.random(rows) < NOISE)), of={"camera.azimuth": "degrees"})
 

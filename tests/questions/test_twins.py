@@ -47,9 +47,12 @@ class RedOrBlue(nn.Module):
 def compared(tmp_path_factory: pytest.TempPathFactory) -> TwinsResult:
     model = advsearch.load_model(RedOrBlue(), labels=["cup", "box"], input_size=32)
     result: TwinsResult = advsearch.twins(
-        PHOTOGRAPHS / "photographs.csv", network=model, environment="studio", spp=4,
+        PHOTOGRAPHS / "photographs.csv",
+        network=model,
+        environment="studio",
+        spp=4,
         run=str(tmp_path_factory.mktemp("twins") / "run"),
-    )  # fmt: skip
+    )
     return result
 
 
@@ -213,9 +216,14 @@ def test_sweep_gate_and_evidence_state_what_the_run_of_twins_measured(tmp_path: 
     """Of one run of two models: the row of the model and its environment, and how it is put into words."""
     model = "small_models:easy"
     twins = advsearch.twins(
-        PHOTOGRAPHS / "photographs.csv", model=f"small_models:blind,{model}", environment="studio", spp=1, pictures=24,
-        names={"obj_000001": "mug", "obj_000002": "vase"}, run=str(tmp_path / "twins"),
-    )  # fmt: skip
+        PHOTOGRAPHS / "photographs.csv",
+        model=f"small_models:blind,{model}",
+        environment="studio",
+        spp=1,
+        pictures=24,
+        names={"obj_000001": "mug", "obj_000002": "vase"},
+        run=str(tmp_path / "twins"),
+    )
     blind, row = (row for row in twins.table if row.surroundings == "studio" and not row.object and not row.condition)
     # it says the same to all, and half of the photographs are of a mug
     assert (blind.model, blind.agreement.value, blind.wrong_photos, row.model) == ("blind", 1.0, 6, "easy")
@@ -289,9 +297,22 @@ def make_row(frame: str, photo_right: bool, twin_right: bool) -> TwinRow:
         for name, right in (("photograph", photo_right), ("room", twin_right))
     ]
     return TwinRow(
-        number=0, model="m", photograph="", frame=frame, object="cup", label="cup", condition="", window=(0, 0, 1, 1),
-        size=1.0, brightness=0.0, contrast=0.0, texture=None, visible=None, overlap=None, predictions=predictions,
-    )  # fmt: skip
+        number=0,
+        model="m",
+        photograph="",
+        frame=frame,
+        object="cup",
+        label="cup",
+        condition="",
+        window=(0, 0, 1, 1),
+        size=1.0,
+        brightness=0.0,
+        contrast=0.0,
+        texture=None,
+        visible=None,
+        overlap=None,
+        predictions=predictions,
+    )
 
 
 def test_rates_are_counted_by_hand() -> None:

@@ -151,10 +151,16 @@ def test_summaries_of_other_types_are_named(
 
 
 DAMAGED = [
-    "", "[1]", "command: [1]\n", "command: attack\nobject: [1]\n", "command: attack\nobject: mug\ncontrols: 3\n",
-    "command: attack\nobject: mug\nseed: 0b_\n", "command: attack\nobject: mug\nbase: /dev/zero\n",
-    "command: attack\nobject: mug\nset: [1]\nsteps: x\n", "\0",
-]  # fmt: skip
+    "",
+    "[1]",
+    "command: [1]\n",
+    "command: attack\nobject: [1]\n",
+    "command: attack\nobject: mug\ncontrols: 3\n",
+    "command: attack\nobject: mug\nseed: 0b_\n",
+    "command: attack\nobject: mug\nbase: /dev/zero\n",
+    "command: attack\nobject: mug\nset: [1]\nsteps: x\n",
+    "\0",
+]
 
 
 @pytest.mark.medium

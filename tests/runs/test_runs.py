@@ -111,8 +111,10 @@ def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> Non
         store.append([Row("sweep", 4, label="first", id=5), Row("sweep", 1, id=2)])
         store.append([Row("sweep", 4, label="late", id=5), Row("sweep", 0, id=1), Row("verification", 4)])
         assert [(row.id, row.step, row.label) for row in store.rows("sweep")] == [
-            (1, 0, None), (2, 1, None), (5, 4, "first"),
-        ]  # fmt: skip
+            (1, 0, None),
+            (2, 1, None),
+            (5, 4, "first"),
+        ]
         assert store.count_rows() == 4
         assert list(store.find_missing_steps("sweep", 8)) == [range(2, 4), range(5, 8)]
         assert list(store.find_missing_steps("sweep", 6)) == [range(2, 4), range(5, 6)]
@@ -243,10 +245,12 @@ def test_a_run_that_fails_later_keeps_what_it_has(tmp_path: Path, keep: str) -> 
 
 
 GONE_ON: dict[str, Callable[[RunDirectory], object]] = {
-    "record": lambda run: run.append_rows(Row("search", 1)), "write_summary": lambda run: run.write_summary(attack()),
+    "record": lambda run: run.append_rows(Row("search", 1)),
+    "write_summary": lambda run: run.write_summary(attack()),
     "forget": lambda run: run.store.delete_cached(),
-    "create": lambda run: RunDirectory.create(run.path / "parts" / "00"), "nothing": lambda run: None,
-}  # fmt: skip
+    "create": lambda run: RunDirectory.create(run.path / "parts" / "00"),
+    "nothing": lambda run: None,
+}
 
 
 @pytest.mark.parametrize("what", GONE_ON)
@@ -327,10 +331,11 @@ def test_a_bad_disk_is_said_and_leaves_nothing(
     with monkeypatch.context() as broken:
         broken.setattr("os.replace", _raises(number))
         writes: list[Callable[[], object]] = [
-            lambda: run.save_image("clean", np.zeros((4, 4, 3))), lambda: run.save_exr("clean", np.zeros((4, 4, 3))),
+            lambda: run.save_image("clean", np.zeros((4, 4, 3))),
+            lambda: run.save_exr("clean", np.zeros((4, 4, 3))),
             lambda: run.save_animation("search", [np.zeros((4, 4, 3))]),
             lambda: run.write_summary(attack(ending="new")),
-        ]  # fmt: skip
+        ]
         for write in writes:
             with pytest.raises(StorageError, match=named):
                 write()

@@ -50,9 +50,10 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Told:
 
 
 ROWS = (
-    Row("search", 0, objective=1.0, success=False), Row("search", 1, objective=2.0, success=True),
+    Row("search", 0, objective=1.0, success=False),
+    Row("search", 1, objective=2.0, success=True),
     Row("baseline", 0, objective=-1.0),
-)  # fmt: skip
+)
 
 
 def run_of(path: Path, log: str) -> None:
@@ -65,10 +66,14 @@ def run_of(path: Path, log: str) -> None:
 def test_tensorboard_is_told(tmp_path: Path, told: Told) -> None:
     run_of(tmp_path / "run", "tensorboard")
     assert told == [
-        ("open", str(tmp_path / "run/artifacts/tensorboard")), ("scalar", "search/objective", 1.0, 0),
-        ("scalar", "search/success", 0.0, 0), ("scalar", "search/objective", 2.0, 1),
-        ("scalar", "search/success", 1.0, 1), ("scalar", "baseline/objective", -1.0, 0), ("close",),
-    ]  # fmt: skip
+        ("open", str(tmp_path / "run/artifacts/tensorboard")),
+        ("scalar", "search/objective", 1.0, 0),
+        ("scalar", "search/success", 0.0, 0),
+        ("scalar", "search/objective", 2.0, 1),
+        ("scalar", "search/success", 1.0, 1),
+        ("scalar", "baseline/objective", -1.0, 0),
+        ("close",),
+    ]
 
 
 def test_mlflow_is_told(tmp_path: Path, told: Told) -> None:
@@ -78,17 +83,20 @@ def test_mlflow_is_told(tmp_path: Path, told: Told) -> None:
     assert told[2:] == [
         ("log_metrics", {"search/objective": 1.0, "search/success": 0.0}, ("step", 0)),
         ("log_metrics", {"search/objective": 2.0, "search/success": 1.0}, ("step", 1)),
-        ("log_metrics", {"baseline/objective": -1.0}, ("step", 0)), ("end_run",),
-    ]  # fmt: skip
+        ("log_metrics", {"baseline/objective": -1.0}, ("step", 0)),
+        ("end_run",),
+    ]
 
 
 def test_wandb_is_told(tmp_path: Path, told: Told) -> None:
     run_of(tmp_path / "run", "wandb")
     assert told == [
-        ("init", "run", "mug"), ("log", {"search/objective": 1.0, "search/success": 0.0, "search/step": 0}),
+        ("init", "run", "mug"),
+        ("log", {"search/objective": 1.0, "search/success": 0.0, "search/step": 0}),
         ("log", {"search/objective": 2.0, "search/success": 1.0, "search/step": 1}),
-        ("log", {"baseline/objective": -1.0, "baseline/step": 0}), ("finish",),
-    ]  # fmt: skip
+        ("log", {"baseline/objective": -1.0, "baseline/step": 0}),
+        ("finish",),
+    ]
 
 
 @pytest.mark.parametrize("when", ["start_run", "log_metrics", "end_run"])

@@ -335,9 +335,10 @@ def test_a_pixel_between_two_depths_is_hidden_by_its_part() -> None:
     """Two of four points of the object are hidden, and one of the two of the ground in the next pixel."""
     infinite = math.inf
     surfaces = SimpleNamespace(
-        names=("ground", "object"), z_depth=torch.tensor([[2.0, 2.0, 3.0, infinite], [2.0, 2.0, 3.0, infinite]]),
+        names=("ground", "object"),
+        z_depth=torch.tensor([[2.0, 2.0, 3.0, infinite], [2.0, 2.0, 3.0, infinite]]),
         visible_mask=lambda name: torch.tensor([[False, False, True, False]] * 2),
-    )  # fmt: skip
+    )
     depth = torch.tensor([[1.0, infinite, 1.0, 1.0], [1.0, 1.99, 2.98, 1.0]])
     front = compute_front(surfaces, depth, 2, 1)  # type: ignore[arg-type]
     # the second pixel has no point of the object, and the first none of the ground
@@ -375,12 +376,18 @@ def test_hostile_depths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.npy").write_text("no array")
     write_photograph(tmp_path / "coloured.png", (12, 16))
     messages = {
-        "deep.png": "metres of a level behind its name", "deep.png#1000": "depths of 0 to 100000 metres, got 700000",
-        "negative.npy": "depths of 0 to", "objects.npy": "an array .height, width. of numbers",
-        "minus.npy": "an array .height, width. of numbers", "small.npy": "depths of 16 x 12 pixels",
-        "huge.npy": "at most", "cut.npy": "another length", "text.npy": "corrupt or of another version",
-        "coloured.png#0.001": "one depth for each pixel", "missing.npy": "expected a picture of depth",
-    }  # fmt: skip
+        "deep.png": "metres of a level behind its name",
+        "deep.png#1000": "depths of 0 to 100000 metres, got 700000",
+        "negative.npy": "depths of 0 to",
+        "objects.npy": "an array .height, width. of numbers",
+        "minus.npy": "an array .height, width. of numbers",
+        "small.npy": "depths of 16 x 12 pixels",
+        "huge.npy": "at most",
+        "cut.npy": "another length",
+        "text.npy": "corrupt or of another version",
+        "coloured.png#0.001": "one depth for each pixel",
+        "missing.npy": "expected a picture of depth",
+    }
     for name, message in messages.items():
         with pytest.raises(InputError, match=message):
             load_description("mug").with_backdrop(tmp_path / "a.png", tmp_path / name)

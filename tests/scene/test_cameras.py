@@ -289,9 +289,10 @@ def test_a_searched_lens_is_the_fixed_one_and_has_a_derivative() -> None:
 
 BARREL = "barrel of a file"
 BOXED = {
-    BARREL: {"camera.distance": 1.05}, "fisheye": {"camera.distance": 0.85},
+    BARREL: {"camera.distance": 1.05},
+    "fisheye": {"camera.distance": 0.85},
     "equirectangular": {"camera.distance": 0.85},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("camera", list(BOXED))

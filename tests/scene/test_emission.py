@@ -119,9 +119,12 @@ def both_ways(scene: SceneDescription, lamp: str, seen: str) -> tuple[torch.Tens
 
 
 WAYS = {
-    "one radiance": (None, UNIT), "a texture": (stripes(), UNIT), "mirrored": (stripes(), UNIT * [-1, 1] + [1, 0]),
-    "repeated": (stripes(), UNIT * 2.0), "shared": (stripes(), np.array([[0, 0], [1, 0], [1, 1], [1, 0.0]])),
-}  # fmt: skip
+    "one radiance": (None, UNIT),
+    "a texture": (stripes(), UNIT),
+    "mirrored": (stripes(), UNIT * [-1, 1] + [1, 0]),
+    "repeated": (stripes(), UNIT * 2.0),
+    "shared": (stripes(), np.array([[0, 0], [1, 0], [1, 1], [1, 0.0]])),
+}
 
 
 @pytest.mark.medium

@@ -225,17 +225,22 @@ def test_values_that_are_not_light(tmp_path: Path, value: float) -> None:
 
 LINE = HEADER + b"-Y 8 +X 16\n"
 BAD: dict[str, tuple[str, bytes]] = {
-    "empty": ("bad.hdr", b""), "png as hdr": ("bad.hdr", b"\x89PNG\r\n\x1a\n\0"), "hdr as exr": ("bad.exr", HEADER),
-    "noise as hdr": ("bad.hdr", np.random.default_rng(0).bytes(2000)), "cut exr": ("bad.exr", exr()[:-100]),
-    "no blue": ("bad.exr", exr(names="RG")), "cut hdr header": ("bad.hdr", b"#?RADIANCE\nFORMAT=32-"),
+    "empty": ("bad.hdr", b""),
+    "png as hdr": ("bad.hdr", b"\x89PNG\r\n\x1a\n\0"),
+    "hdr as exr": ("bad.exr", HEADER),
+    "noise as hdr": ("bad.hdr", np.random.default_rng(0).bytes(2000)),
+    "cut exr": ("bad.exr", exr()[:-100]),
+    "no blue": ("bad.exr", exr(names="RG")),
+    "cut hdr header": ("bad.hdr", b"#?RADIANCE\nFORMAT=32-"),
     "xyz": ("bad.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 8 +X 16\n"),
     "escapes": ("bad.hdr", b"#?RADIANCE\nFORMAT=\x1b[31m\n\n-Y 8 +X 16\n"),
-    "rotated": ("bad.hdr", HEADER + b"+X 16 +X 8\n"), "huge": ("bad.hdr", HEADER + b"-Y 99999 +X 99999\n"),
+    "rotated": ("bad.hdr", HEADER + b"+X 16 +X 8\n"),
+    "huge": ("bad.hdr", HEADER + b"-Y 99999 +X 99999\n"),
     "cut runs": ("bad.hdr", LINE + run_lengths(rgbe(8, 16))[:-1]),
     "cut pixels": ("bad.hdr", LINE + rgbe(8, 16).tobytes()[:-9]),
     "run too long": ("bad.hdr", LINE + b"\2\2\0\x10" + b"\xff\x10" * 60),
     "repeat of nothing": ("bad.hdr", LINE + b"\1\1\1\4" * 200),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -275,9 +275,11 @@ def reference(light: np.ndarray, u: float, v: float, wraps: tuple[int, int], *, 
 
 
 NAMED = {
-    "attribute": ("_CUSTOM", "COLOR_1", "TEXCOORD_3", "TANGENT"), "entry of a material": ("shininess", "extras"),
-    "entry of a sampler": ("anisotropy",), "extension": ("KHR_materials_sheen", "KHR_materials_unlit", "ACME_glitter"),
-}  # fmt: skip
+    "attribute": ("_CUSTOM", "COLOR_1", "TEXCOORD_3", "TANGENT"),
+    "entry of a material": ("shininess", "extras"),
+    "entry of a sampler": ("anisotropy",),
+    "extension": ("KHR_materials_sheen", "KHR_materials_unlit", "ACME_glitter"),
+}
 EVENLY = some.floats(0.0, 1.0, width=32)
 
 

@@ -505,10 +505,16 @@ def test_bad_files(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str])
 
 
 REFERENCES = {
-    "above": "../secret.png", "absolute": "{outside}/secret.png", "through a link": "link.png",
-    "through a linked folder": "folder/secret.png", "a device": "/dev/zero", "a pipe": "pipe.png",
-    "a directory": "inside", "a long name": "n" * 5000 + ".png", "an escape sequence": "\x1b[31m.png",
-}  # fmt: skip
+    "above": "../secret.png",
+    "absolute": "{outside}/secret.png",
+    "through a link": "link.png",
+    "through a linked folder": "folder/secret.png",
+    "a device": "/dev/zero",
+    "a pipe": "pipe.png",
+    "a directory": "inside",
+    "a long name": "n" * 5000 + ".png",
+    "an escape sequence": "\x1b[31m.png",
+}
 
 
 @pytest.mark.parametrize("case", REFERENCES)

@@ -135,9 +135,13 @@ def test_where_light_can_be_predicted(controls: Any, options: dict[str, Any], ca
 
 
 SEARCH: dict[str, Any] = {
-    "controls": {"light": {"power": [0, 12]}}, "resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8,
+    "controls": {"light": {"power": [0, 12]}},
+    "resolution": SIZE,
+    "trials": 6,
+    "steps": 18,
+    "verify_spp": 8,
     "baseline": False,
-}  # fmt: skip
+}
 
 
 @pytest.mark.medium

@@ -101,7 +101,9 @@ SHAPES = {
     "bumps": mesh(
         "slab.obj",
         bsdf(
-            "bumpmap", picture("height", "four.png", RAW), '<float name="scale" value="0.05"/>',
+            "bumpmap",
+            picture("height", "four.png", RAW),
+            '<float name="scale" value="0.05"/>',
             bsdf("diffuse", picture(more=to_uv('<scale value="2"/>'))),
         ),
     ),
@@ -135,7 +137,7 @@ SHAPES = {
         for kind in ("sphere", "cylinder", "cube", "rectangle")
     },
     "red sphere": solid("sphere", bsdf("twosided", bsdf("diffuse", RED))),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")

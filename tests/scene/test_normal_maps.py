@@ -82,10 +82,13 @@ def corner() -> trimesh.Trimesh:
 
 
 WAYS: dict[str, Callable[[], Any]] = {
-    "as it is": card, "mirrored": lambda: card(UNIT * [-1, 1] + [1, 0]),
-    "turned": lambda: card(np.roll(UNIT, 1, axis=0)), "half of it mirrored": lambda: halves(True, 0.7),
-    "two materials, one mirrored": lambda: halves(True, 0.69), "a corner of the picture": corner,
-}  # fmt: skip
+    "as it is": card,
+    "mirrored": lambda: card(UNIT * [-1, 1] + [1, 0]),
+    "turned": lambda: card(np.roll(UNIT, 1, axis=0)),
+    "half of it mirrored": lambda: halves(True, 0.7),
+    "two materials, one mirrored": lambda: halves(True, 0.69),
+    "a corner of the picture": corner,
+}
 
 
 def written(made: Any, folder: Path) -> Path:

@@ -111,11 +111,12 @@ def loss(scene: Scene, controls: dict[str, dict[str, object]]) -> tuple[float, f
 @pytest.mark.parametrize(
     "controls",
     [
-        {"environment": {"rotation": [0.0, 90.0]}}, {"environment": {"tint_red": [0.5, 1.5]}},
+        {"environment": {"rotation": [0.0, 90.0]}},
+        {"environment": {"tint_red": [0.5, 1.5]}},
         {"light": {"power": [0.2, 2.0]}},
     ],
     ids=["rotation", "tint", "light"],
-)  # fmt: skip
+)
 def test_derivatives_reach_the_floor(controls: dict[str, dict[str, object]]) -> None:
     adjoint, difference = loss(load_scene("mug", room()), controls)
     assert adjoint == pytest.approx(difference, rel=GRADIENT_TOLERANCE)

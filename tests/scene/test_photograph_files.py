@@ -178,9 +178,10 @@ def test_a_folder_is_bounded_and_other_files_are_left_alone(
     assert list(read_photograph_folder(copy)) == NAMES
     assert read_photograph_view(copy / "other.jpg").spec == str(copy / "other.jpg"), "it has no camera file"
     for limit, value, words in (
-        ("MAX_PHOTOGRAPHS", 5, "at most 5 photographs"), ("MAX_FILES", 9, "a folder of at most 9 files"),
+        ("MAX_PHOTOGRAPHS", 5, "at most 5 photographs"),
+        ("MAX_FILES", 9, "a folder of at most 9 files"),
         ("MAX_FOLDER_PIXELS", 30_000, "photographs of at most 30,000 pixels"),
-    ):  # fmt: skip
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(photograph_files, limit, value)
             with pytest.raises(FileFormatError, match=words):

@@ -58,8 +58,10 @@ def box(name: str, low: tuple[float, float, float], high: tuple[float, float, fl
             for a, b in square if side else square[::-1]:
                 corner = [0.0, 0.0, 0.0]
                 corner[axis], corner[across[0]], corner[across[1]] = (
-                    bounds[side, axis], bounds[a, across[0]], bounds[b, across[1]],
-                )  # fmt: skip
+                    bounds[side, axis],
+                    bounds[a, across[0]],
+                    bounds[b, across[1]],
+                )
                 corners.append(corner)
                 normals.append((np.eye(3)[axis] * (2 * side - 1)).tolist())
             first = len(corners) - 4
@@ -77,9 +79,10 @@ def street(tmp_path: Path) -> Path:
     folder = tmp_path / "my-street"
     folder.mkdir()
     shapes = [
-        box("road", (-40, -8, -0.5), (40, 8, 0), 0.3), box("house", (-10, 5, 0), (10, 9, 6), 0.6),
+        box("road", (-40, -8, -0.5), (40, 8, 0), 0.3),
+        box("house", (-10, 5, 0), (10, 9, 6), 0.6),
         box("lamp", (3.8, -4.2, 3), (4.2, -3.8, 3.1), 0.8),
-    ]  # fmt: skip
+    ]
     (folder / "street.glb").write_bytes(encode_glb(shapes))
     sky = np.full((16, 32, 3), 0.8, np.float32)
     sky[8:] = 0.2
@@ -202,9 +205,11 @@ def test_a_variant_keeps_the_name_of_what_it_changes_as_a_whole(street: Path) ->
     grey, white = np.full(3, 0.4, np.float32), np.full(3, 0.9, np.float32)
     dull = Material(roughness=0.9)
     looks = {
-        "road": Look(grey, dull), "wet-road": Look(grey, Material(roughness=0.1, specular=0.6, clearcoat=0.5)),
-        "house": Look(grey, dull), "snow": Look(white, dull),
-    }  # fmt: skip
+        "road": Look(grey, dull),
+        "wet-road": Look(grey, Material(roughness=0.1, specular=0.6, clearcoat=0.5)),
+        "house": Look(grey, dull),
+        "snow": Look(white, dull),
+    }
     nodes = [
         Node([Primitive(road, "road", {"wet": "wet-road"})]),
         Node([Primitive(walls, "house"), Primitive(roof, "house", {"snow": "snow"})]),

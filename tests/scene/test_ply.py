@@ -170,9 +170,12 @@ VERTEX = {
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.lists(st.sampled_from(sorted(VERTEX)), unique=True), st.lists(st.integers(3, 9), min_size=1, max_size=5),
-    st.sampled_from(sorted(ORDERS)), st.booleans(), st.integers(0, 2**32 - 1),
-)  # fmt: skip
+    st.lists(st.sampled_from(sorted(VERTEX)), unique=True),
+    st.lists(st.integers(3, 9), min_size=1, max_size=5),
+    st.sampled_from(sorted(ORDERS)),
+    st.booleans(),
+    st.integers(0, 2**32 - 1),
+)
 def test_whatever_a_file_has_is_read_or_named(
     tmp_path_factory: pytest.TempPathFactory, groups: list[str], sides: list[int], kind: str, wedge: bool, seed: int
 ) -> None:

@@ -19,8 +19,10 @@ SIDE = 64
 
 def renderer_of(drops: int, controls: Any = None, **settings: float) -> Any:
     given = {
-        "camera.drops": drops, "camera.drop_size": 3.0, **{f"camera.{name}": one for name, one in settings.items()},
-    }  # fmt: skip
+        "camera.drops": drops,
+        "camera.drop_size": 3.0,
+        **{f"camera.{name}": one for name, one in settings.items()},
+    }
     return advsearch.load_scene("mug", "noon", settings=given).renderer(controls or ["pose"], resolution=SIDE)
 
 

@@ -77,12 +77,18 @@ def holes() -> Image.Image:
 
 
 CASES: dict[str, tuple[str, Callable[[], bytes]]] = {
-    "unwelded": (".obj", unwelded), "non-manifold": (".obj", non_manifold), "tiny": (".obj", lambda: moved(1e-6, 0.0)),
-    "huge": (".obj", lambda: moved(1e6, 0.0)), "far from the origin": (".obj", lambda: moved(1.0, 1e6)),
-    "inverted": (".obj", inverted), "without normals": (".obj", lambda: moved(1.0, 0.0)),
-    "16 bits": (".glb", lambda: painted(deep())), "palette": (".glb", lambda: painted(palette())),
-    "cut-outs": (".glb", lambda: painted(holes(), "MASK")), "blended": (".glb", lambda: painted(holes(), "BLEND")),
-}  # fmt: skip
+    "unwelded": (".obj", unwelded),
+    "non-manifold": (".obj", non_manifold),
+    "tiny": (".obj", lambda: moved(1e-6, 0.0)),
+    "huge": (".obj", lambda: moved(1e6, 0.0)),
+    "far from the origin": (".obj", lambda: moved(1.0, 1e6)),
+    "inverted": (".obj", inverted),
+    "without normals": (".obj", lambda: moved(1.0, 0.0)),
+    "16 bits": (".glb", lambda: painted(deep())),
+    "palette": (".glb", lambda: painted(palette())),
+    "cut-outs": (".glb", lambda: painted(holes(), "MASK")),
+    "blended": (".glb", lambda: painted(holes(), "BLEND")),
+}
 """Ending and content."""
 
 

@@ -200,9 +200,11 @@ def test_a_picture_is_radiance_times_the_gain_through_the_curve() -> None:
     radiance = torch.tensor([[0.0, 0.1, 0.2]])
     light = 2.5 * radiance
     shown = {
-        "srgb": linear_to_srgb(light), "gamma": light.clamp_min(1e-6) ** (1.0 / 2.2),
-        "reinhard": linear_to_srgb(light / (1.0 + light)), "linear": light,
-    }  # fmt: skip
+        "srgb": linear_to_srgb(light),
+        "gamma": light.clamp_min(1e-6) ** (1.0 / 2.2),
+        "reinhard": linear_to_srgb(light / (1.0 + light)),
+        "linear": light,
+    }
     for transfer, expected in shown.items():
         assert torch.allclose(ImageFormation(gain=2.5, transfer=transfer).display(radiance), expected)
 

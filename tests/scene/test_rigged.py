@@ -84,9 +84,10 @@ def figure(weights: str = "f4", **header: Any) -> File:
     ]
     spline = np.stack([TANGENTS[:, 0], SHIFTS, TANGENTS[:, 1]], axis=1).reshape(-1, 3)
     held = [
-        (UPPER, "rotation", TURNS, "LINEAR"), (UPPER, "scale", SCALES, "STEP"),
+        (UPPER, "rotation", TURNS, "LINEAR"),
+        (UPPER, "scale", SCALES, "STEP"),
         (3, "translation", spline, "CUBICSPLINE"),
-    ]  # fmt: skip
+    ]
     held.append((0, "weights", SHARES[:, None], "LINEAR"))
     at = file.values(TIMES[:, None])
     file.header["animations"] = [{

@@ -229,9 +229,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @settings(max_examples=40, deadline=None)
 @given(
-    chosen(STATEMENTS), chosen(MATERIAL_LINES), chosen(OPTIONS), st.sampled_from(["", " # so", "\t#1"]),
+    chosen(STATEMENTS),
+    chosen(MATERIAL_LINES),
+    chosen(OPTIONS),
+    st.sampled_from(["", " # so", "\t#1"]),
     st.sampled_from(["\n", "\r\n"]),
-)  # fmt: skip
+)
 def test_whatever_a_file_has_is_read_or_named(
     folder: Path, statements: list[str], lines: list[str], options: list[str], comment: str, newline: str
 ) -> None:

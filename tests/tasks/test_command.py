@@ -22,11 +22,20 @@ from advsearch.tasks.command import Command
 
 SIDE = 24
 ASKED: dict[str, Any] = {
-    "name": "command", "state": {"speed": 2}, "envelope": 0.4, "names": "yaw rate", "units": "rad/s",
-}  # fmt: skip
+    "name": "command",
+    "state": {"speed": 2},
+    "envelope": 0.4,
+    "names": "yaw rate",
+    "units": "rad/s",
+}
 QUICK: dict[str, Any] = {
-    "resolution": SIDE, "spp": 4, "verify_spp": 4, "trials": 12, "measure": "no", "denoise": "none",
-}  # fmt: skip
+    "resolution": SIDE,
+    "spp": 4,
+    "verify_spp": 4,
+    "trials": 12,
+    "measure": "no",
+    "denoise": "none",
+}
 
 
 class TowardsBlue(nn.Module):

@@ -138,8 +138,10 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     (found,) = task.judge(output, truth)
     score = 0.8 * (objectness or 1.0)
     assert found.right and astuple(found.prediction) == (
-        names[cup(classes)], cup(classes), pytest.approx(score, abs=1e-4),
-    )  # fmt: skip
+        names[cup(classes)],
+        cup(classes),
+        pytest.approx(score, abs=1e-4),
+    )
     best: Any = found.payload
     assert best["found"][0]["box"] == pytest.approx(CUP, abs=0.1)
     assert task.inferred_order == order and task.inferred_unit == ("fractions" if "RT-DETR" in form else "pixels")
@@ -230,9 +232,11 @@ def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
     numbers = first(grid(torch.full((1, 3, 100, 100), 0.25), 3, None))
     nodes = [
         make.make_node("ReduceMean", ["images"], ["mean"], axes=[1, 2, 3], keepdims=0),
-        make.make_node("Mul", ["mean", "little"], ["add"]), make.make_node("Unsqueeze", ["add", "ends"], ["wide"]),
-        make.make_node("Add", ["grid", "wide"], ["sum"]), make.make_node("Clip", ["sum", "zero"], ["output0"]),
-    ]  # fmt: skip
+        make.make_node("Mul", ["mean", "little"], ["add"]),
+        make.make_node("Unsqueeze", ["add", "ends"], ["wide"]),
+        make.make_node("Add", ["grid", "wide"], ["sum"]),
+        make.make_node("Clip", ["sum", "zero"], ["output0"]),
+    ]
     constants = [
         onnx.numpy_helper.from_array(numbers.numpy(), "grid"),
         onnx.numpy_helper.from_array(torch.tensor([1e-5]).numpy(), "little"),

@@ -35,12 +35,19 @@ def test_rows_are_found_by_words_and_by_rules(browser: Browser, tmp_path: Path) 
     with opened(browser, (run / "report.html").as_uri(), 390, bypass_csp=True) as page:
         page.wait_for_selector("[data-cell]")
         counts = {
-            "cup": 6, "noon": 12, "noon mug": 6, "environment noon": 12, f"environment noon or {HOSTILE}": 24,
+            "cup": 6,
+            "noon": 12,
+            "noon mug": 6,
+            "environment noon": 12,
+            f"environment noon or {HOSTILE}": 24,
             "camera.elevation over 30 degrees": 12,
             "camera.elevation over 5 and at most 30 degrees and pose.yaw over 40": 8,
-            "pose.yaw from 340 to 20 degrees": 8, "pose.yaw from 340 to 20 or from 80 to 100 degrees": 16,
-            "environment noon and camera.elevation over 30 degrees": 6, "7": 1, "(nothing [is called so": 0,
-        }  # fmt: skip
+            "pose.yaw from 340 to 20 degrees": 8,
+            "pose.yaw from 340 to 20 or from 80 to 100 degrees": 16,
+            "environment noon and camera.elevation over 30 degrees": 6,
+            "7": 1,
+            "(nothing [is called so": 0,
+        }
         assert {text: sought(page, text) for text in counts} == counts
         assert page.locator(".card").count() == 0
         assert sought(page, "environment noon and camera.elevation over 30 degrees") == 6

@@ -25,11 +25,14 @@ BALL = Block(40, "linf", 0.1, name="texture")
 CHOICE = Block(1, options=4, name="backdrop")
 
 DOMAINS = {
-    "box": (Block(2, low=0.25, high=0.75),), "pose": POSE, "choice": (CHOICE,),
-    "choices and numbers": (CHOICE, Block(2), Block(1, options=2)), "many": (Block(30),),
+    "box": (Block(2, low=0.25, high=0.75),),
+    "pose": POSE,
+    "choice": (CHOICE,),
+    "choices and numbers": (CHOICE, Block(2), Block(1, options=2)),
+    "many": (Block(30),),
     "texture and pose": (BALL, *POSE, CHOICE),
     "pose between balls": (Block(5, "l2", 0.2), Block(2, periodic=True), BALL),
-}  # fmt: skip
+}
 
 
 def domain_of(blocks: tuple[Block, ...], cost: int = 0, free: bool = False) -> Domain:
@@ -165,9 +168,11 @@ def hills(rng: np.random.Generator, d: int) -> Callable[[np.ndarray], float]:
 
 
 FUNCTIONS: dict[str, Callable[[np.random.Generator, int], Callable[[np.ndarray], float]]] = {
-    "peak": peak, "hills": hills, "broad waves": lambda rng, d: waves(rng, d, 0.35 * math.sqrt(d)),
+    "peak": peak,
+    "hills": hills,
+    "broad waves": lambda rng, d: waves(rng, d, 0.35 * math.sqrt(d)),
     "pixel-scale roughness": lambda rng, d: waves(rng, d, 0.03 * math.sqrt(d)),
-}  # fmt: skip
+}
 
 
 def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:

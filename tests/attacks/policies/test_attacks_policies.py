@@ -136,9 +136,14 @@ def test_pgd_starts_at_the_start_and_steps_by_a_fraction_of_epsilon() -> None:
     problem = linear(50, "linf", seed=0)
     seen: list[Tensor] = []
     search(
-        problem.evaluator(), problem.domain, PGD(step_size=0.25), steps=2, seed=0, candidates=0,
+        problem.evaluator(),
+        problem.domain,
+        PGD(step_size=0.25),
+        steps=2,
+        seed=0,
+        candidates=0,
         on_step=lambda record, u, evaluation: seen.append(u),
-    )  # fmt: skip
+    )
     assert torch.equal(seen[0], problem.domain.start)
     assert float((seen[1] - seen[0]).abs().max()) == pytest.approx(0.025, abs=1e-6)
 
@@ -370,9 +375,14 @@ def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
     seen: list[Tensor] = []
     domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
     search(
-        partial(map, evaluate), domain, PGD(step_size=0.125, momentum=0.0), steps=40, seed=0, candidates=0,
+        partial(map, evaluate),
+        domain,
+        PGD(step_size=0.125, momentum=0.0),
+        steps=40,
+        seed=0,
+        candidates=0,
         on_step=lambda record, u, evaluation: seen.append(u),
-    )  # fmt: skip
+    )
     returned = [k for k in range(3, 40) if float(seen[k][0]) < float(seen[k - 1][0]) - 1e-6]
     assert returned, "it never went back"
     assert float((seen[returned[0]] - seen[2]).abs().max()) <= 0.4 * 0.125 + 1e-6

@@ -18,9 +18,14 @@ def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor
         return Evaluation(float(query.u @ slope), slope.clone() if query.gradient else None, False)
 
     search(
-        partial(map, evaluate), domain, policy, steps=steps, seed=0, candidates=0,
+        partial(map, evaluate),
+        domain,
+        policy,
+        steps=steps,
+        seed=0,
+        candidates=0,
         on_step=lambda record, u, evaluation: seen.append(u),
-    )  # fmt: skip
+    )
     return seen
 
 

@@ -68,8 +68,10 @@ MIXED = Domain(
     torch.full((5,), 0.25), tuple(Block(1, name=f"number {k}", options=6 if k == 2 else 0) for k in range(5))
 )
 SCENES: dict[str, tuple[Domain, Callable[[Tensor], float]]] = {
-    "ball": (BOX, ball), "corner": (BOX, corner), "choice": (MIXED, choice),
-}  # fmt: skip
+    "ball": (BOX, ball),
+    "corner": (BOX, corner),
+    "choice": (MIXED, choice),
+}
 """Closed forms whose failures are rare: beside the two numbers of a cell the others have to be right."""
 
 

@@ -41,9 +41,14 @@ def test_only_ranks_matter(policy: Policy[Any]) -> None:
     def played(change: Callable[[float], float]) -> Tensor:
         seen: list[Tensor] = []
         search(
-            evaluator(lambda u: change(bowl(0.6)(u))), domain, policy, steps=60, seed=0, candidates=0,
+            evaluator(lambda u: change(bowl(0.6)(u))),
+            domain,
+            policy,
+            steps=60,
+            seed=0,
+            candidates=0,
             on_step=lambda record, u, evaluation: seen.append(u),
-        )  # fmt: skip
+        )
         return torch.stack(seen)
 
     assert torch.equal(played(lambda v: v), played(lambda v: 1e6 * math.exp(50.0 * v)))
@@ -128,9 +133,14 @@ def test_samples_come_in_mirrored_pairs() -> None:
     domain = Domain(torch.full((3,), 0.5), (Block(3),))
     seen: list[Tensor] = []
     search(
-        evaluator(bowl(0.5)), domain, NES(sigma=0.1, population=4), steps=4, seed=0, candidates=0,
+        evaluator(bowl(0.5)),
+        domain,
+        NES(sigma=0.1, population=4),
+        steps=4,
+        seed=0,
+        candidates=0,
         on_step=lambda record, u, evaluation: seen.append(u),
-    )  # fmt: skip
+    )
     assert torch.allclose(seen[0] + seen[1], torch.ones(3), atol=1e-6)
     assert torch.allclose(seen[2] + seen[3], torch.ones(3), atol=1e-6)
     assert not torch.allclose(seen[0], seen[2])

@@ -33,9 +33,14 @@ def flat(query: Query) -> Evaluation:
 def points(policy: Policy[Any], domain: Domain, steps: int, seed: int = 0) -> tuple[Tensor, SearchResult]:
     seen: list[Tensor] = []
     result = search(
-        partial(map, flat), domain, policy, steps=steps, seed=seed, candidates=0,
+        partial(map, flat),
+        domain,
+        policy,
+        steps=steps,
+        seed=seed,
+        candidates=0,
         on_step=lambda record, u, evaluation: seen.append(u),
-    )  # fmt: skip
+    )
     return torch.stack(seen), result
 
 

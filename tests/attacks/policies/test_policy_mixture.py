@@ -17,10 +17,12 @@ from advsearch.attacks.evaluation import limit_to_single_thread
 BOX = Domain(
     torch.full((4,), 0.5),
     (
-        Block(1, name="yaw", periodic=True), Block(1, name="height"), Block(1, name="light"),
+        Block(1, name="yaw", periodic=True),
+        Block(1, name="height"),
+        Block(1, name="light"),
         Block(1, name="kind", options=4),
     ),
-)  # fmt: skip
+)
 Margin = Callable[[Tensor], Tensor]
 """Over 0 where the model is wrong."""
 

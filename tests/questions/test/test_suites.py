@@ -65,10 +65,11 @@ def written(folder: Path, claims: dict[str, Any], **more: Any) -> str:
 
 
 CLAIMS = {
-    "in-front": claim("right", at_least=0.5, pictures=20), "behind": claim("right", BACK, at_least=0.5, pictures=20),
+    "in-front": claim("right", at_least=0.5, pictures=20),
+    "behind": claim("right", BACK, at_least=0.5, pictures=20),
     "too-few": claim("no_worse", than=EASY, points=20, pictures=9),
     "no-worse": claim("no_worse", than=HARD, points=40, pictures=20),
-}  # fmt: skip
+}
 
 
 GOOD = CLAIMS["in-front"]

@@ -48,10 +48,15 @@ class Setup:
 
     def adjoint(self, cotangent: Tensor, seed: int = 0, **options: Any) -> tuple[Tensor, Tensor]:
         gradients = material_adjoint(
-            self.scene, self.scene.sensors()[0], self.parameters,
-            {"object.vertices": self.vertices, "object.normals": self.normals}, cotangent=cotangent, seed=seed,
-            max_depth=self.depth, **{"spp": SPP, **options},
-        )  # fmt: skip
+            self.scene,
+            self.scene.sensors()[0],
+            self.parameters,
+            {"object.vertices": self.vertices, "object.normals": self.normals},
+            cotangent=cotangent,
+            seed=seed,
+            max_depth=self.depth,
+            **{"spp": SPP, **options},
+        )
         return gradients["object.vertices"], gradients["object.normals"]
 
     def difference(self, cotangent: Tensor, move: Callable[[float], tuple[Tensor, Tensor]], step: float) -> float:
@@ -87,11 +92,12 @@ def build(
             "sampler": {"type": "independent"},
         },
         "sky": {
-            "type": "envmap", "bitmap": mi.Bitmap(load_environment("overcast").radiance),
+            "type": "envmap",
+            "bitmap": mi.Bitmap(load_environment("overcast").radiance),
             "to_world": place().rotate([1, 0, 0], 90),
         },
         "object": mesh,
-    }  # fmt: skip
+    }
     if ground:
         diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
         plugins["ground"] = {"type": "rectangle", "to_world": place().scale(10.0), "bsdf": diffuse}

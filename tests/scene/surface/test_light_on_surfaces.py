@@ -144,9 +144,10 @@ def test_what_is_seen_of_a_photographed_room_is_its_map() -> None:
 
 
 STRANGE = {
-    "inside": {"distance": 0.0, "elevation": 1.0}, "close": {"distance": 0.02, "elevation": 0.0},
+    "inside": {"distance": 0.0, "elevation": 1.0},
+    "close": {"distance": 0.02, "elevation": 0.0},
     "far": {"distance": 1.0},
-}  # fmt: skip
+}
 
 
 @pytest.mark.medium
