@@ -377,6 +377,21 @@ def fit_labels(
     raise FileFormatError(message) if origin.is_file else InputError(message)
 
 
+def _order_by_index(name_by_index: dict[str, Any], where: str) -> list[Any]:
+    """Return the values of a JSON object whose keys are the indices 0, 1, ...
+
+    `where` is the beginning of an error. Raises FileFormatError for other keys.
+    """
+    indices = list(map(str, range(len(name_by_index))))
+    last_index = len(name_by_index) - 1
+    if set(name_by_index) != set(indices):
+        raise FileFormatError(
+            f"{where}: expected the {len(name_by_index)} keys to be the "
+            f"indices 0 to {last_index}, each once"
+        )
+    return [name_by_index[index] for index in indices]
+
+
 def _read_file(path: Path) -> tuple[str, ...]:
     """Read label names from a JSON or text file; see `read_labels`."""
     where = f"label file {path}"
@@ -406,14 +421,7 @@ def _read_file(path: Path) -> tuple[str, ...]:
                 f"{where}: expected label names, got {error}"
             ) from None
     if isinstance(names, dict):
-        indices = list(map(str, range(len(names))))
-        last = len(names) - 1
-        if set(names) != set(indices):
-            raise FileFormatError(
-                f"{where}: expected the {len(names)} keys to be the "
-                f"indices 0 to {last}, each once"
-            )
-        names = [names[index] for index in indices]
+        names = _order_by_index(names, where)
     if not isinstance(names, list):
         raise FileFormatError(
             f"{where}: expected a list of names or an object from index to name"

@@ -405,6 +405,29 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
     return None
 
 
+def _check_processor(source: Source, options: Mapping[str, Any]) -> None:
+    """Raise InputError for options that repeat what a source's processor does."""
+    if not source.processor:
+        return
+    for key in ("mean", "std", "value_range", "channels"):
+        if key in options:
+            raise InputError(
+                f"{key}: model {source.name} has a processor that does "
+                "all of this; leave it out"
+            )
+
+
+def _parse_choice(key: str, value: object, choices: tuple[str, ...]) -> str:
+    """Return the choice that the value of an option names, in any case.
+
+    Raises InputError if it is none of them.
+    """
+    choice = str(value).strip().upper()
+    if choice not in choices:
+        raise InputError(f"{key}: expected one of {', '.join(choices)}, got {value!r}")
+    return choice
+
+
 def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preprocessing:
     """Create the preprocessing from options, else from what the source states.
 
@@ -415,13 +438,7 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
     Raises:
         InputError: an option is out of range, or the source's processor excludes it.
     """
-    if source.processor:
-        for key in ("mean", "std", "value_range", "channels"):
-            if key in options:
-                raise InputError(
-                    f"{key}: model {source.name} has a processor that does "
-                    "all of this; leave it out"
-                )
+    _check_processor(source, options)
     fields: dict[str, Any] = {
         "mean": source.mean,
         "std": source.std,
@@ -446,11 +463,7 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
         _check_eight_bit(source.name, fields, options)
     for key, choices in (("layout", ("NCHW", "NHWC")), ("channels", ("RGB", "BGR"))):
         if key in options:
-            fields[key] = str(options[key]).strip().upper()
-            if fields[key] not in choices:
-                raise InputError(
-                    f"{key}: expected one of {', '.join(choices)}, got {options[key]!r}"
-                )
+            fields[key] = _parse_choice(key, options[key], choices)
     # What is empty has the default of `Preprocessing`.
     return Preprocessing(**{key: value for key, value in fields.items() if value})
 
