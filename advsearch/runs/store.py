@@ -220,11 +220,11 @@ class Store:
 
         Only rows with an id larger than `after` are read.
         """
-        condition, parameters = (
-            ("id > ?", [after])
-            if kind is None
-            else ("id > ? AND kind = ?", [after, kind])
-        )
+        condition = "id > ?"
+        parameters: list[int | str] = [after]
+        if kind is not None:
+            condition += " AND kind = ?"
+            parameters.append(kind)
         for values in self._select(
             f"{', '.join(_COLUMNS)} FROM evaluations WHERE {condition} ORDER BY id",
             *parameters,
@@ -247,18 +247,13 @@ class Store:
         there is no such row, or the run is done and that was deleted.
         """
         row = self.read_row(kind, step)
-        values = (
-            None
-            if row is None
-            else next(
-                self._select(f"{_CACHED_COLUMNS} FROM told WHERE row = ?", row.id), None
-            )
-        )
-        return (
-            None
-            if row is None or values is None
-            else (row, _decode_cached(values, self.path))
-        )
+        if row is None:
+            return None
+        cached_rows = self._select(f"{_CACHED_COLUMNS} FROM told WHERE row = ?", row.id)
+        values = next(cached_rows, None)
+        if values is None:
+            return None
+        return row, _decode_cached(values, self.path)
 
     def iterate_images(
         self, kind: str, after: int, until: int
