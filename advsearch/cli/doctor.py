@@ -354,9 +354,9 @@ def check_reference_weights() -> Component:
     """The weights and labels of the bundled classifier."""
     folder = resources.files("advsearch.models") / "data"
     absent = [
-        n
-        for n in ("reference.safetensors", "reference.json")
-        if not folder.joinpath(n).is_file()
+        name
+        for name in ("reference.safetensors", "reference.json")
+        if not folder.joinpath(name).is_file()
     ]
     if absent:
         fix = "reinstall advsearch; in a checkout: git restore advsearch/models/data"

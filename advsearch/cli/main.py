@@ -294,10 +294,8 @@ def group_commands() -> dict[str, list[str]]:
         for title, group in GROUPS.items()
     }
     known = {name for group in groups.values() for name in group}
-    # the first group
-    next(iter(groups.values())).extend(
-        name for name in EXPERIMENTS if name not in known
-    )
+    first_group = next(iter(groups.values()))
+    first_group.extend(name for name in EXPERIMENTS if name not in known)
     return groups
 
 

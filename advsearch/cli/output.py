@@ -334,9 +334,10 @@ def align_columns(rows: Sequence[Sequence[str]]) -> str:
     """Return lines with the cells of `rows` in aligned columns; rows may have fewer
     cells than others.
     """
+    n_columns = max(map(len, rows), default=0)
     widths = [
-        max(len(row[i]) for row in rows if i < len(row))
-        for i in range(max(map(len, rows), default=0))
+        max(len(row[column]) for row in rows if column < len(row))
+        for column in range(n_columns)
     ]
     return "\n".join(
         (

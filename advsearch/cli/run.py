@@ -60,7 +60,7 @@ def parse_changes(words: Sequence[str]) -> dict[str, object]:
         InputError: a word is no such assignment.
     """
     changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
-    # the nested mapping that dotted names stand for
+    # The nested mapping that dotted names stand for. What a person types may name code.
     typed = dict[str, object]()
     for name, value in changes.items():
         set_dotted(typed, name, value)

@@ -326,7 +326,8 @@ def show_pictures(files: Sequence[Path]) -> None:
         if draw is not None:
             try:
                 draw(file)
-            except Exception as error:  # whatever a terminal answers, the path is said
+            # whatever a terminal answers, the paths of the pictures are printed
+            except Exception as error:
                 draw = None
                 why = (
                     f"The pictures could not be drawn here: {type(error).__name__}: "

@@ -158,7 +158,8 @@ def _find_basin(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float] |
     """
     corner, cell, ground = _compute_height_map(mesh)
     water = _fill_with_water(ground)
-    # connected cells with water; 0 is dry, basins count from 1
+    # Connected cells with water; 0 is dry, basins count from 1. A film of less than a
+    # thousandth of the object is dry as well.
     labels, count = ndimage.label(water - ground > 1e-3)
     if count == 0:
         return None
@@ -245,7 +246,8 @@ def _fill_with_water(ground: assets.Float64Array) -> assets.Float64Array:
         )
         lowest = np.minimum.reduce(neighbors)
         level = np.maximum(ground[1:-1, 1:-1], np.minimum(lowest, water[1:-1, 1:-1]))
-        if np.array_equal(level, water[1:-1, 1:-1]):
+        has_settled = np.array_equal(level, water[1:-1, 1:-1])
+        if has_settled:
             return water
         water[1:-1, 1:-1] = level
 
@@ -442,7 +444,9 @@ class ContentsControl(Control):
             )
         angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        # a disk in the texture, off its edges
         uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * circle])
+        # at half the height, from which `scene_inputs` gives offsets
         vertices = _liquid_surface(vessel, torch.tensor(0.5)).numpy()
         mesh = replace(
             parts.make_polygon(WALL_DIRECTIONS),
@@ -485,6 +489,7 @@ class ContentsControl(Control):
         """Return the offsets, the pose and the color of the liquid's surface."""
         vessel = find_interior(self.scene.object)
         assert vessel is not None  # see `prepare`
+        # the mesh as `prepare` has made it
         base = _liquid_surface(vessel, torch.full_like(values["level"], 0.5))
         surface = _liquid_surface(vessel, values["level"])
         inputs = {f"{self.name}.offsets": surface - base}

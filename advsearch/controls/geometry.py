@@ -111,14 +111,14 @@ class WeldedMesh:
         dimensions. A pair is a wall if the normals are opposite enough and the distance
         is not too large, nor 0.
         """
-        scaled_normals = 0.1 * self.extent * self.normals
+        scaled_normals = 0.1 * self.extent * self.normals  # b n
         tree = cKDTree(np.hstack([self.positions, scaled_normals]))
         partner = tree.query(np.hstack([self.positions, -scaled_normals]))[1]
         distance = np.linalg.norm(self.positions - self.positions[partner], axis=1)
         cosine = (self.normals * self.normals[partner]).sum(axis=1)
         is_wall = (
             (cosine < MAX_OPPOSITE_COSINE)
-            & (distance > 1e-5 * self.extent)
+            & (distance > 1e-5 * self.extent)  # not 0
             & (distance < MAX_WALL_DISTANCE * self.extent)
         )
         position = np.flatnonzero(is_wall)

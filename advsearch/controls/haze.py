@@ -103,6 +103,7 @@ class HazeControl(Control):
                     renamed if part is scene_haze else part for part in scene.parts
                 ),
             )
+        # from the origin, the center of the ball
         camera_distance = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
         return scene.with_part(
             parts.HazePart(

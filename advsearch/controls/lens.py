@@ -201,6 +201,7 @@ def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Te
     squared_distance = y_offset[:, :, None] ** 2 + x_offset[:, None, :] ** 2
     in_radii = squared_distance / values["radius"][:, None, None] ** 2
     falloff = values["falloff"]
+    # beyond it the exponential is 0, and its derivative would not be finite
     max_in_radii = float(_MAX_EXPONENT ** (1.0 / falloff.detach()))
     # not 0, where a power has no derivative
     fading = torch.exp(-(in_radii.clamp(1e-12, max_in_radii) ** falloff))

@@ -408,20 +408,19 @@ def _thread_tones(
 def leopard(grid: Grid) -> Float64Array:
     """Paint rosettes with dots between them.
 
-    The last argument of `_scattered` is a seed; other numbers are chosen by eye,
-    lengths in tiles.
+    Numbers are chosen by eye, lengths in tiles.
     """
     warped = _warped(
         _warped(grid, cells=4, amount=0.03, seed=51), cells=12, amount=0.012, seed=52
     )
-    points = _scattered(42, 53)
+    points = _scattered(count=42, seed=53)
     distance, index = _cells(warped, points)
     rosettes, core = _draw_rosettes(warped, points, distance[..., 0], index[..., 0])
     fur = _clouds(grid, cells=(24, 90), octaves=2, seed=55)
     shade = 0.5 + 0.5 * _clouds(grid, cells=(3, 3), octaves=2, seed=56)
     coat = _mix(_color("d8a861"), _color("e7c58c"), shade)
     coat = _mix(coat, _color("a9692f"), 0.75 * core)
-    dot_distance, _ = _cells(warped, _scattered(150, 57), 1)
+    dot_distance, _ = _cells(warped, _scattered(count=150, seed=57), 1)
     between_rosettes = _step(distance[..., 0], edge=0.07, soft=0.012)
     dots = 1.0 - _step(
         dot_distance.reshape(TILE_SIDE, TILE_SIDE), edge=0.011, soft=0.006

@@ -559,6 +559,7 @@ class PatchPainter:
         They are connected to it, and their faces look to the side of the normal.
         """
         is_face_near = self._surface.find_region(face, point, normal, radius)
+        # a texel belongs to a face
         connected = np.flatnonzero(is_face_near[self._faces])
         offsets = self._positions[connected] - point
         is_close = (offsets**2).sum(axis=1) <= radius**2
@@ -717,7 +718,7 @@ def _rasterise_finely(
     and is doubled as often as needed, as long as it stays within the largest.
 
     Args:
-        mesh: the object's.
+        mesh: mesh of the object.
         texture_side: longer side of its own texture, texels.
         pixel_size: side of a pixel, object sizes.
     """
@@ -725,6 +726,7 @@ def _rasterise_finely(
     first_side = max(min_side, texture_side)
     charts = images.rasterize_charts(mesh, first_side)
     areas = charts.compute_areas()
+    # side of a usual texel of the first map, in object sizes
     spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
     map_side = first_side
     while 2 * map_side <= max_side and spacing * first_side / map_side > pixel_size:

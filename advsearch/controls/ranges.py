@@ -165,6 +165,7 @@ class DistributionRange(Range):
         """
         lower = 0.0
         upper = 1.0
+        # 60 halvings go beyond the precision of a float
         for _ in range(60):
             middle = 0.5 * (lower + upper)
             probability = (
@@ -284,6 +285,7 @@ def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
     if low - FULL_TURN >= parameter.low:
         begin = low - FULL_TURN
         end = high
+    # where the shorter range crosses the full turn, as an angle within it
     through = 0 if begin <= 0 else FULL_TURN
     return (
         f"write [{begin:g}, {end:g}] for the {FULL_TURN - low + high:g} "
@@ -357,7 +359,7 @@ def _count_repeats(probabilities: Sequence[float]) -> list[int]:
             abs(candidate * probability - round(candidate * probability))
             for probability in probabilities
         ]
-        if max(errors) < 1e-9:
+        if max(errors) < 1e-9:  # whole but for rounding
             total = candidate
             break
     cumulated_counts = [

@@ -212,7 +212,8 @@ def apply_mosaic(light: Tensor) -> Tensor:
     red = (1 - rows) * (1 - columns)
     blue = rows * columns
     is_measured = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
-    # Bilinear weights; divided by the weight of the pixels that have the channel.
+    # Bilinear weights. A sum of neighbors is divided by the weight of those that have
+    # the channel.
     kernel = light.new_tensor(
         [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
     ).expand(3, 1, 3, 3)

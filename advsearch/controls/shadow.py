@@ -136,7 +136,8 @@ class ShadowControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Add the card, out of sight."""
-        texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
+        # a dark grey texture, the same everywhere
+        texels = np.full((2, 2, 3), 0.1, dtype=np.float32)
         hidden_pose = geometry.make_hidden_pose(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
@@ -145,7 +146,7 @@ class ShadowControl(Control):
             parts.MeshPart(
                 self.name,
                 card,
-                texel,
+                texels,
                 assets.Material(roughness=1.0),
                 to_world=hidden_pose,
             )

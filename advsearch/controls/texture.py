@@ -537,16 +537,18 @@ def _quantise_colors(
     colors = image.reshape(-1, 3).double().numpy()
     weights = weight.reshape(-1).astype(np.float64)
     levels = (colors * 31.0).round().astype(np.int64)
-    cells, cell_of = np.unique(levels, axis=0, return_inverse=True)
-    cell_of = cell_of.reshape(-1)
-    total = np.bincount(cell_of, weights=weights, minlength=len(cells))
+    cells, cell_index = np.unique(levels, axis=0, return_inverse=True)
+    cell_index = cell_index.reshape(-1)
+    cell_weight = np.bincount(cell_index, weights=weights, minlength=len(cells))
     sums = [
-        np.bincount(cell_of, weights=weights * colors[:, channel], minlength=len(cells))
+        np.bincount(
+            cell_index, weights=weights * colors[:, channel], minlength=len(cells)
+        )
         for channel in range(3)
     ]
-    has_weight = total > 0.0
-    points = np.stack(sums, axis=1)[has_weight] / total[has_weight, None]
-    return points, np.sqrt(total[has_weight])
+    has_weight = cell_weight > 0.0
+    points = np.stack(sums, axis=1)[has_weight] / cell_weight[has_weight, None]
+    return points, np.sqrt(cell_weight[has_weight])
 
 
 def _choose_first_centers(
@@ -560,8 +562,11 @@ def _choose_first_centers(
     """
     chosen = [int(mass.argmax())]
     while len(chosen) < min(count, len(points)):
-        squared = ((points[:, None] - points[chosen]) ** 2).sum(axis=-1).min(axis=1)
-        if not squared.max() > 0.0:
+        # of each point from the nearest chosen one
+        squared_distance = (
+            ((points[:, None] - points[chosen]) ** 2).sum(axis=-1).min(axis=1)
+        )
+        if not squared_distance.max() > 0.0:
             break
-        chosen.append(int((mass * squared).argmax()))
+        chosen.append(int((mass * squared_distance).argmax()))
     return chosen

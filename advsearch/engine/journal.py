@@ -453,22 +453,7 @@ class Journal:
             )
         if cached.non_finite:
             self.problem.renderer.non_finite += cached.non_finite
-        gradient = None
-        if cached.gradient is not None:
-            gradient = torch.from_numpy(cached.gradient.copy())
-        image = None
-        if cached.picture is not None:
-            # stored with 8 bits
-            image = torch.from_numpy(cached.picture.copy()).float() / 255.0
-        return Evaluation(
-            objective=math.nan if row.objective is None else row.objective,
-            gradient=gradient,
-            success=bool(row.success),
-            non_finite=cached.non_finite,
-            cost=cached.cost,
-            judgement=None if row.correct is None else read_judgement(row),
-            picture=image,
-        )
+        return _restore_evaluation(row, cached)
 
     def store(
         self,
@@ -664,3 +649,23 @@ def compute_digest(u: Tensor) -> bytes:
     """Return 16 bytes that identify a configuration (d,) by all its bits."""
     array = np.ascontiguousarray(u.detach().numpy())
     return hashlib.blake2b(array.tobytes(), digest_size=16).digest()
+
+
+def _restore_evaluation(row: Row, cached: CachedEvaluation) -> Evaluation:
+    """Return a search's evaluation from its row and what is stored beside it."""
+    gradient = None
+    if cached.gradient is not None:
+        gradient = torch.from_numpy(cached.gradient.copy())
+    image = None
+    if cached.picture is not None:
+        # stored with 8 bits
+        image = torch.from_numpy(cached.picture.copy()).float() / 255.0
+    return Evaluation(
+        objective=math.nan if row.objective is None else row.objective,
+        gradient=gradient,
+        success=bool(row.success),
+        non_finite=cached.non_finite,
+        cost=cached.cost,
+        judgement=None if row.correct is None else read_judgement(row),
+        picture=image,
+    )

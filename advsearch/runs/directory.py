@@ -234,8 +234,9 @@ class RunDirectory:
         Raises:
             InputError: some are not, so that it would give other numbers.
         """
-        # the run was killed before it noted anything: it begins now
-        if self.store.read_note(SETTINGS_NOTE) is None:
+        # without settings, the run was killed before it noted anything: it begins now
+        has_settings = self.store.read_note(SETTINGS_NOTE) is not None
+        if not has_settings:
             if self.store.count_rows():
                 raise FileFormatError(
                     f"{self.store.path}: expected the settings the "
@@ -243,6 +244,7 @@ class RunDirectory:
                 )
             self._note_start(config)
             return
+        # a file that only the beginning of a run reads may have changed since
         read_again = {
             name: value
             for name, value in _known_settings(config).items()
@@ -507,6 +509,7 @@ def find_run(run: str | Path, *, checked: bool = True) -> Path:
         UnknownNameError: there is no such run.
         FileFormatError: it has links in it (`check_links`).
     """
+    # a path comes before a name of the same text
     for path in (Path(run).expanduser(), locate_run(run)):
         folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):
@@ -603,7 +606,8 @@ def _make_numbered_directory(default: str) -> Path:
             for path in HOME.iterdir()
             if (match := pattern.fullmatch(path.name))
         ]
-        # another process may take a number between listing and mkdir
+        # Another process may take a number between listing and mkdir: then the next one
+        # is tried.
         for number in itertools.count(max(used_numbers, default=0) + 1):
             path = HOME / f"{default}-{number:03d}"
             try:

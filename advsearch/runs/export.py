@@ -120,12 +120,11 @@ def iterate_values(
     entry is a mapping with value and unit, or the value alone.
     """
     for name, entry in values.items():
-        value, unit = (
-            (entry.get("value"), entry.get("unit"))
-            if isinstance(entry, Mapping)
-            else (entry, None)
-        )
-        unit = str(unit or "")
+        value: Any = entry
+        unit = ""
+        if isinstance(entry, Mapping):
+            value = entry.get("value")
+            unit = str(entry.get("unit") or "")
         if isinstance(value, (list, tuple)):
             yield from (
                 (f"{name}[{index}]", component, unit)
@@ -155,7 +154,7 @@ def _write_csv(
             for name, value in _encode_payload(record).items()
         }
         writer.writerow(cells)
-    # or the stream would be closed with the wrapper
+    # the stream stays open when the wrapper is deleted
     text.detach()
 
 
@@ -334,6 +333,7 @@ def _import_values(record: JsonObject, render_args: JsonObject) -> dict[str, Val
     """Return the parameters of a line of 3DB's log by name; each number of a list has
     its index behind the name.
     """
+    # 3DB calls the object "model", and the model "network"
     values: dict[str, Value] = {
         "object": _make_value(record.get("model")),
         "environment": _make_value(record.get("environment")),

@@ -93,10 +93,9 @@ def is_results_database(path: Path) -> bool:
             header = file.read(72)
     except (OSError, FileFormatError):
         return False
-    # SQLite keeps the number of the application at byte 68
-    return header[:15] == b"SQLite format 3" and header[
-        68:72
-    ] == APPLICATION_ID.to_bytes(4, "big")
+    # SQLite keeps the number of the application in bytes 68 to 71
+    is_sqlite = header[:15] == b"SQLite format 3"
+    return is_sqlite and header[68:72] == APPLICATION_ID.to_bytes(4, "big")
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
@@ -133,6 +132,7 @@ def check_version(db: sqlite3.Connection, path: Path) -> None:
         created = db.execute("SELECT value FROM meta WHERE key = 'created'").fetchone()
         day = f", that of {str(created[0])[:10]}" if created else ""
     db.close()
+    # version 0 is SQLite's own, of a database in which nothing was set
     advice = (
         f"read it with the advsearch that wrote it{day}"
         if version
@@ -355,7 +355,8 @@ def _check_image_shape(array: Any) -> Any:
     Raises:
         ValueError: it has another shape.
     """
-    squeezed = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+    has_single_channel = array.ndim == 3 and array.shape[2] == 1
+    squeezed = array[..., 0] if has_single_channel else array
     if squeezed.ndim != 2 and not (squeezed.ndim == 3 and squeezed.shape[2] == 3):
         raise ValueError(
             f"expected a picture of shape (H, W, 3) or (H, W), got {tuple(array.shape)}"

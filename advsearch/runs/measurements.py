@@ -54,6 +54,7 @@ class Measurements:
         """
         stored = self.read(key)
         if stored is None:
+            # one measurement in each sitting, so that every one gets further
             if self.n_new and time.monotonic() >= self._end:
                 raise OutOfTime
             self.n_new += 1

@@ -124,18 +124,19 @@ class Result(Fields):
         """Return the fields that are declared with `as_fact`, as texts by their names;
         None and NaN are left out.
         """
-        found = {}
-        for name, about in self.described().items():
-            extra = about.json_schema_extra
+        facts = {}
+        for name, field in self.described().items():
+            extra = field.json_schema_extra
             value = getattr(self, name)
             if (
                 isinstance(extra, dict)
                 and "fact" in extra
                 and value is not None
-                and value == value
+                and value == value  # not NaN
             ):
-                found[name.replace("_", " ")] = str(extra["fact"]).format(value)
-        return found
+                # as_fact has a format, such as "{:.2f} s"
+                facts[name.replace("_", " ")] = str(extra["fact"]).format(value)
+        return facts
 
     @property
     def is_unfinished(self) -> bool:

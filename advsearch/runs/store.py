@@ -177,21 +177,9 @@ class Store:
             with self._db:
                 self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
                 if cached is not None:
-                    arrays = [
-                        None if array is None else array.tobytes()
-                        for array in (cached.gradient, cached.picture)
-                    ]
-                    height = None if cached.picture is None else len(cached.picture)
-                    search_values = (
-                        cached.number,
-                        cached.u,
-                        cached.non_finite,
-                        cached.cost,
-                        *arrays,
-                        height,
-                    )
+                    row = rows[-1]
                     self._db.execute(
-                        _INSERT_CACHED, (*search_values, rows[-1].kind, rows[-1].step)
+                        _INSERT_CACHED, (*_encode_cached(cached), row.kind, row.step)
                     )
         if must_sync:
             end_time = time.monotonic()
@@ -220,11 +208,11 @@ class Store:
 
         Only rows with an id larger than `after` are read.
         """
-        condition, parameters = (
-            ("id > ?", [after])
-            if kind is None
-            else ("id > ? AND kind = ?", [after, kind])
-        )
+        condition = "id > ?"
+        parameters: list[int | str] = [after]
+        if kind is not None:
+            condition += " AND kind = ?"
+            parameters.append(kind)
         for values in self._select(
             f"{', '.join(_COLUMNS)} FROM evaluations WHERE {condition} ORDER BY id",
             *parameters,
@@ -247,18 +235,13 @@ class Store:
         there is no such row, or the run is done and that was deleted.
         """
         row = self.read_row(kind, step)
-        values = (
-            None
-            if row is None
-            else next(
-                self._select(f"{_CACHED_COLUMNS} FROM told WHERE row = ?", row.id), None
-            )
-        )
-        return (
-            None
-            if row is None or values is None
-            else (row, _decode_cached(values, self.path))
-        )
+        if row is None:
+            return None
+        cached_rows = self._select(f"{_CACHED_COLUMNS} FROM told WHERE row = ?", row.id)
+        values = next(cached_rows, None)
+        if values is None:
+            return None
+        return row, _decode_cached(values, self.path)
 
     def iterate_images(
         self, kind: str, after: int, until: int
@@ -377,6 +360,26 @@ _FIELDS = tuple(field.name for field in fields(Row))
 _ENCODED_FIELDS = _FIELDS[:-2]  # without the time and the id
 _SIMPLE = frozenset({str, int, bool, type(None)})
 _JSON = json.JSONEncoder(allow_nan=False)
+
+
+def _encode_cached(cached: CachedEvaluation) -> tuple[Any, ...]:
+    """Return what an evaluation told its search as the values of its columns.
+
+    Arrays become their bytes; the height of the picture tells their shape.
+    """
+    arrays = [
+        None if array is None else array.tobytes()
+        for array in (cached.gradient, cached.picture)
+    ]
+    height = None if cached.picture is None else len(cached.picture)
+    return (
+        cached.number,
+        cached.u,
+        cached.non_finite,
+        cached.cost,
+        *arrays,
+        height,
+    )
 
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:

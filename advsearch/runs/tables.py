@@ -101,6 +101,7 @@ class Units:
         Args:
             image_index: number of the picture in the whole sweep, or an array of them.
         """
+        # from `again` on, the same pictures come once more
         if self.again:
             image_index = image_index % self.again
         image_index = image_index // self.noise

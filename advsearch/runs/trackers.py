@@ -108,7 +108,7 @@ class Tracker:
             if values:
                 metrics[f"{kind}/{name}"] = sum(values) / len(values)
         is_right = [row.correct for row in rows if row.correct is not None]
-        # right rows and judged rows so far
+        # [right rows, judged rows] of the kind so far
         counts = self._accuracy_counts[kind]
         counts[0] += sum(is_right)
         counts[1] += len(is_right)

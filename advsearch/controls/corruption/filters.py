@@ -83,18 +83,23 @@ def blur_gaussian(image: Tensor, sigma: Tensor) -> Tensor:
 
     Edges are continued.
     """
+    # cut off at four standard deviations
     reach = max(1, math.ceil(4.0 * float(sigma.detach())))
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2)
     weights = weights / weights.sum()
     channels = image.shape[2]
     padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
-    rows = F.conv2d(
+    # A Gaussian is separable: first along columns, then along rows, each channel by
+    # itself.
+    blurred_down = F.conv2d(
         padded, weights.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels
     )
     return images.to_image(
         F.conv2d(
-            rows, weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels
+            blurred_down,
+            weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1),
+            groups=channels,
         )
     )
 
@@ -188,6 +193,7 @@ def sample_poisson(mean: Tensor, quantile: Tensor) -> Tensor:
     probability = torch.exp(-mean.double())
     total = probability.clone()
     count = torch.zeros_like(probability)
+    # far beyond any count with a mean of 80
     for candidate in range(1, 400):
         is_above = quantile > total
         if not bool(is_above.any()):
@@ -618,6 +624,7 @@ def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     rows, columns = compute_reference_size(height, width)
     mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]
     source = make_generator(seed, "snow")
+    # downwards, up to 45 degrees to either side
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
     noise = mean + spread * torch.randn(
         math.ceil(rows / flake_size),
@@ -628,6 +635,6 @@ def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     flakes = images.resized(noise, rows, columns)
     flakes = torch.where(flakes < threshold, torch.zeros_like(flakes), flakes)
     streaks = blur_along_line(
-        flakes, torch.tensor(radius), torch.tensor(sigma), angle, 1.0
+        flakes, torch.tensor(radius), torch.tensor(sigma), angle, step=1.0
     )
     return images.resized(streaks.clamp(0.0, 1.0), height, width)

@@ -118,6 +118,7 @@ class Waypoints:
         Returns:
             (...,) or (..., k).
         """
+        # of the waypoint after the time; the last one, if there is none after it
         index = torch.searchsorted(self.times, time.detach(), right=True)
         index = index.clamp(1, len(self.times) - 1)
         begin = self.times[index - 1]
@@ -1089,6 +1090,7 @@ def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> N
     is_missing = not set(required) <= names
     has_duplicates = len(names) < len(header)
     is_unknown = not names <= {*required, *optional}
+    # some columns of a group, but not all of them
     is_incomplete = any(
         0 < len(names.intersection(group)) < len(group)
         for group in (TARGET_COLUMNS, OBJECT_SHIFT_COLUMNS)

@@ -276,8 +276,9 @@ def _find_time_unit(
                 f"{reading.format_name(unit)}; correct the first line"
             )
         return unit
-    for least, unit in UNIT_BY_SIZE:
-        if abs(times[0]) >= least:
+    # A time since 1970 shows its unit by its size: nanoseconds are the largest numbers.
+    for min_time, unit in UNIT_BY_SIZE:
+        if abs(times[0]) >= min_time:
             notes.append(
                 f"{path}: its times do not state a unit; by their size they "
                 f"are read as {unit}."

@@ -148,9 +148,8 @@ class SpotControl(ProjectorControl):
         if parameter.name != "lumens":
             return super().resolve_parameter(parameter)
         std = DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.size_in_metres
-        area = (
-            2.0 * math.pi * std**2
-        )  # in which a Gaussian spot of peak 1 has its light
+        # the integral of a Gaussian spot of peak 1
+        area = 2.0 * math.pi * std**2
         max_lumens = min(
             DEFAULT_LUMENS,
             MAX_AMBIENT_FACTOR * float(self.get_clean_value("ambient")) * area,

@@ -125,17 +125,10 @@ def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     return loss
 
 
-def compare_with_reference(
-    estimate: GradientEstimate,
-    reference: Reference,
-    others: Sequence[Reference] = (),
-    probe: Probe | None = None,
-    spp: int = 0,
-) -> Measured:
-    """Return how good an estimate is along a probe.
-
-    Its status is the first of these that holds; doubt is `N_STANDARD_ERRORS` standard
-    errors of both values together:
+def _rate_estimate(
+    estimate: GradientEstimate, reference: Reference, size: float, doubt: float
+) -> GradientStatus:
+    """Return the first status that holds for an estimate.
 
     - "reference unusable": the reference's noise exceeds `MAX_NOISE`, and the error of
       the mean is within doubt;
@@ -143,9 +136,35 @@ def compare_with_reference(
     - "noisy": the estimate's noise exceeds `MAX_NOISE`;
     - "ok".
 
-    All are relative to a size: that of the reference, but at least `MIN_SIZE_FRACTION`
-    of the largest of `others`, since a derivative that happens to be near zero says
-    nothing about the size of errors that matter.
+    Args:
+        estimate: estimate to rate.
+        reference: reference of the same probe.
+        size: size to which the limits are relative.
+        doubt: difference of both values that may be due to their noise.
+    """
+    difference = abs(estimate.value - reference.value)
+    if difference <= doubt and reference.noise > MAX_NOISE * size:
+        return "reference unusable"
+    if difference > MAX_BIAS * size + doubt:
+        return "biased"
+    if estimate.noise > MAX_NOISE * size:
+        return "noisy"
+    return "ok"
+
+
+def compare_with_reference(
+    estimate: GradientEstimate,
+    reference: Reference,
+    others: Sequence[Reference] = (),
+    probe: Probe | None = None,
+    spp: int = 0,
+) -> Measured:
+    """Return how good an estimate is along a probe, see `_rate_estimate`.
+
+    Errors are relative to a size: that of the reference, but at least
+    `MIN_SIZE_FRACTION` of the largest of `others`, since a derivative that happens to
+    be near zero says nothing about the size of errors that matter. Doubt is
+    `N_STANDARD_ERRORS` standard errors of both values together.
 
     Args:
         estimate: estimate to rate.
@@ -159,15 +178,7 @@ def compare_with_reference(
     difference = abs(estimate.value - reference.value)
     estimate_error = estimate.noise / math.sqrt(max(1, estimate.repeats))
     doubt = N_STANDARD_ERRORS * math.hypot(estimate_error, reference.noise)
-    status: GradientStatus
-    if difference <= doubt and reference.noise > MAX_NOISE * size:
-        status = "reference unusable"
-    elif difference > MAX_BIAS * size + doubt:
-        status = "biased"
-    elif estimate.noise > MAX_NOISE * size:
-        status = "noisy"
-    else:
-        status = "ok"
+    status = _rate_estimate(estimate, reference, size, doubt)
 
     def relative(value: float) -> float:
         """Return a value in units of the size; of size 0, any value is infinite."""

@@ -147,8 +147,8 @@ def describe_marks(
     half_width = math.tan(math.radians(control.part.fov) / 2.0)
     lines = []
     for index, (row, column, x, y) in enumerate(marked_texels, 1):
-        # x and y are 0 to 1 from the upper left; -1 to 1 from the middle times half the
-        # width is the tangent
+        # x and y are 0 to 1 from the upper left. From the middle they are -1 to 1, which
+        # times half the width at distance 1 is the tangent of the angle.
         right = math.degrees(math.atan((2 * x - 1) * half_width))
         up = math.degrees(math.atan((1 - 2 * y) * half_width / control.part.aspect))
         lines.append(

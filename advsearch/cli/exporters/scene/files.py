@@ -91,6 +91,7 @@ def check_free(path: Path, out: Path) -> None:
     Raises:
         InputError: there is one already.
     """
+    # the files beside the XML have names that begin with its own
     candidates = [path]
     if path.parent.is_dir():
         candidates += path.parent.glob(f"{path.stem}-*")
