@@ -58,9 +58,10 @@ from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 results = [list(CONFIGS)]
 for words in json.loads(sys.argv[1]):
-    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as error:
+    out = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)  # tables are written as bytes
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(io.StringIO()) as error:
         status = main(words)
-    results.append([status, out.getvalue(), error.getvalue()])
+    results.append([status, out.buffer.getvalue().decode(), error.getvalue()])
 print(json.dumps(results))
 """
 
