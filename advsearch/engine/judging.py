@@ -46,7 +46,7 @@ from advsearch.scene.formation import Surfaces
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.things import ALL_THINGS
 from advsearch.tasks import Facts, Judgement, Task
-from advsearch.tasks.base import Output, Truth, mean
+from advsearch.tasks.base import Output, Prediction, Truth, mean
 from advsearch.tasks.together import Ensemble, EnsembleTask, Outputs, split_by_model
 from advsearch.trust.code import check_import, current_directory_importable
 
@@ -376,6 +376,18 @@ def calibrate_task(
     raise InputError(f"model {model.name}: {task.ambiguities}")
 
 
+def _get_unique_label(model: Model, prediction: Prediction) -> str:
+    """Return a label that names the predicted class and no other, such as "#504".
+
+    It is the name of the class if only this class has it, else its index.
+    """
+    # `label_set` raises for a name that no class has
+    with suppress(InputError):
+        if model.label_set(prediction.label).indices == (prediction.index,):
+            return prediction.label
+    return f"#{prediction.index}"
+
+
 def check_truth(
     task: Task,
     model: Model,
@@ -409,13 +421,7 @@ def check_truth(
             )
             for prediction in predictions
         )
-        first = predictions[0]
-        suggested_label = f"#{first.index}"
-        # The name instead, if it names this class and no other; `label_set` raises for
-        # a name that no class has.
-        with suppress(InputError):
-            if model.label_set(first.label).indices == (first.index,):
-                suggested_label = first.label
+        suggested_label = _get_unique_label(model, predictions[0])
         raise InputError(
             f"{error}; model {model.name} calls a clean picture of it "
             f"{prediction_texts}; name what is right, such as "

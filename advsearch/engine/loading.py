@@ -477,6 +477,28 @@ def _camera_setting(description: SceneDescription) -> str | None:
     return None if description.camera == ORBIT_CAMERA else description.camera
 
 
+def _fit_photographs(
+    description: SceneDescription,
+    photograph: BackdropPhotograph,
+    size: tuple[int, int],
+) -> SceneDescription:
+    """Return a scene fitted to a picture size in its photograph, and in any others.
+
+    Args:
+        description: the scene.
+        photograph: photograph that the scene is in.
+        size: height and width of the picture in pixels.
+    """
+    folder = description.photographs
+    if folder is not None:
+        fitted_scenes = {
+            name: fit_camera(scene, size) for name, scene in folder.scenes.items()
+        }
+        folder = replace(folder, scenes=fitted_scenes)
+    fitted = fit_to_photograph(description, photograph, size, description.gain)
+    return replace(fitted, photographs=folder)
+
+
 def fit_camera(
     description: SceneDescription, resolution: int | tuple[int, int]
 ) -> SceneDescription:
@@ -496,18 +518,8 @@ def fit_camera(
     height, width = _height_and_width(resolution)
     aspect = width / height
     if description.backdrop_photograph is not None:
-        size = (height, width)
-        folder = description.photographs
-        if folder is not None:
-            fitted_scenes = {
-                name: fit_camera(scene, size) for name, scene in folder.scenes.items()
-            }
-            folder = replace(folder, scenes=fitted_scenes)
-        return replace(
-            fit_to_photograph(
-                description, description.backdrop_photograph, size, description.gain
-            ),
-            photographs=folder,
+        return _fit_photographs(
+            description, description.backdrop_photograph, (height, width)
         )
     camera_model = description.camera_model
     remarks = description.remarks
