@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 from test_sweep import FakeRenderer
-from test_sweep_workers import Disorder, rows, summary
+from test_sweep_workers import Disorder, summary
 from torch import Tensor, nn
 
 import advsearch
@@ -28,6 +28,7 @@ from advsearch.questions.sweep.stored import StoredSweep
 from advsearch.questions.sweep.summary import DriveRates
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.tables import read_sweep
+from stored_sweeps import all_rows
 
 SMALL: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "batch": 4}
 
@@ -143,7 +144,7 @@ def test_resumed_and_shared_drives_are_those_of_one_who_did_it_alone(tmp_path: P
         with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
             executor = Disorder(make_worker_call(SceneLoader(job).load_by_name), seed=3, stop=None if resumed else 4)
             found = Sweep(job, run, NullProgress(), executor).execute()
-    assert rows(path) == rows(tmp_path / "alone") and len(rows(path)) == 2 * 3 * 3 * 2
+    assert all_rows(path) == all_rows(tmp_path / "alone") and len(all_rows(path)) == 2 * 3 * 3 * 2
     assert summary(found) == summary(alone) and alone.summary.drives is not None
     assert alone.summary.drives[0].drives == 12 and alone.summary.drives[0].right.interval is not None
     kept = [(one / "images" / "drive.webp").read_bytes() for one in (path, tmp_path / "alone")]
