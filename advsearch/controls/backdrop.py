@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Control, Values
-from advsearch.controls.environment import rotate_map
 from advsearch.controls.ranges import ParameterValue
+from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
 from advsearch.scene.assembly import PHOTOGRAPH_INPUT
 from advsearch.scene.assets import Float64Array

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from advsearch.controls.base import FULL_RANGE, Budget, Choice, Control, Values
 from advsearch.controls.ranges import Fixed, ParameterValue, Range
+from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.assets import EnvironmentAsset
@@ -303,23 +304,6 @@ def _load_map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor
     if scene.metered:
         factor = compute_metered_gain(other_scene) / compute_metered_gain(scene)
     return torch.from_numpy(asset.radiance.copy()) * factor
-
-
-def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
-    """Rotate a map (H, W, 3) about the vertical, as `environment.rotation` does.
-
-    Its columns are interpolated linearly and go round. Differentiable in both
-    arguments; exact at whole columns.
-    """
-    columns = radiance.shape[1]
-    shift = torch.remainder(degrees / 360.0, 1.0) * columns
-    if not shift.requires_grad and float(shift) == 0.0:
-        return radiance
-    full_columns = int(shift.detach().floor())
-    fraction = shift - full_columns
-    lower = radiance.roll(-full_columns, dims=1)
-    upper = radiance.roll(-full_columns - 1, dims=1)
-    return lower + fraction * (upper - lower)
 
 
 def compute_harmonic_light(coefficients: Tensor, reference: Tensor) -> Tensor:

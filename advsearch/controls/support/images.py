@@ -127,3 +127,20 @@ def draw_noise(
     generator = torch.Generator().manual_seed(seeds.stream(seed, stream_name))
     sample = torch.randn if normal else torch.rand
     return sample(height, width, 3, generator=generator)
+
+
+def rotate_map(radiance: Tensor, degrees: Tensor) -> Tensor:
+    """Rotate a map (H, W, 3) about the vertical, as `environment.rotation` does.
+
+    Its columns are interpolated linearly and go round. Differentiable in both
+    arguments; exact at whole columns.
+    """
+    columns = radiance.shape[1]
+    shift = torch.remainder(degrees / 360.0, 1.0) * columns
+    if not shift.requires_grad and float(shift) == 0.0:
+        return radiance
+    full_columns = int(shift.detach().floor())
+    fraction = shift - full_columns
+    lower = radiance.roll(-full_columns, dims=1)
+    upper = radiance.roll(-full_columns - 1, dims=1)
+    return lower + fraction * (upper - lower)
