@@ -145,9 +145,12 @@ class BackdropControl(Control):
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the photograph, its camera, its exposure and its light."""
-        index = int(values["which"])
-        inputs = _compute_view_inputs(self.scene, index)
-        return {name: value.clone() for name, value in inputs.items()}
+        which = values["which"]
+        inputs = _compute_view_inputs(self.scene, int(which))
+        # Copies, since the cached tensors must not change.
+        return {
+            name: value.to(which.device, copy=True) for name, value in inputs.items()
+        }
 
 
 @cache_per_scene

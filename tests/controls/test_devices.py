@@ -12,6 +12,7 @@ from advsearch.controls import CONTROLS, compose, make_control
 from advsearch.controls.corruption import CORRUPTION_NAMES
 from conftest import ROOT
 from elsewhere import ELSEWHERE, Away, elsewhere
+from samples import load_photographed_box
 
 PICTURE = str(ROOT / "advsearch/bundled/data/objects/book/base_color.png")
 
@@ -50,6 +51,8 @@ CASES = [
 def test_what_a_control_gives_lies_where_the_searchs_numbers_do(kind: str, given: dict[str, Any]) -> None:
     beside = "bottle@0.4,0.1" if kind == "things" else None
     scene = advsearch.load_scene("person" if kind == "body" else "mug", things=beside).description
+    if kind == "backdrop":
+        scene = load_photographed_box().description
     space = compose((make_control(kind, given),), scene)
     u = (0.25 * space.start + 0.5).clamp(0.0, 1.0)
     image = torch.full((8, 8, 3), 0.5)

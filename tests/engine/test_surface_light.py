@@ -62,8 +62,8 @@ def off(monkeypatch: pytest.MonkeyPatch, *levels: float) -> None:
     coming = iter(levels)
     compare = SurfaceLight._compare
 
-    def found(self: SurfaceLight, *arguments: Any) -> Deviation:
-        compare(self, *arguments)
+    def found(self: SurfaceLight, u: Any, index: int) -> Deviation:
+        compare(self, u, index)
         self.deviations[-1] = replace(self.deviations[-1], levels=next(coming), allowed_levels=3.0)
         return self.deviations[-1]
 
