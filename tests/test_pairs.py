@@ -114,9 +114,7 @@ def model() -> advsearch.Model:
 
 @pytest.mark.medium
 def test_every_control_is_here_and_varies() -> None:
-    assert set(FORMS) | APART == set(CONTROLS.built_ins), (
-        "FORMS of tests/test_pairs.py names a control that there is not"
-    )
+    assert set(FORMS) | APART == set(CONTROLS.built_ins), "FORMS names a control that there is not"
     for kind, form in FORMS.items():
         varied = compose(
             [make_control(kind, form)], load_description(suited([kind]), things=beside([kind]))
