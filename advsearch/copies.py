@@ -79,8 +79,8 @@ def hand_copies(kind: type, **argument_slices: slice) -> None:
 
     Args:
         kind: the class; one of this package is left as it is.
-        argument_slices: argument slices by the name of the method, which of its
-            positional arguments after `self` are copied. All keyword arguments are.
+        argument_slices: the positional arguments after `self` that are copied, by the
+            name of the method. All keyword arguments are copied.
     """
     if is_ours(kind):
         return

@@ -46,8 +46,8 @@ def assert_right(
         model: model from `load_model`, or what that takes.
         at_least: the share, over 0 and under 1.
         pictures: pictures that are drawn, at most.
-        confidence: confidence that an assertion that passes, or fails, is right to do
-            so.
+        confidence: probability with which an assertion that passes, or fails, does so
+            rightly.
         seed: root of all random numbers.
         run: where the run is kept.
         **settings: settings of a scene and its pictures, as `sweep` takes them, and

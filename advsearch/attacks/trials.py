@@ -199,9 +199,10 @@ def choose_spp(
         seed: root seed.
         ladder: sample counts, rising, at least one, or InputError. A single one is
             returned unmeasured.
-        trials: trials that will follow under the same conditions. So many renders are
-            one more look, the last one, at which only the mean and every single render
-            have to be on one side; 0 where other trials follow.
+        trials: number of trials that will follow under the same conditions; 0 where
+            other trials follow. After as many renders there is one more look, the
+            last one, at which only the mean and every single render have to be on
+            one side.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
         raise InputError(

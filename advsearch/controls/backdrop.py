@@ -14,7 +14,7 @@ takes the shadow where it is.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Control, Values
-from advsearch.controls.ranges import ParameterValue
+from advsearch.controls.ranges import ParameterValue, list_set_names
 from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
 from advsearch.scene.assembly import PHOTOGRAPH_INPUT
@@ -55,16 +55,10 @@ class BackdropControl(Control):
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameter, with the photographs that a setting names as options.
 
-        The setting is a name, a list of names, or a mapping with "choices".
+        See `list_set_names` for the forms of the setting.
         """
         which = cls.parameters[0]
-        setting = settings.get("which") if isinstance(settings, Mapping) else None
-        if isinstance(setting, Mapping):
-            setting = setting.get("choices")
-        names: Sequence[object] = [setting]
-        if isinstance(setting, Sequence) and not isinstance(setting, str):
-            names = setting
-        options = tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
+        options = tuple(dict.fromkeys(list_set_names(settings, "which")))
         if not options:
             return (which,)
         high = len(options) - 1.0

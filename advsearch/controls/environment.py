@@ -15,7 +15,7 @@ the map's mean radiance, inside an L2 ball.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -24,7 +24,12 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import FULL_RANGE, Budget, Choice, Control, Values
-from advsearch.controls.ranges import Fixed, ParameterValue, Range
+from advsearch.controls.ranges import (
+    Fixed,
+    ParameterValue,
+    Range,
+    list_set_names,
+)
 from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
@@ -101,19 +106,13 @@ class EnvironmentControl(Control):
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameters, with files of the setting `which` among its options.
 
-        The setting is a name, a list of names, or a mapping with "choices".
+        See `list_set_names` for the forms of the setting.
         """
         which, *others = cls.parameters
-        setting = settings.get("which") if isinstance(settings, Mapping) else None
-        if isinstance(setting, Mapping):
-            setting = setting.get("choices")
-        names: Sequence[object] = [setting]
-        if isinstance(setting, Sequence) and not isinstance(setting, str):
-            names = setting
         files = [
             name
-            for name in names
-            if isinstance(name, str) and name not in which.options and is_path(name)
+            for name in list_set_names(settings, "which")
+            if name not in which.options and is_path(name)
         ]
         options = tuple(dict.fromkeys((*which.options, *files)))
         return (replace(which, options=options), *others)

@@ -196,6 +196,23 @@ def to_plain_value(value: object) -> object:
     return value
 
 
+def list_set_names(settings: object, parameter: str) -> list[str]:
+    """Return the names that the settings of a control give a parameter.
+
+    Args:
+        settings: settings of a control; names alone, without values, give none.
+        parameter: name of the parameter. It is set to a name, a list of names, or a
+            mapping with "choices"; what is no text is left out.
+    """
+    setting = settings.get(parameter) if isinstance(settings, Mapping) else None
+    if isinstance(setting, Mapping):
+        setting = setting.get("choices")
+    names: Sequence[object] = [setting]
+    if isinstance(setting, Sequence) and not isinstance(setting, str):
+        names = setting
+    return [name for name in names if isinstance(name, str)]
+
+
 def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
     """Parse what a parameter was set to.
 

@@ -136,8 +136,8 @@ class PredictedSearch(ABC):
         n_traced: images that were traced, for the predictor and to compare it.
         seconds: spent on both.
         n_renewals: how often the predictor was computed again; None where it never is.
-        first_traced: first traced by kind of search, the evaluation from which on
-            images are traced, as predictions were too far off.
+        first_traced: the evaluation from which on images are traced because
+            predictions were too far off, by kind of search.
         tracing_reason: why images are traced, as a sentence; None while they are
             predicted.
         window: the window of the image that is traced; None for all of it.
@@ -309,8 +309,7 @@ class Transport(PredictedSearch):
 
     is_exact: ClassVar[bool] = True
     clean_matrix: CleanMatrix = field(default_factory=CleanMatrix)
-    # Score bias by how much predicted scores are above the lower end of those of
-    # trials.
+    # How far predicted scores lie above the lower end of those of trials.
     _score_bias: float = 0.0
     # the latest matrix of each kind of search
     _current: dict[str, Predictor] = field(default_factory=dict)

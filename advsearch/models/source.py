@@ -156,7 +156,7 @@ class Source:
     reads_text: bool = False  # it is given texts beside the picture
     takes_more: bool = False  # it is called with more than pictures
     value_range: tuple[float, float] | None = None
-    # Size type in which it takes the size of pictures, see `WithImageSize`.
+    # The type in which it takes the size of images, see `WithImageSize`.
     size_type: torch.dtype | None = None
 
 

@@ -150,8 +150,8 @@ class ResultPart:
 
         Args:
             rows: the values.
-            columns: columns by the head of each column, what makes its cell from a
-                value: a function, or a text for `str.format`.
+            columns: what makes a cell from a value, by the head of the column: a
+                function, or a text for `str.format`.
             more: other attributes of the part.
         """
         cells = [

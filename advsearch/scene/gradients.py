@@ -58,7 +58,7 @@ class Group:
     begin: int = 0  # first coordinate in u
     estimator: str = "none"  # the one that is used
     step: float = 0.0  # half-width of a difference in u; 0 where none is taken
-    # Pixel that over which the fastest outline moves by a pixel; that of the group
+    # The difference in u that moves the fastest outline by a pixel; that of the group
     # where nothing moves.
     pixel: float = 0.0
     reason: str = ""  # why this estimator is used, as a text

@@ -54,7 +54,7 @@ class Predictor(ABC):
         traced: a renderer of the space, which traces paths.
 
     Attributes:
-        path_renderer: path renderer that renderer.
+        path_renderer: the renderer `traced`.
         non_finite: how many values were not finite while it was made, and were set to
             zero.
     """

@@ -205,8 +205,8 @@ def _find_cell_ranges(
     """Return the range (low, high) of each parameter of the archive in a cell.
 
     Args:
-        measure_indices: measure indices of the parameters in u; they are the keys of
-            the result.
+        measure_indices: indices in u of the parameters that are axes of the archive;
+            they are the keys of the result.
         boundaries: boundaries of the cells on each axis, ascending.
         grid_index: index of the cell on each axis.
     """

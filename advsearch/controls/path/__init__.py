@@ -167,7 +167,7 @@ class PathControl(Control):
 
     Attributes:
         seconds: how long the path takes; of several, the longest.
-        _paths: paths of each path, what each mover does.
+        _paths: what each mover does, for each path.
         _movers: what moves on any path: camera, object or both.
         _files: the movements that were read from files.
     """

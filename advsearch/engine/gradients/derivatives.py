@@ -170,7 +170,7 @@ def compare_with_reference(
         estimate: estimate to rate.
         reference: reference of the same probe.
         others: references of the other probes of its control.
-        probe: probe for the names in the row; None leaves them empty.
+        probe: the probe that names the row; None leaves its names empty.
         spp: samples per pixel of the estimate, for the row.
     """
     min_sizes = [MIN_SIZE_FRACTION * abs(other.value) for other in others]

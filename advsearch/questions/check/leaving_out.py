@@ -177,8 +177,8 @@ def _relative_difference(without: list[Tensor], with_item: list[Tensor]) -> floa
     differences between the two seeds; not divided if seeds make no difference.
 
     Args:
-        without: without at two seeds, without the item.
-        with_item: with item at the same seeds.
+        without: images or gradients at two seeds, without the item.
+        with_item: the same with the item, at the same seeds.
     """
     noise = math.sqrt(
         statistics.fmean(_difference(pair) ** 2 for pair in (without, with_item))

@@ -202,7 +202,7 @@ def _locate_image(directory: Path, name: str, coco_file: Path) -> Path:
     Args:
         directory: directory of the images, resolved.
         name: name in the file, which is not trusted.
-        coco_file: coco file for messages.
+        coco_file: path of the COCO file, for messages.
 
     Raises:
         FileFormatError: it is outside of the directory.

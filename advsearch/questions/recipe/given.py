@@ -235,8 +235,8 @@ def _describe_named(
 
     Args:
         rows: rows with object and texture.
-        names_texture: names texture by texture, which of its rows (n,) have a
-            prediction that names the texture.
+        names_texture: for each texture, whether the prediction of each of its rows
+            (n,) names it.
         options: options of the figure; a texture without `classes` has no name that a
             prediction could have.
     """

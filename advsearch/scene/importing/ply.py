@@ -284,10 +284,10 @@ def _store_values(
 
     Args:
         element: its scalars and lists are set.
-        starts: starts by property, the bytes (rows,) at which it begins in each row.
-        values: values by property, the number of its type that begins at each byte.
-        counts: counts by property that is a list, the count that begins at each byte. A
-            list is its count and then its values.
+        starts: by property, the bytes (rows,) at which it begins in each row.
+        values: by property, the number of its type that begins at each byte.
+        counts: by property that is a list, the count that begins at each byte. A list
+            is its count and then its values.
     """
     for name, property_starts in starts.items():
         if name in counts:

@@ -417,10 +417,10 @@ class _PlaneHits:
 
     Attributes:
         is_hit: whether a ray meets the plane first.
-        direct_change: direct change of its radiance by what hides the environment, and
-            by lamps.
+        direct_change: the change of its radiance by what hides the environment, and by
+            lamps.
         weight: weight of the light that comes along the path's next segment.
-        path_ray: path ray that segment; of other rays, the camera ray.
+        path_ray: that segment as a ray; of other rays, the camera ray.
         is_traced: whether there is such a segment.
     """
 

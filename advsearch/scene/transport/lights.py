@@ -83,8 +83,8 @@ def has_fixed_lights(renderer: Renderer) -> bool:
 class Lighting:
     """Which groups of a space change only light, exposure or the finished image."""
 
-    # Groups by `control.parameter`, the inputs changed; none if it changes the finished
-    # image.
+    # The inputs that each group changes, by its name `control.parameter`; none if it
+    # changes the finished image.
     groups: Mapping[str, frozenset[str]]
     harmonic_groups: frozenset[
         str

@@ -759,7 +759,7 @@ class PreviewSurface:
 
         Args:
             color_use: the texture of the color, or None.
-            opacity_use: opacity use that of the opacity, or None.
+            opacity_use: the texture of the opacity, or None.
             color: (3,) linear color where there is no texture of it.
 
         Returns:
