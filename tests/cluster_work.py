@@ -1,7 +1,5 @@
 """Work for workers that takes no time to load; they import it by its name."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

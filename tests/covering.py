@@ -1,7 +1,5 @@
 """Few cases of a product: each value once beside ever new others; the other cases are slow and come by turns."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations, product
 from typing import Any

@@ -1,7 +1,5 @@
 """Binary glTF files taken apart and put together again, with another header."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable

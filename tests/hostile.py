@@ -1,7 +1,5 @@
 """Values that nobody should give, for batteries over everything that takes a value."""
 
-from __future__ import annotations
-
 import decimal
 import math
 from pathlib import Path

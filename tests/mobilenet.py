@@ -1,7 +1,5 @@
 """MobileNetV2 (Sandler et al. 2018) with the names that torchvision gives to its weights, for pictures in [0, 1]."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

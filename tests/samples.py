@@ -1,7 +1,5 @@
 """Whole results that tests change in one place: what a command could have answered, made without doing any work."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Workers that are only simulated, with a clock of their own: they run as fast as whoever gives them work."""
 
-from __future__ import annotations
-
 import heapq
 import queue
 from collections import deque

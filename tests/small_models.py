@@ -71,6 +71,27 @@ class Ranger(nn.Module):
         return 40.0 * (ground + near * (0.52 - ground)) - 3.0
 
 
+class Brightness(nn.Module):
+    """The second class where a picture is brighter than a threshold, else the first: a victim with a known weakness.
+
+    Args:
+        threshold: mean of the pixels at which it changes its mind.
+        border: pixels around the middle that it does not look at.
+        slope: of the logits, for each unit of brightness.
+    """
+
+    def __init__(self, threshold: float, border: int = 0, slope: float = 40.0) -> None:
+        super().__init__()
+        self.threshold = nn.Parameter(torch.tensor(threshold))
+        self.border, self.slope = border, slope
+
+    def forward(self, images: Tensor) -> Tensor:
+        height, width = images.shape[2:]
+        middle = images[:, :, self.border : height - self.border, self.border : width - self.border]
+        score = self.slope * (middle.mean(dim=(1, 2, 3)) - self.threshold)
+        return torch.stack([-score, score], dim=1)
+
+
 class Blue(nn.Module):
     """A mug where the band in the middle is bluer than a threshold, else a vase.
 

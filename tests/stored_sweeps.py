@@ -1,7 +1,5 @@
 """Sweeps without a renderer, for tests of what shows them."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The rules of the house, read from the source: who may import whom, what is shipped, what is pinned, what is heavy."""
 
-from __future__ import annotations
-
 import ast
 import configparser
 import fnmatch

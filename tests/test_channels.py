@@ -1,7 +1,5 @@
 """The ways to get and run advsearch beside `make`: the action for GitHub, the container and the list for programs."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

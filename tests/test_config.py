@@ -1,7 +1,5 @@
 """The typed configuration: what every wrong value says, and that YAML, flags and Python mean the same."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import re

@@ -1,7 +1,5 @@
 """The examples in the documentation run or are read; what holds its words to the code is tools/check_docs.py."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import inspect

@@ -1,7 +1,5 @@
 """The quick part of the fuzz of hostile files (`make fuzz` runs all), and that the fuzz sees what it looks for."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Ctrl-C is answered wherever it strikes, once."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Islands are built-in parts that the core does without: they import `advsearch.extend`, and nothing else of ours."""
 
-from __future__ import annotations
-
 import ast
 import json
 import subprocess

@@ -3,8 +3,6 @@
 They share one run of an attack and one of a sweep, as users read what they have computed.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

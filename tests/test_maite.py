@@ -1,7 +1,5 @@
 """Models and datasets of MAITE; with the package itself where it is installed."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, ClassVar
 

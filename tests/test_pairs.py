@@ -4,8 +4,6 @@ Each control is here in a small form whose values leave the start. A row is chec
 were made for it alone, and against a scene in which the values that the row names are fixed.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 from typing import Any

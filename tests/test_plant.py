@@ -1,7 +1,5 @@
 """The list of planted faults is true: each stands in the source once, is no slip of syntax, and its tests are there."""
 
-from __future__ import annotations
-
 import pytest
 from plant import FAULTS, ROOT, Fault
 

@@ -1,7 +1,5 @@
 """What whoever waits is told: every stage has a name in plain words, and no count goes beyond its total."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The main job on objects, environments and a classifier that nobody on this project made."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

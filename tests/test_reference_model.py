@@ -1,7 +1,5 @@
 """What makes the reference model: its training, its augmentation and the figures that are kept of it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Registries: our own entries, those of installed packages, and a package made from the pages that say how."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

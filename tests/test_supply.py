@@ -1,7 +1,5 @@
 """What the set-up installs, and the list of what the wheel was built with."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Thread counts and how idle threads wait."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

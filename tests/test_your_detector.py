@@ -1,7 +1,5 @@
 """The page about a detector of one's own: its commands are carried out, with a small network in place of the large."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from pathlib import Path

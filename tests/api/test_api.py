@@ -1,7 +1,5 @@
 """`attack` from Python, end to end, with a tiny model and pictures of 32 pixels."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -10,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 import advsearch
 from advsearch.cli.output import format_result as text_of
@@ -18,6 +16,7 @@ from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.listing import can_resume, list_runs
 from advsearch.runs.store import Row, Store
+from small_models import Brightness
 from stand_ins import interrupted
 
 SIZE = 32
@@ -26,21 +25,8 @@ FAST: dict[str, Any] = {"resolution": (SIZE, SIZE), "steps": 6, "spp": 2, "trial
 REPEATED: dict[str, Any] = {**FAST, "deterministic": True, "baseline": False}
 
 
-class Brightness(nn.Module):
-    """Says "mug" while the middle of the picture is darker than a threshold: an easy victim with a known weakness."""
-
-    def __init__(self, threshold: float, slope: float = 40.0) -> None:
-        super().__init__()
-        self.threshold, self.slope = threshold, slope
-
-    def forward(self, images: Tensor) -> Tensor:
-        middle = images[:, :, SIZE // 4 : -SIZE // 4, SIZE // 4 : -SIZE // 4].mean(dim=(1, 2, 3))
-        score = self.slope * (middle - self.threshold)
-        return torch.stack([-score, score], dim=1)
-
-
 def model(threshold: float) -> advsearch.Model:
-    return advsearch.load_model(Brightness(threshold), labels=LABELS, input_size=SIZE, name="brightness")
+    return advsearch.load_model(Brightness(threshold, SIZE // 4), labels=LABELS, input_size=SIZE, name="brightness")
 
 
 @pytest.fixture(scope="module")

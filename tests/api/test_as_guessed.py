@@ -1,7 +1,5 @@
 """The Python interface as somebody guesses it who has not read about it."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """What a call from Python gives: keywords of other libraries, and values of wrong types."""
 
-from __future__ import annotations
-
 import inspect
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """The colour chart: what is printed of it comes back from a photograph."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

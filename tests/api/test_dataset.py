@@ -1,7 +1,5 @@
 """Pictures of runs as datasets: what stands in the files, against the runs themselves, by a reader of its own."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Answers out again: stock Mitsuba renders the adversarial scene of a run as the run did, and so does reading it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

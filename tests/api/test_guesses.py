@@ -1,7 +1,5 @@
 """What a researcher guesses in Python: arrays for u, and a function for a task."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

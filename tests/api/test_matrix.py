@@ -1,7 +1,5 @@
 """Attacks on several models: the matrix of attacked on against tested on, and one answer for all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

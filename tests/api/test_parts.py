@@ -1,7 +1,5 @@
 """The attacks of a study that others carry out: their folders come back as those of attacks that were made here."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The Python interface as a person meets it: keywords, tables, and models without a gradient."""
 
-from __future__ import annotations
-
 import collections.abc
 import inspect
 import typing
@@ -9,7 +7,6 @@ from typing import Any, get_type_hints
 
 import pytest
 import torch
-from torch import Tensor, nn
 
 import advsearch
 from advsearch.api import keywords as api_keywords
@@ -19,6 +16,7 @@ from advsearch.models import ModelWarning
 from advsearch.questions.attack.python import AttackKeywords
 from advsearch.questions.sweep.carry_out import SweepKeywords
 from advsearch.settings import settings
+from small_models import Brightness
 
 
 @pytest.mark.parametrize(
@@ -38,17 +36,9 @@ def test_typed_keywords_are_the_settings(function: Any, keywords: Any, command: 
         assert hint == eval(expected[name], names), name
 
 
-class Middle(nn.Module):
-    """Says the first class where the middle of a picture is dark, the second where it is bright."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        score = 40.0 * (images[:, :, 4:-4, 4:-4].mean(dim=(1, 2, 3)) - 0.9)
-        return torch.stack([-score, score], dim=1)
-
-
 @pytest.fixture(scope="module")
 def model() -> advsearch.Model:
-    return advsearch.load_model(Middle(), labels=["mug", "vase"], input_size=16, name="middle")
+    return advsearch.load_model(Brightness(0.9, border=4), labels=["mug", "vase"], input_size=16, name="middle")
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """An attack on a classifier of the usual size: MobileNetV2 at 224 x 224 pixels, a thousand classes, random weights."""
 
-from __future__ import annotations
-
 import torch
 from torch import nn
 

@@ -1,7 +1,5 @@
 """`advsearch render`: pictures before anything is searched, and what the model says of them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

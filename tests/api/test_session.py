@@ -1,7 +1,5 @@
 """A question inside somebody's program: torch as it was before, whatever it was; instances; what exists only there."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 import advsearch
 from advsearch.errors import AdvsearchError, InputError
@@ -19,6 +17,7 @@ from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
+from small_models import Brightness
 from stand_ins import interrupted
 
 SIDE = 16
@@ -28,18 +27,6 @@ FAST: dict[str, Any] = {
 }
 
 
-class Bright(nn.Module):
-    """Says "mug" while the middle of the picture is darker than a threshold."""
-
-    def __init__(self, threshold: float) -> None:
-        super().__init__()
-        self.threshold = nn.Parameter(torch.tensor(threshold))
-
-    def forward(self, images: Tensor) -> Tensor:
-        score = 40.0 * (images[:, :, 4:-4, 4:-4].mean(dim=(1, 2, 3)) - self.threshold)
-        return torch.stack([-score, score], dim=1)
-
-
 @pytest.fixture(scope="module")
 def scene() -> advsearch.Scene:
     return advsearch.load_scene("mug")
@@ -47,13 +34,13 @@ def scene() -> advsearch.Scene:
 
 @pytest.fixture(scope="module")
 def level(scene: advsearch.Scene) -> float:
-    """What `Bright` sees of the clean mug."""
+    """What `Brightness` sees of the clean mug."""
     render = scene.renderer("texture", resolution=SIDE, denoise="none")
     return float(render(render.start, spp=16)[4:-4, 4:-4].mean())
 
 
 def victim(threshold: float, name: str = "bright") -> advsearch.Model:
-    return advsearch.load_model(Bright(threshold), labels=["mug", "vase"], input_size=SIDE, name=name)
+    return advsearch.load_model(Brightness(threshold, border=4), labels=["mug", "vase"], input_size=SIDE, name=name)
 
 
 @pytest.fixture
@@ -76,7 +63,7 @@ def test_a_search_learns_whatever_is_switched_off_around_it(scene: advsearch.Sce
 def test_a_renderer_and_a_model_that_were_made_in_inference_mode_are_differentiable(level: float) -> None:
     with torch.inference_mode():
         render = advsearch.load_scene("mug").renderer(["texture", "pose.yaw"], resolution=SIDE, denoise="none")
-        model, bare = victim(level), Bright(level)
+        model, bare = victim(level), Brightness(level, border=4)
         picture = render(render.start, spp=1)
     assert not picture.is_inference() and not picture.requires_grad
     u = render.start.clone().requires_grad_()

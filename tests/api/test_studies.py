@@ -1,7 +1,5 @@
 """Curves and regions: their accounting with stand-ins for attacks, and one small region that is rendered."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

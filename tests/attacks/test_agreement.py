@@ -1,7 +1,5 @@
 """Kappa, rank correlation and their intervals over clusters, by published numbers, scipy and simulation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Budgets: projections are exact, samples stay inside, and bad budgets are refused by name."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -59,17 +57,6 @@ def test_l2_projection_equals_a_quadratic_program(seed: int) -> None:
     assert np.linalg.norm(ours.numpy() - centre) <= radius * (1 + 1e-5)
 
 
-def test_l2_projection_is_not_clip_then_rescale() -> None:
-    centre = torch.tensor([0.95, 0.5])
-    u = torch.tensor([2.0, 1.0])
-    exact = project_l2_box(u, centre, 0.3)
-    clipped = u.clamp(0, 1)
-    shortcut = centre + (clipped - centre) * 0.3 / float((clipped - centre).norm())
-    assert float((exact - u).norm()) < float((shortcut - u).norm()) - 1e-3
-    assert exact[0] == 1.0
-    assert float((exact - centre).norm()) == pytest.approx(0.3, rel=1e-6)
-
-
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 def test_points_inside_come_back_bit_for_bit(norm: str) -> None:
     domain = ball(norm, 0.2, torch.full((50,), 0.5))
@@ -111,17 +98,6 @@ def test_projection_lies_inside_is_idempotent_and_nonexpansive(
     assert domain.contains(p)
     assert torch.allclose(domain.project(p), p, rtol=0.0, atol=ROUNDING)
     assert float((p - q).norm()) <= float((u - v).norm()) * (1 + 1e-5) + 1e-6
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10_000), st.integers(1, 60), st.floats(1e-3, 2.0), st.sampled_from(["linf", "l2"]))
-def test_no_sample_is_nearer_than_the_projection(seed: int, d: int, epsilon: float, norm: str) -> None:
-    rng = generator(seed)
-    domain = ball(norm, epsilon, torch.rand(d, generator=rng))
-    u = domain.start + 2 * epsilon * torch.randn(d, generator=rng)
-    nearest = float((domain.project(u) - u).norm())
-    others = domain.sample(rng, 20)
-    assert float((others - u).norm(dim=1).min()) >= nearest - 1e-5
 
 
 def test_blocks_are_projected_each_in_its_own_norm() -> None:

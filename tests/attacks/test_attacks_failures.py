@@ -1,7 +1,5 @@
 """Which of many failures are listed: the worst, then whatever is farthest from all that are listed."""
 
-from __future__ import annotations
-
 import torch
 
 from advsearch.attacks.candidates import select_diverse

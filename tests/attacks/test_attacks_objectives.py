@@ -1,7 +1,5 @@
 """Objectives over label sets: values, one battery for all of them and all their forms, and a user's own function."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import product

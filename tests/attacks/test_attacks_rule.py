@@ -1,7 +1,5 @@
 """By which rule a claim is verified, on judgements alone."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The search loop: budgets, endings, what it does with noise, NaN and interrupts. Policies here are made to order."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The smallest change and the region, on objectives whose answers are known."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Literal

@@ -1,7 +1,5 @@
 """Confidence sequences: right at all times together, decided as soon as draws allow, and monotone."""
 
-from __future__ import annotations
-
 import math
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shares and tests of answers that share a draw: what is worked out by hand, and how seldom they err."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whole checks, carried out by the code that runs with margins in place of pictures: small forms of a study."""
 
-from __future__ import annotations
-
 import math
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The bundled objects and environments: sound meshes of every family; what is shipped is what the scripts make."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

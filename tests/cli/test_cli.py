@@ -1,7 +1,5 @@
 """The command line: what it prints where, its exit statuses, and that it answers at once."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

@@ -1,7 +1,5 @@
 """`advsearch completion`: what Tab offers in bash."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`advsearch doctor`: what it says of parts that work, are missing, are broken, or take their process down."""
 
-from __future__ import annotations
-
 import os
 import sys
 from argparse import Namespace

@@ -1,7 +1,5 @@
 """YAML, label files, names and the terminal: limits, types, and characters that steer a terminal."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Finding the name of a class: what is like a word, `advsearch labels`, and what an object without a label is told."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

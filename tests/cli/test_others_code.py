@@ -1,8 +1,6 @@
 """Python code that a run, a suite or a recipe of somebody else names is imported by no command and no function, until
 whoever asks has named it."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 import sqlite3

@@ -1,7 +1,5 @@
 """Settings with power over more than their run: honoured where they are typed or given in Python, from no file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Real workers: processes of this machine, and a scheduler and workers of Dask that were started by themselves."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

@@ -1,7 +1,5 @@
 """Every range comes back once, whatever becomes of the workers. The workers are simulated, and so is the time."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Iterator
 from pathlib import Path

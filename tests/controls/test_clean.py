@@ -1,8 +1,6 @@
 """The clean scene is the one that the object, the environment and the settings describe: otherwise it is refused or
 said."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

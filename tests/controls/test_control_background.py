@@ -1,7 +1,5 @@
 """The background control: the colour that was asked for, behind the object and nowhere else."""
 
-from __future__ import annotations
-
 import colorsys
 import itertools
 

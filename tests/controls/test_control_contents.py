@@ -1,7 +1,5 @@
 """The contents control: finds the inside of vessels, keeps proportions that add up to one, and fills to the level."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The corruption control: the published strengths, nothing at severity 0, derivatives that are right, no surprises."""
 
-from __future__ import annotations
-
 import io
 import math
 

@@ -1,7 +1,5 @@
 """Environments of one's own in the control `environment`: in lists, as an axis, for every picture, and refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A control of one's own from a module in the current directory: `--control module:Class`, in YAML and in Python."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterator

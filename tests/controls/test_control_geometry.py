@@ -1,7 +1,5 @@
 """The geometry control: smooth, bounded, and never breaking the mesh."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The haze control: no haze at density 0, light kept where it should be, derivatives that agree with differences."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

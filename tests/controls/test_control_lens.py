@@ -1,7 +1,5 @@
 """The lens control: dots where and what they are asked to be, nothing at the start, derivatives that are right."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

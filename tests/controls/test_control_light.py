@@ -1,7 +1,5 @@
 """The light control: a lamp's power in the environment's units, what its places do, and which derivative is right."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

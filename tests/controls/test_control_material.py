@@ -1,7 +1,5 @@
 """The material control: patterns without seams, named materials with numbers of their own, sound derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The occlusion control: the share that was asked for is the share that is hidden, and nothing else happens at zero."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

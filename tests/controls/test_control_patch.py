@@ -1,7 +1,5 @@
 """The patch control, and the map of a mesh's surface that it lies on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The path control: the scene as it is where it is promised, distances that are right, and files, good and hostile."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from pathlib import Path

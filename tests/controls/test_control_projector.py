@@ -1,8 +1,6 @@
 """The projector control: its light in the scene's units, its derivatives, its matrix, its files, and in which ambient
 light it ends."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The sensor control: nothing at the start, each step what it says, derivatives that are right."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The shadow control: it takes light away from the object, from where the camera does not see it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

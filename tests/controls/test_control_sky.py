@@ -1,7 +1,5 @@
 """The sky control: the published model, the right way round, metered, and with derivatives of the map."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

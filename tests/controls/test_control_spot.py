@@ -1,7 +1,5 @@
 """The spot control, and what it shares with a projector that is out of focus or flashes."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

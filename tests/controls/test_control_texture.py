@@ -1,7 +1,5 @@
 """The texture control's further forms: a few colours, smooth waves, and other meshes than the object."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The `things` control: what it moves, that nothing stands in anything else, and that what is away is not there."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import Any
 

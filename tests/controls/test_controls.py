@@ -1,7 +1,5 @@
 """Every registered control passes one battery; the texture control's own rules follow."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Controls make what they give on the device of the search's numbers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,8 +1,6 @@
 """Values that vary by chance: distributions of torch, scipy and Python, and choices with weights, through the inverse
 CDF."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from typing import Any

@@ -1,7 +1,5 @@
 """Numbers and colours by Mitsuba's own names: the picture is Mitsuba's with that value, and gradients are right."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

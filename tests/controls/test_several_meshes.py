@@ -1,7 +1,5 @@
 """Controls of other meshes than the object: `pose:post` moves the post as `pose` moves the object."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Textures by material: which texels belong to which material of a file, and a search that keeps to some of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The rule by which predicted pictures take the place of rendered ones, and how often it is wrong."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Objectives that see more than pictures: u, the texture, the scene's inputs and numbers, with a graph."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Shares of wrong predictions with and without each of many parts, and what is told from chance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2_contingency

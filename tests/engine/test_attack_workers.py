@@ -1,7 +1,5 @@
 """An attack whose trials and plain evaluations workers make beforehand: the same rows, whatever happens to them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

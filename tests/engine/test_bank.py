@@ -1,7 +1,5 @@
 """Searches under conditions that vary by chance, by a matrix for each condition of a bank."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Clips: pictures of a rig that are taken one after the other, and video classifiers of transformers that see them."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path

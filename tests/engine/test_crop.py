@@ -1,7 +1,5 @@
 """Searches that trace the part of the picture that can change, and paste it into a whole picture."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

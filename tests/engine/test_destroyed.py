@@ -1,7 +1,5 @@
 """Whatever code of others is handed, it may destroy: nothing that it writes into is looked at again."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

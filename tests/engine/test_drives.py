@@ -1,7 +1,5 @@
 """Drives: frames that share their draws, rates worked out by hand, and what an attack keeps along its path."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

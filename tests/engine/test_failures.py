@@ -1,7 +1,5 @@
 """The different failures of an archive: tried with fresh seeds by the rule of any answer, and told in words."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

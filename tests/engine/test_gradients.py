@@ -1,7 +1,5 @@
 """The gradient plan: what each estimator computes, what is left out, and how it is chosen. Renders are small."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`--aov`: a sweep keeps ground truth of every configuration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Judging a thing beside the object, or all, with truth for each in the rows."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

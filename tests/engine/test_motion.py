@@ -1,7 +1,5 @@
 """An open shutter and rows that are read one after the other, against stills that are rendered one by one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

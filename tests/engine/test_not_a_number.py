@@ -1,7 +1,5 @@
 """Answers that are NaN or infinite are called that wherever trials are kept, counted and told."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

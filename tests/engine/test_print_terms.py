@@ -1,7 +1,5 @@
 """What `printable` takes from an objective."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

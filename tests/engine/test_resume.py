@@ -1,7 +1,5 @@
 """A run that is killed at any moment goes on to the same rows; without the renderer, on a problem in closed form."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal

@@ -1,7 +1,5 @@
 """Runs of a rig: killed within a configuration and resumed, shared by workers, judged by boxes, bounded in memory."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

@@ -1,7 +1,5 @@
 """Several cameras, one verdict: where they look, rules by hand, and attacks on a network that takes all pictures."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

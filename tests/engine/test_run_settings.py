@@ -1,7 +1,5 @@
 """A setting of the whole run reaches every control that declares it, by whatever name and in whatever command."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

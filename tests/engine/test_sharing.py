@@ -1,7 +1,5 @@
 """One way to answer: queries by workers, and the journal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any

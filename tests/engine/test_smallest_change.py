@@ -1,7 +1,5 @@
 """How many trials the way to the smallest change takes."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """`sweep --surface`: which parts of the surface, when seen, go with wrong predictions."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Searches under cameras and lights that vary by chance, by light on surfaces."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -20,7 +20,7 @@ import torch
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
-from torch import Tensor, nn
+from torch import Tensor
 
 import advsearch
 from advsearch.attacks.domain import NET, ProductIndex, SampleSequence
@@ -42,6 +42,7 @@ from advsearch.statistics.intervals import clopper_pearson
 from covering import once_each
 from samples import PHOTOGRAPHS, write_photograph_folder
 from samples import attack as attack_result
+from small_models import Brightness
 
 SIZE = 16
 LABELS = ("mug", "vase")
@@ -87,18 +88,6 @@ class FakeRenderer:
         return torch.full((*self.size, 3), level if FakeRenderer.level is None else FakeRenderer.level)
 
 
-class Brightness(nn.Module):
-    """Says "mug" while the picture is darker than a threshold."""
-
-    def __init__(self, threshold: float = 0.55) -> None:
-        super().__init__()
-        self.threshold = threshold
-
-    def forward(self, images: Tensor) -> Tensor:
-        score = 20.0 * (images.mean(dim=(1, 2, 3)) - self.threshold)
-        return torch.stack([-score, score], dim=1)
-
-
 @pytest.fixture(autouse=True)
 def fake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is rendered, unless the test is marked so by its name."""
@@ -109,7 +98,7 @@ def fake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def model(threshold: float = 0.55, name: str = "brightness", size: int = SIZE) -> advsearch.Model:
-    return advsearch.load_model(Brightness(threshold), labels=LABELS, input_size=size, name=name)
+    return advsearch.load_model(Brightness(threshold, slope=20.0), labels=LABELS, input_size=size, name=name)
 
 
 def rows_of(run: Path) -> list[tuple[Any, ...]]:
@@ -357,7 +346,7 @@ def test_outputs_that_are_not_finite_are_counted_and_not_right() -> None:
             logits = super().forward(images)
             return torch.where(images.mean(dim=(1, 2, 3))[:, None] > 0.6, math.nan, logits)
 
-    victim = advsearch.load_model(Fails(), labels=LABELS, input_size=SIZE, name="fails")
+    victim = advsearch.load_model(Fails(0.55, slope=20.0), labels=LABELS, input_size=SIZE, name="fails")
     result = advsearch.sweep("mug", victim, {"pose.yaw": "0:360:40"}, trials=0)
     bad = [row for row in result.rows() if row.score is None]
     assert bad and all((row.correct, row.margin) == (False, None) for row in bad)
@@ -551,7 +540,7 @@ def test_a_model_that_looks_is_told_from_one_that_does_not_really_rendered(tmp_p
 
 
 def test_what_a_row_says_is_true_of_the_picture_that_its_model_was_shown() -> None:
-    wide = advsearch.load_model(Brightness(), labels=LABELS, input_size=(SIZE, 2 * SIZE), name="wide")
+    wide = advsearch.load_model(Brightness(0.55, slope=20.0), labels=LABELS, input_size=(SIZE, 2 * SIZE), name="wide")
     drawn: dict[str, Any] = {"camera": {}}
     both = advsearch.sweep("mug", [model(), wide], controls=drawn, samples=2, trials=0)
     alone = [

@@ -1,7 +1,5 @@
 """Sweeps over light: pictures that differ in nothing else come from basis pictures, once these pay."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

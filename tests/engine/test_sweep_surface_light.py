@@ -1,7 +1,5 @@
 """Sweeps over cameras: pictures that differ in nothing else come from light on surfaces, once that pays."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A sweep whose batches are carried out by others: the rows and the summary of one that did it all itself."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace

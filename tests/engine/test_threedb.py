@@ -1,7 +1,5 @@
 """Folders of 3DB: written so that its dashboard reads them, and read into a run."""
 
-from __future__ import annotations
-
 import json
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tracks along drives: numbers by hand, a detector that misses frames, and what a sweep says of it."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from pathlib import Path

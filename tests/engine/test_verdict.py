@@ -1,7 +1,5 @@
 """A whole verdict where nobody says how many samples and trials it takes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``make fuzz``: run all cases of a seed and print what went wrong, and a table of how they ended."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Blender files: damaged ones, and a Blender that writes hostile glTF or nothing and says anything."""
 
-from __future__ import annotations
-
 from fuzz import gltf
 from fuzz.case import Case, Maker, Random
 from fuzz.mutations import damaged

@@ -1,7 +1,5 @@
 """What one case of the fuzz is: a few files made from a seed, and the loader that has to survive them."""
 
-from __future__ import annotations
-
 import os
 import random
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """All cases of the fuzz: number k of a seed is always the same files."""
 
-from __future__ import annotations
-
 import random
 
 from fuzz import blender, gltf, meshes, mitsuba_scenes, models, pictures, rigs, run_folders, runs

@@ -1,7 +1,5 @@
 """glTF in JSON and binary: other types, hostile counts, planted references, odd trees of nodes."""
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

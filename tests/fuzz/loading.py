@@ -1,7 +1,5 @@
 """The loaders under test: what a command does with a file before it renders or asks a model anything."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import warnings

@@ -1,7 +1,5 @@
 """Wavefront OBJ with its materials, PLY and STL."""
 
-from __future__ import annotations
-
 import struct
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Mitsuba's XML: damaged bytes, hostile texts, planted files and libraries, numbers out of range."""
 
-from __future__ import annotations
-
 from fuzz.case import OUTSIDE, Case, Maker, Random
 from fuzz.mutations import NUMBERS, damaged
 

@@ -1,7 +1,5 @@
 """Models (.pt2, TorchScript, ONNX), label files and YAML with settings."""
 
-from __future__ import annotations
-
 import io
 import json
 import pickle

@@ -1,7 +1,5 @@
 """Damage to any file: cuts, flipped bits, swapped lengths, hostile numbers in texts, other types in JSON."""
 
-from __future__ import annotations
-
 import copy
 import json
 import re

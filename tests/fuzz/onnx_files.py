@@ -1,7 +1,5 @@
 """ONNX files by hand: protocol buffers of a few messages, so that nothing has to be installed to write them."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Pictures and environment maps: PNG, JPEG and other textures, Radiance and OpenEXR maps."""
 
-from __future__ import annotations
-
 import io
 import math
 import struct

@@ -1,7 +1,5 @@
 """Rigs of cameras: plain lists, Kalibr's camchains, nerfstudio's frames and COLMAP's images, damaged or hostile."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Runs cases in processes of their own and says how each ended: loaded, refused, or what went wrong with it."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Run folders that somebody else made: whole ones, in which rows, settings, pictures or links are hostile."""
 
-from __future__ import annotations
-
 import json
 import random as chance
 import sqlite3

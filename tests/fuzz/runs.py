@@ -1,7 +1,5 @@
 """Run folders with a file that is damaged: the results, the summary, the settings."""
 
-from __future__ import annotations
-
 import io
 import json
 import pickle

@@ -4,8 +4,6 @@ It counts the CPU time and the growth of memory of each case, and watches what P
 loader itself prints goes to a file, so that a leak is seen. A crash or a hang is for the parent to see.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

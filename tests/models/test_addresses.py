@@ -1,7 +1,5 @@
 """Models that only answer, asked over the network: a real server on this machine, well behaved and otherwise."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Depth Anything and its like: tiny ones with random weights, beside the library's own post-processing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

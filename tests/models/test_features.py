@@ -1,7 +1,5 @@
 """Penultimate features of every kind of network that can be loaded, beside the same numbers worked out by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

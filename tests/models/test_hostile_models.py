@@ -1,7 +1,5 @@
 """Model files that were made to do harm: nothing in them is run, and they are refused in one sentence."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json

@@ -1,7 +1,5 @@
 """What networks take beside or in place of floating-point pictures: sizes, whole numbers, colors from 0 to 255."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

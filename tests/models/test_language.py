@@ -1,7 +1,5 @@
 """LLaVA, Qwen-VL and their like as classifiers of names: tiny ones with random weights, beside the library's own."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path

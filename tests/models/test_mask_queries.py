@@ -1,7 +1,5 @@
 """Mask2Former and its like as segmenters: tiny ones with random weights, beside the library's own post-processing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Gradients that are those of the answers where torch, or a network, would give others."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

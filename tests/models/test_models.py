@@ -1,7 +1,5 @@
 """The models room: preprocessing, label sets, the probe, every loader, the reference network."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -1,8 +1,6 @@
 """OWL-ViT and Grounding DINO as detectors of names that are given: tiny ones with random weights, beside the library's
 own pipeline."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Networks of torchvision and timm with the libraries themselves, which need another torch: `make test-zoo`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Networks that no task can judge as they are: each is refused in a sentence that says what it is, and the way on."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

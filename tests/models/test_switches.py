@@ -1,7 +1,5 @@
 """torch's global switches, turned by the code of users: they stay with their network, and break nothing of ours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

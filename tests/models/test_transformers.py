@@ -1,7 +1,5 @@
 """Networks of transformers: tiny ones with random weights, fed as the library's own pipeline feeds them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

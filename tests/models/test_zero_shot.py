@@ -1,7 +1,5 @@
 """CLIP and SigLIP as classifiers of names that are given: tiny ones with random weights, beside the library's own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

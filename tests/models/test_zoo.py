@@ -1,7 +1,5 @@
 """Networks by a library's name and in ONNX files: with small stand-ins, and with the libraries where they are."""
 
-from __future__ import annotations
-
 import os
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Parts are listed in the catalog or come from packages; without one of them the tool works."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """`check` keeps what it has measured: stopped in any way, it goes on to the same rows."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`compare` on stored sweeps, without a renderer."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from functools import cache

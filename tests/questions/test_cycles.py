@@ -1,7 +1,5 @@
 """Cycles: Blender gets the scene as it is in a configuration, and a picture for each seed; what goes wrong is said."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

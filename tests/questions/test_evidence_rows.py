@@ -1,7 +1,5 @@
 """Evidence, line by line against the rows of the runs that it is of."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`explain` on stored sweeps, without a renderer: what it reads, what it would render, what it answers and prints."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`harden` as a whole: a small network, pictures of 32 x 32, and a stand-in for the attacks of the measurement."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

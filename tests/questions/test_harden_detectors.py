@@ -1,7 +1,5 @@
 """Hardening detectors: what their training sees, whose loss it descends, and a run as a whole on a small network."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Hardening segmenters: what their training sees, whose loss it descends, and a run as a whole on a small network."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

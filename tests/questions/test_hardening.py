@@ -1,7 +1,5 @@
 """Hardening: the split, what is trained, the training, and the data set; without renders but for one scene."""
 
-from __future__ import annotations
-
 import gc
 import json
 import shutil

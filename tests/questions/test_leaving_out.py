@@ -1,7 +1,5 @@
 """What searches leave out changes neither pictures nor gradients, and bounces only within a bound."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

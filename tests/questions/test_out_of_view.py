@@ -1,7 +1,5 @@
 """Pictures with nothing of the object in them: no share of right predictions counts them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

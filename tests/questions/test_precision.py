@@ -1,7 +1,5 @@
 """Error against run time: slopes, references and budgets on synthetic noise whose law is known, and one tiny scene."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -1,7 +1,5 @@
 """Recipes: what a file may say, the runs that it comes to, what figures say, and one that is rendered."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

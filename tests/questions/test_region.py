@@ -1,7 +1,5 @@
 """Regions over viewpoints: pictures are predicted while the box grows, and fresh samples of it are rendered."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The answer of a run under other conditions: what holds, what does not, and beside what clean scene."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

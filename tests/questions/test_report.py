@@ -1,7 +1,5 @@
 """What runs stand for: no ending, count or command makes a claim that says more than the run does."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

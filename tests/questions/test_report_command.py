@@ -1,7 +1,5 @@
 """`advsearch report`: runs as evidence, from their folders."""
 
-from __future__ import annotations
-
 import json
 from hashlib import sha256
 from pathlib import Path

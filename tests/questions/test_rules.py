@@ -1,7 +1,5 @@
 """Rules, importance and envelopes of rows whose law is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

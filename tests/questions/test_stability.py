@@ -1,7 +1,5 @@
 """The stability suite: its cases hold, the command reports honestly, and it goes on where it was stopped."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace

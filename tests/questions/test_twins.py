@@ -1,7 +1,5 @@
 """`advsearch twins`: reading photographs with poses, rendering their twins, and counting."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

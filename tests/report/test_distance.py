@@ -1,7 +1,5 @@
 """The distance at which a detector first sees an object."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Boxes and masks drawn into pictures: where they lie, in which colour, and what stands beside them."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What becomes of an object in a detector's boxes, as headlines, tables and counts tell it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

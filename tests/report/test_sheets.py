@@ -1,7 +1,5 @@
 """Sheets for printing, read back: sizes in millimetres, pictures put together again."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

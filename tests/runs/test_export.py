@@ -1,7 +1,5 @@
 """Exports: written by the name of the file, to no link, and of a run whose disk was full."""
 
-from __future__ import annotations
-
 import errno
 import json
 import math

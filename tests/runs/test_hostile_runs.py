@@ -1,7 +1,5 @@
 """Run folders that are damaged, or that somebody made to do harm: one sentence that names the file, and status 2."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

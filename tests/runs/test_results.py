@@ -1,7 +1,5 @@
 """Results: what every one of them promises, whatever the command."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Which rows of a sweep share a draw."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from itertools import product

@@ -1,7 +1,5 @@
 """What is evaluated, told to other programs: by stand-ins of their packages, which keep what they are told."""
 
-from __future__ import annotations
-
 import logging
 import sys
 import threading

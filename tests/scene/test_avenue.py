@@ -1,7 +1,5 @@
 """The avenue: a street as geometry, to scale in metres, which comes and goes with its ground."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Photographs behind the object: what is composed, which camera sees it, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """Blender files: Blender is started so that nothing in the file runs, has a deadline, and its glTF is read."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat

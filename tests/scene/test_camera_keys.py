@@ -1,7 +1,5 @@
 """Every key of every kind of camera file: it changes what is seen, is on the list of those that do not, or is told."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Iterator

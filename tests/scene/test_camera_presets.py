@@ -1,7 +1,5 @@
 """Mounted cameras, cameras of a height, and the heights from which vehicles are seen."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Cameras with a lens of their own: against OpenCV, from files, inside Mitsuba, and as part of the camera control."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

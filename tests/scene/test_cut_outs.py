@@ -1,7 +1,5 @@
 """Cut-outs of glTF materials: they are neither seen, nor in the mask, nor in what guides the denoiser."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

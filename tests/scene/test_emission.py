@@ -1,7 +1,5 @@
 """Surfaces of glTF and material files that emit light: seen, lighting what is around them, and in what goes out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

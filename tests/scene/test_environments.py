@@ -1,7 +1,5 @@
 """Environments from .hdr and .exr pictures: values, sizes, and every error that a file can cause."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The exposure is metered on what the camera sees of the object, whatever that is made of."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

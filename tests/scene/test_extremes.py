@@ -1,7 +1,5 @@
 """Extreme and bad input: a clear refusal, or a finite picture with finite gradients."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

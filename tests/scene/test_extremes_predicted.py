@@ -1,7 +1,5 @@
 """Pictures that light on surfaces predicts, where scenes are at their ends."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which way a file faces: by its format, by `facing`, never by its name; and on which side of it a dashcam is."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

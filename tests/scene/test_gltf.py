@@ -1,7 +1,5 @@
 """glTF as its specification has it: what is in a file is either read so, or named as left out."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

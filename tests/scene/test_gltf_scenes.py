@@ -1,7 +1,5 @@
 """glTF: where cameras look, what skins move, how lights and surfaces that shine compare, and packed geometry."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Lamps of cars: the beam, light on the ground and on a wall, where lamps sit, and what they belong to."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Objects from mesh files: geometry, normals, texture coordinates, colours, and every error that a file can cause."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

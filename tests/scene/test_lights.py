@@ -1,7 +1,5 @@
 """Basis pictures of lights: what counts as light, their sums against traced pictures, and searches over light."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where the object is seen: the mask is what rays through the middles of pixels, cast by hand, hit first."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

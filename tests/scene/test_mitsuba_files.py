@@ -1,7 +1,5 @@
 """Mitsuba's scenes: files and dictionaries with one shape as the object, hostile files, and the picture as it was."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Objects of Mitsuba scenes keep what their plugins had: each picture beside that of stock Mitsuba."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scenes as Mitsuba's XML: what is written is what is read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Normal maps of glTF and material files: a bump in a picture is lit as the same bump in the geometry."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How much of a thing a picture shows, against a picture of twice the width and height round the same one."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """People: heights and limits are kept, feet stand on the ground, joints turn what they say, gradients are right."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

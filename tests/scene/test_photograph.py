@@ -1,7 +1,5 @@
 """The ground that shows the environment's photograph: it looks as photographed, darker where light is kept from it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

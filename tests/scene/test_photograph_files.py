@@ -1,7 +1,5 @@
 """Camera files beside photographs, and folders of photographs among which the control `backdrop` chooses."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Places of one's own: a glTF file and a YAML file beside it, as the environment of any scene."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The crossing, the car park and the room: places as geometry, made of the avenue's parts or as it is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """PLY and STL: what their properties say is read, or named as left out."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Polygons become triangles with the same area, convex or not."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Raindrops before the camera: rays are Snell's, truth is that of the scene without them, gradients go through them."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

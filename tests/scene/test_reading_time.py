@@ -1,7 +1,5 @@
 """Reading takes time in proportion to a file: what a hostile one repeats is not compared with all before it."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

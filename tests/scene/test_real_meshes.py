@@ -1,7 +1,5 @@
 """Meshes as people have them: each stands upright, is in the frame and is not black; what can't be kept is said."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

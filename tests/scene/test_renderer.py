@@ -1,7 +1,5 @@
 """The function in the middle: repeatable, stateless, finite, and differentiable as it claims."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Rigs from files of others: their axes against poses by hand, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Rigged glTF and VRM: vertices are where the format's formulas put them, which are written out here once more."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The road under things of the street, what distances mean for what has a size, and surfaces of several materials."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

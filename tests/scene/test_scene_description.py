@@ -1,7 +1,5 @@
 """Settings, poses and cameras, without Mitsuba."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

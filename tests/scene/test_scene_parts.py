@@ -1,7 +1,5 @@
 """A scene's named meshes, lamps and cameras, and scenes without an environment map."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Scenes from glTF files: one node is the object, the rest stays in its place; lamps, cameras, names."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Own operations of torch: those that are exact any number of times are, and no other is differentiated twice."""
 
-from __future__ import annotations
-
 import ast
 import math
 import re

@@ -1,7 +1,5 @@
 """Meshes with fewer faces: as many as were asked for, where they were, without gaps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

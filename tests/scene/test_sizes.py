@@ -1,7 +1,5 @@
 """How large objects are in metres: what is said of them, what their files say, and what is asked."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Cells of a mesh's map, and where the mesh is unwrapped anew for it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Ground truth beside a picture: what each pixel sees, and the EXR that it is written to."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Things beside the object: how they are asked for, where they stand, and what is true of each."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

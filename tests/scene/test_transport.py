@@ -1,7 +1,5 @@
 """Light transport as a matrix: its pictures against traced ones, its derivative against the adjoint, and searches."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

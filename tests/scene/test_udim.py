@@ -1,7 +1,5 @@
 """Pictures of one square of texture coordinates each (UDIM), faces of too few corners, and means over what is shown."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

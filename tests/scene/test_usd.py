@@ -1,7 +1,5 @@
 """OpenUSD files: what is read of them beside their twins in glTF, what is left out, and what is refused."""
 
-from __future__ import annotations
-
 import math
 import zipfile
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Preview surfaces of OpenUSD, their textures and display colours: each beside what the specification says."""
 
-from __future__ import annotations
-
 import struct
 import zipfile
 import zlib

@@ -1,7 +1,5 @@
 """How far a street's picture and a photograph fit the ground before them: the formula, against rendered pictures."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

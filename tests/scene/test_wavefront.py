@@ -1,7 +1,5 @@
 """Wavefront OBJ and its material files: what each statement says is read, or named as left out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

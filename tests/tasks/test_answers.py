@@ -1,7 +1,5 @@
 """Free answers: what counts as right, and the margin beside it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Command: an action about the clean one, a state beside pictures, and a policy that a texture turns the wrong way."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Depth: how far a model judges the object to be, beside how far it is."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Object detection: what a detector may return, and when the object counts as found, mislabelled, displaced."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

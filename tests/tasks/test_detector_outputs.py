@@ -1,7 +1,5 @@
 """What detectors return: which output is what, which rows count, in what unit and form boxes are."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What DETR's networks answer: boxes by their middle in shares of the picture, and logits that names explain."""
 
-from __future__ import annotations
-
 import types
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Every command with a detector and with a segmenter: small networks of the colours of the bundled mug, as files."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

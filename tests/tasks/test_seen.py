@@ -1,7 +1,5 @@
 """A task that judges by where the object is seen, and what is kept of its answers: in rows, exports and summaries."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

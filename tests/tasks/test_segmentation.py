@@ -1,7 +1,5 @@
 """Semantic segmentation: how many of the object's pixels a model gets right."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Similarity: features as the library's own pipeline gives them, references in folders, ranks, distances."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tasks: what counts as success, what is right, and what is said of an output."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Two tasks at once, with a model each: one answer against both."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

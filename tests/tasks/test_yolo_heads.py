@@ -1,7 +1,5 @@
 """What YOLO's networks answer, in each form that they have: one cup at a known place, and noise everywhere else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import astuple
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Only ordinary files are read, and never more of them than a limit."""
 
-from __future__ import annotations
-
 import io
 import os
 import socket

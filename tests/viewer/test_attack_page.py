@@ -1,7 +1,5 @@
 """The report page: filled, escaped, self-contained; and the words that it shares with the final table."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from html.parser import HTMLParser

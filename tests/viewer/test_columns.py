@@ -1,7 +1,5 @@
 """Rows of a sweep as columns of numbers."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run that goes on, as the dashboard follows it: what is new in its rows, and when its page is shown."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

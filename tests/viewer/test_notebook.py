@@ -1,7 +1,5 @@
 """What results show in a notebook, and the notebook of the documentation."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """The page of a sweep, and the folder that any server can serve."""
 
-from __future__ import annotations
-
 import json
 import re
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Photographs: what a browser may send, what is kept of it, how it is judged and counted, and over what it comes."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """The dashboard's server: what it answers, and what it refuses."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """The pages of studies and of measurements: what is drawn, what the tables say, and where they lead."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from urllib.error import HTTPError

@@ -1,7 +1,5 @@
 """The policy `auto`: PGD bit for bit on norm balls, a real search everywhere else, and never worse than random."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable

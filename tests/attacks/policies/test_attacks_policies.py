@@ -1,7 +1,5 @@
 """Policies on objectives with a known optimum, and one battery that every registered policy must pass."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The policy `adam`: steps in units of half a range, whatever the gradient's size."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import pytest

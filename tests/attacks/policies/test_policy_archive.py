@@ -1,7 +1,5 @@
 """The archive of different failures: what it keeps, over which parameters, and how many cells it fills."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,8 +1,6 @@
 """Batches: what a policy proposes does not depend on how many proposals it is asked for at once; a last batch may be
 cut."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

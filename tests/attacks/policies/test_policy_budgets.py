@@ -1,7 +1,5 @@
 """What the policies state about themselves is true: budgets to a known optimum, and the example of their page."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import sys

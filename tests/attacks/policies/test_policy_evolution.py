@@ -1,7 +1,5 @@
 """The policies `cmaes` and `nes`: ranks alone decide, bounds hold, memory and time stay those of a few vectors."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from collections.abc import Callable

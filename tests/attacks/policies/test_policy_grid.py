@@ -1,7 +1,5 @@
 """The policies `grid` and `sobol`: which points they take, in which order, and what they refuse."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """The mixture that learns where failures lie: how large a share it says that they are, and where."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

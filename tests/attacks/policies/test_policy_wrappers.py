@@ -1,7 +1,5 @@
 """What wraps policies: rounds of a race, `restarts` and discrete choices."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """`advsearch test`: claims, their answers, what machines read of them, and answers of runs that become tests."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

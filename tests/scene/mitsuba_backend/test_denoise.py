@@ -1,7 +1,5 @@
 """The denoiser: its bytes do not depend on the number of threads, and its brightness is what it would find itself."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Finding a libLLVM: every platform's places, names and versions, in made-up folders; and the one of this machine."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The material-form adjoint: agrees with central differences, leaves the scene alone, and stays finite."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Scenes with media beside each other in one process: each renders as it does alone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Nothing is freed while Dr.Jit records: in 1.5.0 that ends the process."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

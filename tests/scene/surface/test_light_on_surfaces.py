@@ -1,7 +1,5 @@
 """Pictures from light that is kept on surfaces, beside traced ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
