@@ -138,10 +138,8 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
     takes_images = has_star_args or _has_image_parameter(
         [name for name in by_position if name not in requested_inputs]
     )
-    n_positional = 3 if takes_images else 2
     try:
-        # a trial call, with None for every argument
-        signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
+        _check_arguments(signature, takes_images, requested_inputs)
     except TypeError as error:
         raise InputError(
             f"objective {get_name(function)!r}: expected a function that takes "
@@ -153,6 +151,16 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
     return ObjectiveSignature(takes_images, requested_inputs)
 
 
+def _check_arguments(
+    signature: inspect.Signature, takes_images: bool, requested_inputs: Iterable[str]
+) -> None:
+    """Raise TypeError if a function can't be called with (output, images, truth), or
+    (output, labels), and the inputs that it requests by name.
+    """
+    n_positional = 3 if takes_images else 2
+    signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
+
+
 def _has_image_parameter(names: Sequence[str]) -> bool:
     """Return whether the positional parameters of a function are meant as (output,
     images, truth), by their names; otherwise they are (output, truth).
@@ -160,12 +168,13 @@ def _has_image_parameter(names: Sequence[str]) -> bool:
     A third parameter means the former, unless the second is called like the truth, as
     in a loss whose third parameter is an option.
     """
-    if len(names) < 2:  # neither; the caller refuses it
+    if len(names) < 2:  # neither; the caller rejects it whatever is returned
         return True
     second_name = names[1]
     if second_name in TRUTH_PARAMETERS:
         return False
     has_third = len(names) > 2
+    # a function whose second parameter is called like an image has forgotten the truth
     return has_third or second_name in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS)
 
 
@@ -188,7 +197,7 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
     def objective(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
-        """Call the function with what it asks for, and check what it returns, (N,)."""
+        """Call the function with what it requests, and check what it returns, (N,)."""
         inputs = {
             input_name: more(input_name) for input_name in signature.requested_inputs
         }
@@ -210,11 +219,8 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         if isinstance(result, Tensor) and result.ndim == 0 and count > 1:
             result = _evaluate_each_image(objective, output, images, truth, inputs)
         values = _check_values(name, result, count)
-        # torch counts in `_version` how often a tensor was written into
-        has_written_into_arguments = any(
-            tensor._version for tensor in _list_tensors((argument_copies, input_copies))
-        )
-        if values.requires_grad and has_written_into_arguments:
+        if values.requires_grad and _are_written_into((argument_copies, input_copies)):
+            # the derivative may be lost that way: it is computed now, to see
             sources = [
                 tensor
                 for tensor in _list_tensors((output, inputs))
@@ -225,6 +231,12 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         return values
 
     return objective
+
+
+def _are_written_into(copies: Any) -> bool:
+    """Return whether a tensor in nested copies was written into since it was made."""
+    # torch counts in `_version` how often a tensor was written into
+    return any(tensor._version for tensor in _list_tensors(copies))
 
 
 def _is_label_set_rejected(labels: Any, error: TypeError) -> bool:
@@ -244,15 +256,16 @@ def _evaluate_each_image(
     """Return the values (N,) of an objective that is called with one image at a time.
 
     Args:
-        objective: returns a scalar.
+        objective: objective of a function that returns a scalar.
         output: output of the model for N images.
         images: (N, H, W, 3).
-        truth: equal for all images.
-        inputs: what the objective requests by name, for N images.
+        truth: what is right, equal for all images.
+        inputs: what the function requests, by the names of its parameters, for N
+            images.
     """
     values = []
     for index in range(images.shape[0]):
-        image_slice = slice(index, index + 1)
+        image_slice = slice(index, index + 1)  # a batch of one
         read_input = partial(_select_input, inputs, index)
         values.append(
             objective(output[image_slice], images[image_slice], truth, read_input)
@@ -330,6 +343,7 @@ def _check_values(name: str, values: Any, count: int) -> Tensor:
             "no gradient"
         )
     value_per_image: Tensor = values
+    # a scalar is the value of a single image
     if values.ndim == 0 and count == 1:
         value_per_image = values.reshape(1)
     if value_per_image.shape != (count,):
@@ -436,9 +450,10 @@ def _pass_copies(objective: Objective) -> Objective:
     def with_copies(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
-        return objective(
-            *copy_value((output, images, truth)), lambda name: copy_value(more(name))
-        )
+        def read_copy(name: str) -> Any:
+            return copy_value(more(name))
+
+        return objective(*copy_value((output, images, truth)), read_copy)
 
     return with_copies
 
@@ -769,10 +784,10 @@ def check_objective(
             f"truth), got {objective!r}"
         )
     kind = _find_kind(objective)
-    if kind is None:
-        read_signature(objective)  # type: ignore[arg-type]  # checks its arguments
-        return
-    _check_kind(kind, task, targeted=targeted, minimise=minimise)
+    if kind is not None:
+        _check_kind(kind, task, targeted=targeted, minimise=minimise)
+    else:  # a function: this raises if it takes other arguments
+        read_signature(objective)  # type: ignore[arg-type]
 
 
 def _check_kind(

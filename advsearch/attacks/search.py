@@ -222,8 +222,7 @@ def search(
 def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     """Return what a search found, by its log.
 
-    An interrupted batch is passed to the policy as far as it was evaluated. An
-    interrupted search claims nothing, whatever it found.
+    An interrupted search claims nothing, whatever it found.
 
     Args:
         log: log of the search.
@@ -237,14 +236,7 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     if math.isfinite(best.mean_objective):
         best_objective = best.mean_objective
     is_claimed = best.success_rate >= 0.5 and stopped is not Ending.INTERRUPTED
-    final_policy = None
-    state = None
-    if log.state is not None:  # else the search ended before the first proposal
-        final_policy = log.policy
-        state = log.state
-        if final_policy is not None and log.evaluated_batch:
-            state = final_policy.update(state, log.evaluated_batch)
-    return SearchResult(
+    result = SearchResult(
         best_u=best.u,
         best_objective=best_objective,
         claimed_objective=best.objective,
@@ -259,11 +251,26 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         non_finite_elements=sum(record.non_finite for record in log.records),
         seconds=seconds,
         agreement=tuple(log.agreement),
-        counts=Counts() if final_policy is None else final_policy.counts(state),
-        distribution=(
-            None if final_policy is None else final_policy.distribution(state)
-        ),
-        failures=None if final_policy is None else final_policy.failures(state),
+    )
+    return _add_policy_findings(result, log)
+
+
+def _add_policy_findings(result: SearchResult, log: _Log) -> SearchResult:
+    """Return the result of a search with what its policy knows at the end.
+
+    An interrupted batch is passed to the policy as far as it was evaluated.
+    """
+    policy = log.policy
+    state = log.state
+    if policy is None or state is None:  # the search ended before the first proposal
+        return result
+    if log.evaluated_batch:
+        state = policy.update(state, log.evaluated_batch)
+    return replace(
+        result,
+        counts=policy.counts(state),
+        distribution=policy.distribution(state),
+        failures=policy.failures(state),
     )
 
 
@@ -431,9 +438,9 @@ def _explore(
     """Let the policy propose until there is a reason to stop; return that.
 
     Reasons are that the budget is spent, the time is over (which counts as the same),
-    the policy has nothing more to propose, or objectives are not finite. The log has
-    the policy's state and the evaluations since then, so that an interrupted search can
-    use them.
+    the policy has nothing more to propose, or objectives are not finite. At any time,
+    the log has the policy's latest state and the evaluations since then: an interrupted
+    search ends with these.
 
     Args:
         log: log of the search; it is changed.

@@ -294,13 +294,16 @@ def _probe_source(
         origin: origin of the names, for messages.
     """
     min_batch, max_batch = source.batch_limits
-    max_batch = min(max_batch, options.get("max_batch") or max_batch)  # 0: not set
+    requested_max_batch = options.get("max_batch")
+    if requested_max_batch:
+        max_batch = min(max_batch, requested_max_batch)
     preprocessing = _make_preprocessing(source, options)
     model = Model(
         module=_adapt_to_images_alone(source, preprocessing),
         name=name or source.name,
         labels=(),
         preprocessing=preprocessing,
+        # a network that needs larger batches gets them whatever the option is
         batch_limits=(min_batch, max(min_batch, max_batch)),
         dtype=source.dtype,
         device=source.device,
@@ -373,7 +376,8 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
 
 
 def _make_unknown_error(text: str) -> UnknownNameError:
-    """Return the error for a model's name that means nothing."""
+    """Return the error for a model's name that means nothing, with similar names."""
+    # what stands after the colon; NAME for other sources
     forms = {
         "hf": "hf:REPOSITORY",
         "http": "http://ADDRESS",
@@ -382,7 +386,8 @@ def _make_unknown_error(text: str) -> UnknownNameError:
     names = ["reference", *(forms.get(source, f"{source}:NAME") for source in SOURCES)]
     hint = FORMS
     may_be_of_library = re.fullmatch(r"[\w.-]+", text)
-    if may_be_of_library and not find_similar_names(text, ["reference"]):
+    is_misspelt_reference = bool(find_similar_names(text, ["reference"]))
+    if may_be_of_library and not is_misspelt_reference:
         hint = (
             "A library's network is written with its library: "
             f"'torchvision:{text}' or 'timm:{text}'. {FORMS}"
@@ -480,14 +485,15 @@ def _parse_input_size(value: Any) -> tuple[int, int]:
 
 
 def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Parse `mean` and `std` (3,) each; a preset for one fills the other too, unless
-    that is given.
+    """Parse the options `mean` and `std`, three numbers each.
+
+    The name of a preset ("imagenet") for one of them sets both, unless the user gave
+    the other one too.
     """
     fields: dict[str, Any] = {}
     for key in ("mean", "std"):
         value = options.get(key)
         if isinstance(value, str) and value.strip().lower() in PRESETS:
-            # A preset sets both, but does not replace what the user gave for the other.
             preset_mean, preset_std = PRESETS[value.strip().lower()]
             if key == "mean" or "mean" not in options:
                 fields["mean"] = preset_mean
@@ -496,8 +502,8 @@ def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
         elif value is not None:
             expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
             numbers = _parse_numbers(key, value, (1, 3), expected)
-            # The first, middle and last of three; of one number three times this.
-            fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
+            is_single = len(numbers) == 1  # for all channels
+            fields[key] = (numbers * 3) if is_single else numbers
     return fields
 
 

@@ -47,6 +47,8 @@ of the network's dtype: bfloat16 distinguishes 0.50 from 0.51 and no less.
 
 # Change of each value of an image, in [0, 1], along the gradient that is checked.
 STEP = 1e-3
+# Likewise, for outputs that jump over the longer step only.
+SMALL_STEP = STEP / 8.0
 
 MAX_GRADIENT_ERROR = 0.9
 """Maximum relative error of what the gradient predicts: a wrong sign is an error of 2,
@@ -234,13 +236,13 @@ def _run(model: Model, images: Tensor) -> Tensor:
 
 
 def _run_and_read(model: Model, images: Tensor) -> Any:
-    """Run a network that does not return logits on images (N, H, W, 3), and read its
-    output.
+    """Run a network that does not return logits on images (N, H, W, 3), and return the
+    output for each as the task reads it.
     """
     assert model.read is not None
-    return read_output(model.read, *_run_network(model, images), model.name)[
-        : len(images)
-    ]
+    returned, batch_size = _run_network(model, images)
+    output = read_output(model.read, returned, batch_size, model.name)
+    return output[: len(images)]  # without images that fill a batch up
 
 
 def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
@@ -286,24 +288,22 @@ def _explain_failed_call(
     Returns:
         The reason, to follow the model's name; and advice, a further sentence or "".
     """
-    reason = _describe_other_inputs(network, str(error))
     if isinstance(model.module, WithState) and model.module.state:
         sizes = ", ".join(
             f"{name} (N, {len(numbers)})"
             for name, numbers in model.module.state.items()
         )
-        wrong_options = "`state`"
         reason = f"cannot be called with pictures and a state of {sizes[:200]}"
-    elif reason:
+        return reason, ". Give the `state` that it was made for"
+    reason = _describe_other_inputs(network, str(error))
+    if reason:
         return reason, ""
-    else:
-        height, width = model.input_size
-        wrong_options = "`input_size` and `layout`"
-        reason = (
-            f"cannot be run on a {model.preprocessing.channels} image of "
-            f"{height} x {width} pixels in layout {model.preprocessing.layout}"
-        )
-    return reason, f". Give the {wrong_options} that it was made for"
+    height, width = model.input_size
+    reason = (
+        f"cannot be run on a {model.preprocessing.channels} image of "
+        f"{height} x {width} pixels in layout {model.preprocessing.layout}"
+    )
+    return reason, ". Give the `input_size` and `layout` that it was made for"
 
 
 def _unwrap(network: Any) -> Any:
@@ -330,24 +330,7 @@ def _describe_other_inputs(network: object, error: str) -> str:
     """
     if not isinstance(network, nn.Module):
         return ""
-    parameters: list[inspect.Parameter] = []
-    with suppress(TypeError, ValueError):  # it is not written in Python
-        # the first one is the images
-        parameters = list(inspect.signature(network.forward).parameters.values())[1:]
-    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    required = {
-        parameter.name
-        for parameter in parameters
-        if parameter.kind not in variadic
-        and parameter.default is inspect.Parameter.empty
-    }
-    # Labels of training have a default, and yet a network may need them.
-    named_in_error = LABEL_ARGUMENTS & set(re.findall(r"\w+", error))
-    missing = [
-        parameter.name
-        for parameter in parameters
-        if parameter.name in required | named_in_error
-    ]
+    missing = _list_missing_inputs(network, error)
     if missing:
         return (
             f"wants {' and '.join(missing)} beside pictures; wrap it in an nn.Module "
@@ -360,6 +343,32 @@ def _describe_other_inputs(network: object, error: str) -> str:
             "in an nn.Module that makes one of each picture"
         )
     return ""
+
+
+def _list_missing_inputs(network: nn.Module, error: str) -> list[str]:
+    """Return the names of the inputs that a network lacks if it is called with images.
+
+    They are required; or labels of training that its error names: they have a default,
+    and yet a network may need them.
+    """
+    try:
+        # the first one is the images
+        parameters = list(inspect.signature(network.forward).parameters.values())[1:]
+    except (TypeError, ValueError):  # it is not written in Python
+        return []
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    required = {
+        parameter.name
+        for parameter in parameters
+        if parameter.kind not in variadic
+        and parameter.default is inspect.Parameter.empty
+    }
+    named_in_error = LABEL_ARGUMENTS & set(re.findall(r"\w+", error))
+    return [
+        parameter.name
+        for parameter in parameters
+        if parameter.name in required | named_in_error
+    ]
 
 
 def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:
@@ -408,44 +417,52 @@ def _check_range(model: Model, images: Tensor) -> None:
     noise, but do so, at the same size, with these colors. A network in Python that
     returns no logits is not checked: if it is untrained, it looks the same.
     """
-    preprocessing = model.preprocessing
-    # Whoever sets one of these knows which colors the network takes.
-    is_declared = preprocessing.processor is not None or any(
-        getattr(preprocessing, name) != default
-        for name, default in (
-            ("mean", (0.0, 0.0, 0.0)),
-            ("std", (1.0, 1.0, 1.0)),
-            ("value_range", (0.0, 1.0)),
-        )
-    )
-    is_program = isinstance(_unwrap(model.module), PROGRAMS) or hasattr(
-        _unwrap(model.module), "stop"
-    )
-    if is_declared or (model.read is not None and not is_program):
+    network = _unwrap(model.module)
+    is_program = isinstance(network, PROGRAMS) or hasattr(network, "stop")
+    returns_logits = model.read is None
+    if _is_range_declared(model) or not (returns_logits or is_program):
         return
-    narrow = _collect_numbers(model, images)
-    if narrow is None or _compute_relative_change(narrow) >= MIN_RELATIVE_CHANGE:
+    outputs = _collect_numbers(model, images)
+    if outputs is None or _follows_images(outputs):
         return
-    wide_model = dataclasses.replace(
-        model, preprocessing=dataclasses.replace(preprocessing, value_range=EIGHT_BIT)
-    )
-    wide = _collect_numbers(wide_model, images)
+    wide_preprocessing = dataclasses.replace(model.preprocessing, value_range=EIGHT_BIT)
+    wide_model = dataclasses.replace(model, preprocessing=wide_preprocessing)
+    wide_outputs = _collect_numbers(wide_model, images)
     if (
-        wide is None
-        or wide.shape != narrow.shape
-        or _compute_relative_change(wide) < MIN_RELATIVE_CHANGE
+        wide_outputs is None
+        or wide_outputs.shape != outputs.shape
+        or not _follows_images(wide_outputs)
     ):
         return
-    growth = float(wide.abs().amax(dim=0).mean() / narrow.abs().amax(dim=0).mean())
+    size = outputs.abs().amax(dim=0).mean()
+    growth = float(wide_outputs.abs().amax(dim=0).mean() / size)
     # Outputs that grow with the colors, as of untrained networks, are no sign.
     if 1.0 / MAX_GROWTH < growth < MAX_GROWTH:
         warn(
             f"outputs of model {model.name} hardly follow the picture: they differ by "
-            f"{_compute_relative_change(narrow):.1%} "
+            f"{_compute_relative_change(outputs):.1%} "
             "between a black, a white and a random one, and by "
-            f"{_compute_relative_change(wide):.0%} if colors go from 0 to "
+            f"{_compute_relative_change(wide_outputs):.0%} if colors go from 0 to "
             "255. If it is made for these, give `value_range=0,255`"
         )
+
+
+def _is_range_declared(model: Model) -> bool:
+    """Return whether the user or a library has set what depends on the range of colors:
+    then the range is known, too.
+    """
+    preprocessing = model.preprocessing
+    return (
+        preprocessing.processor is not None
+        or preprocessing.mean != (0.0, 0.0, 0.0)
+        or preprocessing.std != (1.0, 1.0, 1.0)
+        or preprocessing.value_range != (0.0, 1.0)
+    )
+
+
+def _follows_images(outputs: Tensor) -> bool:
+    """Return whether outputs (K, n) differ between K unlike images."""
+    return _compute_relative_change(outputs) >= MIN_RELATIVE_CHANGE
 
 
 @torch.no_grad()
@@ -551,7 +568,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
                 with torch.no_grad():
                     rows = _run(model, images)
                 gradient = torch.zeros_like(images)
-        if model.read is not None and not bool(rows[:, 0].any()):
+        if _has_no_output(model, rows):
             # It detects nothing in noise: rendered images will show its gradient.
             return dataclasses.replace(model, differentiable=True)
         if repeatable and detaching.has_detached:
@@ -590,12 +607,13 @@ def _try_attached(
     # raises if that is ignored: it keeps its own.
     with suppress(RuntimeError, ModelError):
         attached_gradient = _compute_gradient(attached, images)[1]
-        for step_size in (STEP, STEP / 8.0):
-            step_size = max(step_size, ROUNDING_STEPS * torch.finfo(model.dtype).eps)
-            step = step_size * (attached_gradient - gradient).sign()
-            change, (attached_change, detached_change), *_ = _measure_change(
+        min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
+        for step_size in (STEP, SMALL_STEP):
+            step = max(step_size, min_step) * (attached_gradient - gradient).sign()
+            change, predicted_changes, *_ = _measure_change(
                 model, images, step, attached_gradient, gradient
             )
+            attached_change, detached_change = predicted_changes
             detached_error = abs(change - detached_change)
             # better than the network's own gradient, and good by itself
             max_error = min(detached_error, MAX_ATTACHED_ERROR * abs(attached_change))
@@ -613,9 +631,17 @@ def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
     leaf = images.clone().requires_grad_()
     with torch.enable_grad():
         rows = _run(model, leaf)
-        if model.read is not None and not bool(rows[:, 0].any()):
+        if _has_no_output(model, rows):
             return rows, torch.zeros_like(images)
         return rows, torch.autograd.grad(_compute_checked_value(rows), leaf)[0]
+
+
+def _has_no_output(model: Model, rows: Tensor) -> bool:
+    """Return whether a model, such as a detector, finds nothing, by rows of `_run`."""
+    if model.read is None:
+        return False
+    n_numbers = rows[:, 0]
+    return not bool(n_numbers.any())
 
 
 def _compute_checked_value(rows: Tensor) -> Tensor:
@@ -669,7 +695,7 @@ def _check_gradient(
     """
     # A gradient that holds for one of two steps is right. Suppression of boxes may make
     # outputs jump in the larger one only.
-    step_sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)
+    step_sizes = (STEP,) if model.read is None else (STEP, SMALL_STEP)
     min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
     if min_step > STEP:
         # A network in half precision is nonlinear in the first, and rounds the second.
@@ -707,19 +733,20 @@ def _check_gradient(
 def _collect_discrete_values(model: Model, images: Tensor) -> str:
     """Return the part of an output that no gradient changes, as a string to compare.
 
-    That is its shapes, its columns of integers, and its texts. A detector with
-    suppression finds other boxes after a small step, and a text continues differently
-    after another word.
+    That is its shapes, its columns of integers, and its texts; "" of a single tensor. A
+    detector with suppression finds other boxes after a small step, and a text continues
+    differently after another word.
     """
     outputs = _run_and_read(model, images)
     if isinstance(outputs, Tensor):
         return ""
-    choices = list[Any]()
+    discrete_values = list[Any]()
     for tensor in list_tensors(outputs):
         columns = tensor.flatten(1).T if tensor.ndim > 1 else tensor[None]
         is_integer = (columns == columns.round()).all(dim=1)
-        choices.append((tensor.shape, columns[is_integer].tolist()))
+        discrete_values.append((tensor.shape, columns[is_integer].tolist()))
     for output in outputs:
         if isinstance(output, Mapping):
-            choices += [value for value in output.values() if type(value) is str]
-    return str(choices)
+            texts = [value for value in output.values() if type(value) is str]
+            discrete_values += texts
+    return str(discrete_values)

@@ -77,17 +77,18 @@ class Purpose:
     ask: Mapping[str, float] = field(default_factory=dict)
 
     def check(self, model: str, what: str, *tasks: str) -> None:
-        """Check that a network can do the task.
+        """Check that a network can do the task; any network may do a user's own task.
 
         Args:
-            model: its name.
-            what: the network does, such as "compares a picture with texts".
-            *tasks: tasks that this is good for. A user's own task may read any output.
+            model: name of the model.
+            what: what the network does, such as "compares a picture with texts".
+            *tasks: the tasks of the package that it can do.
 
         Raises:
-            ModelError: it cannot.
+            ModelError: it cannot do the task.
         """
-        if self.task in (*OUTPUTS_BY_TASK, "answer") and self.task not in tasks:
+        is_user_task = self.task not in (*OUTPUTS_BY_TASK, "answer")
+        if not is_user_task and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
             raise ModelError(
                 f"model {model} {what} and cannot do task {self.task}; use {instead}"
@@ -336,7 +337,7 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     module_name, _, attribute = target.partition(":")
     module = _import_module(module_name, spec, libraries)
     value = _get_attribute(module, attribute, module_name)
-    if not isinstance(value, (nn.Module, Model)):
+    if not isinstance(value, (nn.Module, Model)):  # a function or a class makes it
         value = _call_factory(value, spec)
     if isinstance(value, Model):
         if weights is not None:

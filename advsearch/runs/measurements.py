@@ -27,11 +27,11 @@ class Measurements:
     """What a run has measured, in its store; measures what is not there, until the time
     is up.
 
-    One measurement is always made, so that a run gets on. What is stored is read back
-    before the first one.
+    One measurement is always made, so that a run that is resumed again and again gets
+    on. What is stored is read back before the first one.
 
     Attributes:
-        n_new: how many were made in this sitting.
+        n_new: how many were made since the run was started or resumed.
 
     Args:
         context: `experiment.RunContext` of the run that stores them.
@@ -50,15 +50,14 @@ class Measurements:
 
         Raises:
             OutOfTime: it would have to be measured, the time is up, and something was
-                measured in this sitting.
+                measured since the run was started or resumed.
         """
         stored = self.read(key)
         if stored is None:
-            # one measurement in each sitting, so that every one gets further
             if self.n_new and time.monotonic() >= self._end:
                 raise OutOfTime
             self.n_new += 1
-            # so that it is the same as when it is read back
+            # encoded and decoded, so that it is equal to what is read back later
             stored = json.loads(json.dumps(measure()))
             self.put(key, stored)
         return stored

@@ -83,11 +83,13 @@ class Units:
         return self.find_cluster(step // self.models)
 
     def find_cluster(self, image_index: Number) -> Number:
-        """Return the number of the unit of a picture: its photograph, or its draw.
+        """Return the number of the unit of a picture: that of its photograph, or of its
+        draw where there is no folder of photographs.
 
         Args:
             image_index: number of the picture in the whole sweep, or an array of them.
         """
+        # the scenes, of `scene` pictures each, are in the photographs in turn
         if self.photographs > 1:
             return image_index // self.scene % self.photographs
         return self.find_draw(image_index)
