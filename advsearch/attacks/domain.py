@@ -104,8 +104,7 @@ class Block:
         if self.options and (self.options < 0 or not is_plain_number):
             raise InputError(
                 f"block{where}: expected a discrete choice to have at least one "
-                "option, size 1, norm 'box' and "
-                f"bounds [0, 1], got {self}"
+                f"option, size 1, norm 'box' and bounds [0, 1], got {self}"
             )
 
     @property
@@ -645,8 +644,7 @@ class SampleSequence:
         if sampler == "sobol" and dimensions > MAX_DIMENSIONS:
             raise InputError(
                 f"`sampler` sobol: expected at most {MAX_DIMENSIONS} numbers to draw, "
-                f"got {dimensions}; use "
-                "`sampler=random`"
+                f"got {dimensions}; use `sampler=random`"
             )
         self.dimensions = dimensions
         self._sampler = sampler

@@ -324,7 +324,6 @@ def _compute_reference(features: ReadFeatures, clean: Tensor) -> Tensor:
     if not bool(torch.isfinite(reference).all()):
         raise InputError(
             "objective: expected finite features of the clean picture, got NaN or "
-            "infinity; check that the "
-            "model predicts it"
+            "infinity; check that the model predicts it"
         )
     return reference.mean(dim=0)

@@ -143,10 +143,8 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
     except TypeError as error:
         raise InputError(
             f"objective {get_name(function)!r}: expected a function that takes "
-            "(output, "
-            "images, truth) or (output, "
-            f"labels), and beside them any of {', '.join(REQUESTABLE_INPUTS)} by name: "
-            f"{error}"
+            "(output, images, truth) or (output, labels), and beside them any of "
+            f"{', '.join(REQUESTABLE_INPUTS)} by name: {error}"
         ) from None
     return ObjectiveSignature(takes_images, requested_inputs)
 
@@ -282,9 +280,8 @@ def _check_keeps_gradient(name: str, values: Tensor, sources: tuple[Any, ...]) -
     if any(isinstance(source, Tensor) and source.requires_grad for source in sources):
         raise InputError(
             f"objective {name!r}: the result does not depend on the output or the "
-            "images differentiably; "
-            "remove .detach(), torch.no_grad() or argmax, or choose a policy "
-            "without gradients (random)"
+            "images differentiably; remove .detach(), torch.no_grad() or argmax, or "
+            "choose a policy without gradients (random)"
         )
 
 
@@ -311,10 +308,9 @@ def _check_differentiable(name: str, values: Tensor, sources: Sequence[Tensor]) 
             raise
         raise InputError(
             f"objective {name!r}: it writes into what it is given, and then torch "
-            "can't differentiate what it has "
-            "computed before; use the operation that makes a new tensor (`scatter` for "
-            "`scatter_`, "
-            "`logits.clone()` before `logits[...] = ...`)"
+            "can't differentiate what it has computed before; use the operation that "
+            "makes a new tensor (`scatter` for `scatter_`, `logits.clone()` before "
+            "`logits[...] = ...`)"
         ) from None
 
 
@@ -332,15 +328,13 @@ def _check_values(name: str, values: Any, count: int) -> Tensor:
     if not isinstance(values, Tensor):
         raise InputError(
             f"objective {name!r}: expected a torch tensor of shape ({count},), got "
-            f"{type(values).__name__}; "
-            "compute it with torch operations and don't call .item(), float() or "
-            ".numpy()"
+            f"{type(values).__name__}; compute it with torch operations and don't call "
+            ".item(), float() or .numpy()"
         )
     if not values.is_floating_point():
         raise InputError(
             f"objective {name!r}: expected floating-point values, got {values.dtype}; "
-            "a count or a comparison has "
-            "no gradient"
+            "a count or a comparison has no gradient"
         )
     value_per_image: Tensor = values
     # a scalar is the value of a single image
@@ -655,8 +649,7 @@ def _make_feature_objective(
     if features is None or clean is None:
         raise InputError(
             f"objective {kind.name!r}: expected the model's features and a clean "
-            "picture, got none; use "
-            "get_objective(name, "
+            "picture, got none; use get_objective(name, "
             "features=advsearch.models.features.features_of(model), clean=picture)"
         )
     return _ignore_inputs(kind.of_features(features, clean))
@@ -737,9 +730,8 @@ def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -
     if bool((slope[:, classes].sum(dim=1) < 0.0).all()):
         warnings.warn(
             f"objective {name!r} falls as the target becomes more likely, and an "
-            "objective is maximised: the search "
-            "walks away from the target. Negate it, or take a loss of advsearch.losses "
-            "that begins with targeted_.",
+            "objective is maximised: the search walks away from the target. Negate "
+            "it, or take a loss of advsearch.losses that begins with targeted_.",
             stacklevel=2,
         )
 
@@ -768,13 +760,11 @@ def check_objective(
     if targeted and minimise:
         raise InputError(
             "minimise: expected no `target` beside it; to make the object easier to "
-            "recognise as something else, "
-            "give that as `label`"
+            "recognise as something else, give that as `label`"
         )
     if isinstance(objective, str) and objective not in OBJECTIVE_KINDS:
         hint = (
-            "From Python, objective= also takes a function (output, images, "
-            "truth), "
+            "From Python, objective= also takes a function (output, images, truth), "
             "or (output, labels)."
         )
         raise UnknownNameError("objective", objective, OBJECTIVE_KINDS, hint)
@@ -806,8 +796,7 @@ def _check_kind(
         fitting = [name for name, other in OBJECTIVE_KINDS.items() if other.fits(task)]
         raise InputError(
             f"objective: expected an objective of task {task} ({', '.join(fitting)}), "
-            f"got {kind.name}, which takes "
-            f"outputs of {kind.task}"
+            f"got {kind.name}, which takes outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
         # a distance from the clean picture has no other use than to be maximised

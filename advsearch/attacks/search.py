@@ -574,8 +574,7 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
     if u.shape != domain.start.shape or u.dtype != torch.float32:
         raise RuntimeError(
             f"policy {name!r} proposed {u.dtype} of shape {tuple(u.shape)}; expected "
-            "torch.float32 of shape "
-            f"{tuple(domain.start.shape)}"
+            f"torch.float32 of shape {tuple(domain.start.shape)}"
         )
     excess = domain.violation(u)
     if not excess <= TOLERANCE:  # so that NaN is rejected as well
@@ -604,13 +603,10 @@ def _check_evaluation(
     if proposal.gradient and gradient is not None and not is_like_u:
         raise RuntimeError(
             f"evaluate returned a gradient of {gradient.dtype}, shape "
-            f"{tuple(gradient.shape)}; expected "
-            f"{u.dtype}, shape {tuple(u.shape)}"
+            f"{tuple(gradient.shape)}; expected {u.dtype}, shape {tuple(u.shape)}"
         )
     if not min_cost <= evaluation.cost <= max_cost:
         raise RuntimeError(
             f"evaluate took {evaluation.cost} renders; expected {min_cost} to "
-            f"{max_cost}, by "
-            "the proposal's samples and the "
-            "domain's gradient_cost"
+            f"{max_cost}, by the proposal's samples and the domain's gradient_cost"
         )

@@ -67,7 +67,8 @@ def find_surface_light_refusal(
         problem: problem of the search.
         steps: evaluations of the search.
         policy: policy by which it searches.
-        specialise: whether anything may be left out or predicted at all.
+        specialise: whether the search may leave out or predict anything at all (the
+            setting of this name).
     """
     if not specialise:
         return Refusal("nothing is left out")
@@ -78,7 +79,8 @@ def find_surface_light_refusal(
     moves_camera = bool(changed_inputs & CAMERA_INPUTS)
     if not moves_camera:
         return NO_CAMERA
-    if steps * problem.n_draws < MIN_IMAGES:
+    n_images = steps * problem.n_draws
+    if n_images < MIN_IMAGES:
         return Refusal(
             f"light on surfaces pays from {MIN_IMAGES} pictures on",
             RefusalCause.TOO_FEW_STEPS,
@@ -86,7 +88,8 @@ def find_surface_light_refusal(
     if policy.takes_differences(problem.domain, steps):
         return Refusal(f"{policy.name} takes derivatives that need rendered pictures")
     for group in problem.plan.groups:
-        # a prediction has derivatives of its own: no estimator that a user chose
+        # a prediction has derivatives of its own, and not by an estimator that the user
+        # has forced
         needs_estimator = group.estimator not in ("none", "image")
         if group.is_forced and needs_estimator:
             return Refusal(f"the estimator of {group.name} is forced")
@@ -273,15 +276,14 @@ class SurfaceLight(PredictedSearch):
         Images are predicted in batches if neither conditions nor colors vary: then they
         do not depend on the evaluations before.
         """
-        # images of queries that were predicted in one batch, by position
+        # images of the queries of the latest batch, by position
         predicted_images: dict[int, Tensor] = {}
+        can_batch = self.problem.conditions is None and not self._searches_colors
         for position, query in enumerate(queries):
             self.replay(query)
             if self._must_trace(query):
                 yield from trace(queries[position:])
                 return
-            can_batch = self.problem.conditions is None and not self._searches_colors
-            # the last batch is used up
             if can_batch and position not in predicted_images:
                 batch = queries[position : position + self.renderer.batch_size]
                 images = self.renderer.predict_images([batched.u for batched in batch])
@@ -304,13 +306,16 @@ class SurfaceLight(PredictedSearch):
         return self._evaluate_over_conditions(query)
 
     def _evaluate_trial(self, query: Query, image: Tensor | None) -> Evaluation:
-        """Evaluate a trial: judge the predicted image as a file would hold it."""
+        """Evaluate a trial: judge the predicted image as a file would hold it.
+
+        `image` is that image; None to predict it here.
+        """
         full_u = self.problem.add_conditions(query.u)
         with torch.no_grad():
             rounded = round_to_8_bit(self.renderer(full_u) if image is None else image)
         return Evaluation.from_judgement(
             self.problem.judge(rounded, full_u),
-            cost=0,
+            cost=0,  # nothing is rendered
             predicted=RAYS_PER_PIXEL,
             picture=rounded if query.with_image else None,
         )
@@ -333,14 +338,16 @@ class SurfaceLight(PredictedSearch):
         predicted.
         """
         problem = self.problem
-        # a random search uses few sets of conditions in turn, for which what cameras
-        # see is stored
+        # A random search ("baseline") uses few sets of conditions in turn, for which what
+        # cameras see is stored.
         reuses_conditions = (
             query.kind == "baseline"
             and problem.conditions is not None
             and not self._has_moving
         )
-        index = query.index % N_CONDITION_SETS if reuses_conditions else query.index
+        index = query.index
+        if reuses_conditions:
+            index = query.index % N_CONDITION_SETS
         conditions = self._choose_conditions(query.kind, index, problem.n_draws)
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
@@ -390,8 +397,9 @@ class SurfaceLight(PredictedSearch):
         computed, which are the last coordinates: the base color is then missing.
         """
         with torch.no_grad():
-            n_coordinates = len(self._input_space.start)
-            inputs = self._input_space.inputs(full_u[len(full_u) - n_coordinates :])
+            # all coordinates, or those of the conditions, which are the last
+            first = len(full_u) - len(self._input_space.start)
+            inputs = self._input_space.inputs(full_u[first:])
             return self.problem.renderer.scene.assembly(inputs)
 
     def _predict_images(

@@ -97,8 +97,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
     if not models.is_fetch_allowed(spec):
         raise models.CodeNotAllowedError(
             f"a file names the model {spec}, to which pictures would be sent, and the "
-            f"key in {models.KEY}; "
-            f"{models.explain_how_to_allow(spec)}"
+            f"key in {models.KEY}; {models.explain_how_to_allow(spec)}"
         )
     # A chat answers in words, another address with scores. After a # stands the name.
     chat = address.path.endswith(CHAT_SUFFIX)
@@ -626,10 +625,9 @@ class AddressModel(models.RemoteNetwork):
         limit = self.limits[name]
         advised_limit = 2 * limit or 1  # twice 0 would allow nothing either
         return errors.ModelError(
-            f"model {self.name}: {spent:,.10g} {name} are spent, "
-            f"and `ask` allows {limit:,.10g}; "
-            f"`advsearch resume RUN ask.{name}={advised_limit:.10g}` goes on "
-            "with more, and asks nothing twice"
+            f"model {self.name}: {spent:,.10g} {name} are spent, and `ask` allows "
+            f"{limit:,.10g}; `advsearch resume RUN ask.{name}={advised_limit:.10g}` "
+            "goes on with more, and asks nothing twice"
         )
 
     def _send_together(
@@ -713,8 +711,7 @@ class AddressModel(models.RemoteNetwork):
         if 300 <= status < 400:
             location = self._clean(error.headers.get("Location", "elsewhere"))
             return (
-                f"sends on to {location}, and pictures and keys are not sent "
-                "there; "
+                f"sends on to {location}, and pictures and keys are not sent there; "
                 "give that address if you trust it"
             )
         if status in (401, 403):

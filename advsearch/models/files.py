@@ -59,9 +59,8 @@ PICKLE_SUFFIXES = (".pkl", ".pickle", ".pth", ".ckpt", ".bin")
 
 EXPORT_HINT = (
     "Export the network instead: torch.export.save(torch.export.export(net.eval(), "
-    "(example,)), 'net.pt2'); or pass "
-    "the nn.Module through the Python API; or store its state dict as safetensors and "
-    "name what builds it: "
+    "(example,)), 'net.pt2'); or pass the nn.Module through the Python API; or store "
+    "its state dict as safetensors and name what builds it: "
     "'package.module:callable@weights.safetensors'"
 )
 
@@ -364,10 +363,8 @@ def _advise_on_second_input(names: list[str]) -> str:
         return ""
     return (
         f"; its second input {names[1][:60]!r} is not known: of two inputs, the second "
-        "may be the size of the "
-        "pictures, (N, 2) in pixels, (width, height), named 'orig_target_sizes'. "
-        "Export a network that takes pictures "
-        "alone"
+        "may be the size of the pictures, (N, 2) in pixels, (width, height), named "
+        "'orig_target_sizes'. Export a network that takes pictures alone"
     )
 
 
@@ -472,10 +469,8 @@ def _open_session(path: Path) -> tuple[Any, Any]:
     if release is None or (int(release[1]), int(release[2])) < MIN_VERSION:
         raise ModelError(
             f"model {path}: needs onnxruntime {'.'.join(map(str, MIN_VERSION))} or "
-            "newer, "
-            f"got {runtime.__version__}, which "
-            "may read weights from anywhere that a file names: pip install -U "
-            "'advsearch[onnx]'"
+            f"newer, got {runtime.__version__}, which may read weights from anywhere "
+            "that a file names: pip install -U 'advsearch[onnx]'"
         )
     options = runtime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
@@ -521,9 +516,8 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
     got = ", ".join(f"{tensor.name} {tensor.type} {tensor.shape}" for tensor in inputs)
     advice = _advise_on_second_input([tensor.name for tensor in inputs])
     raise ModelError(
-        f"model file {path}: expected one input, a batch of floating-point images "
-        "of 4 dimensions (or of uint8), "
-        f"got {got or 'none'}{advice}"
+        f"model file {path}: expected one input, a batch of floating-point images of 4 "
+        f"dimensions (or of uint8), got {got or 'none'}{advice}"
     )
 
 

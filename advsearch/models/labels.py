@@ -453,7 +453,6 @@ def _find_problem(names: Sequence[Any]) -> str:
         if len(name) > MAX_NAME_CHARACTERS:
             return (
                 f"expected a name of at most {MAX_NAME_CHARACTERS} characters for "
-                "class "
-                f"{index}, got {len(name):,}"
+                f"class {index}, got {len(name):,}"
             )
     return ""

@@ -151,10 +151,8 @@ def _check_batch_size(model: Model) -> None:
     if count * height * width > scale_limit(MAX_PIXELS):
         raise ModelError(
             f"model {model.name}: takes {count:,} images of {height:,} x {width:,} "
-            "pixels at once, expected at most "
-            f"{scale_limit(MAX_PIXELS):,} pixels; if you trust it, {FACTOR}=10 in the "
-            "environment allows ten times "
-            "as many"
+            f"pixels at once, expected at most {scale_limit(MAX_PIXELS):,} pixels; if "
+            f"you trust it, {FACTOR}=10 in the environment allows ten times as many"
         )
 
 
@@ -178,10 +176,9 @@ def _find_probabilities(model: Model, rows: Tensor) -> bool:
         return False
     kind = "percentages that sum to 100" if are_percentages else "probabilities"
     warn(
-        f"model {model.name} returns {kind}. Their logarithm is used, so that "
-        "margins are log-odds, "
-        "but gradients vanish where a probability rounds to 0 or 1: remove the "
-        "final softmax if you can"
+        f"model {model.name} returns {kind}. Their logarithm is used, so that margins "
+        "are log-odds, but gradients vanish where a probability rounds to 0 or 1: "
+        "remove the final softmax if you can"
     )
     return True
 
@@ -195,9 +192,8 @@ def _warn_of_pixel_probabilities(model: Model, images: Tensor) -> None:
     if is_map and _are_probabilities(output.movedim(1, -1).flatten(0, 2)):
         warn(
             f"model {model.name} returns probabilities for each pixel: margins are "
-            "differences of these and no "
-            "log-odds, and gradients vanish where one rounds to 0 or 1: remove the "
-            "final softmax if you can"
+            "differences of these and no log-odds, and gradients vanish where one "
+            "rounds to 0 or 1: remove the final softmax if you can"
         )
 
 
@@ -209,9 +205,8 @@ def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
     if kind:
         warn(
             f"model {model.name} returns {kind}. They are taken for logits: the "
-            "probabilities that are shown are none, "
-            "and margins are differences of such scores. Return what stands before the "
-            "last function"
+            "probabilities that are shown are none, and margins are differences of "
+            "such scores. Return what stands before the last function"
         )
 
 
@@ -539,8 +534,7 @@ def _find_batch_limits(
     if rows is not None and not _are_equal(model, rows, batch_rows):
         warn(
             f"model {model.name} sees an image differently in a batch: was it exported "
-            "in training mode? "
-            "Call .eval() before exporting"
+            "in training mode? Call .eval() before exporting"
         )
     return min_batch, max_batch
 

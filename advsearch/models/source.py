@@ -127,8 +127,7 @@ class Purpose:
         if self.names is None:
             raise InputError(
                 f"model {model} {what} and has no classes of its own: name them, two "
-                "at least, such as "
-                "`labels=mug,cup,bowl` or `labels=imagenet`"
+                "at least, such as `labels=mug,cup,bowl` or `labels=imagenet`"
             )
         return self.names
 
@@ -225,8 +224,7 @@ def freeze_network(module: nn.Module, name: str) -> nn.Module:
         ) as error:  # it holds a lock or an open file, for example
             warn(
                 f"model {name} cannot be copied ({get_first_line(error)}): the module "
-                "itself is set to evaluation mode and "
-                "its parameters are frozen"
+                "itself is set to evaluation mode and its parameters are frozen"
             )
     with suppress(NotImplementedError):  # programs of torch.export have no modes
         module.eval()
@@ -472,8 +470,7 @@ def import_library(name: str, spec: str, extra: str) -> Any:
             ) from error
         raise ModelError(
             f"model {spec}: needs {name}, which cannot be imported here "
-            f"({get_first_line(error)}). Install builds that fit "
-            f"each other: {command}, torch's own index where that has them; or export "
-            "the network with torch.export "
-            f"where {name} works, and give the .pt2 file"
+            f"({get_first_line(error)}). Install builds that fit each other: "
+            f"{command}, torch's own index where that has them; or export the network "
+            f"with torch.export where {name} works, and give the .pt2 file"
         ) from error

@@ -298,8 +298,7 @@ class RunDirectory:
             )
             raise InputError(
                 f"{self.path}: cannot resume with something else than the run began "
-                f"with: {changes}; restore it, or "
-                f"{self.restart_advice}"
+                f"with: {changes}; restore it, or {self.restart_advice}"
             )
         has_new_facts = not facts.keys() <= before.keys()
         if has_new_facts:

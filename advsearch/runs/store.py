@@ -109,9 +109,8 @@ _INSERT = (
 )
 
 _INSERT_CACHED = (
-    "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations "
-    "WHERE "
-    "kind = ? AND step = ?"
+    "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations WHERE kind = ? "
+    "AND step = ?"
 )
 
 

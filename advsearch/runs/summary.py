@@ -164,7 +164,9 @@ def _parse_array(data: bytes) -> NDArray[np.float32] | None:
     count = int(header[1])
     if len(data) != header.end() + 4 * count:
         return None
-    numbers = np.frombuffer(data, np.float32, count=count, offset=header.end())
+    numbers: NDArray[np.float32] = np.frombuffer(
+        data, np.float32, count=count, offset=header.end()
+    )
     return numbers.copy()  # frombuffer is read-only
 
 

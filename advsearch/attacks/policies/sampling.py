@@ -120,8 +120,7 @@ class Sobol(NonAdaptivePolicy):
         if size > MAX_SOBOL_DIM:
             raise InputError(
                 f"policy 'sobol': expected at most {MAX_SOBOL_DIM} dimensions, got "
-                f"{size}; use "
-                "policy random, nes, pgd or auto"
+                f"{size}; use policy random, nes, pgd or auto"
             )
         seed = draw_seed(generator)
         max_points = max(1, MAX_CHUNK_NUMBERS // size)
@@ -313,9 +312,8 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
             renders_text = "billions of"
         raise InputError(
             f"policy 'grid': {min_values} values for each of {n_numbers} "
-            f"numbers{combinations_text} are {renders_text} renders, and "
-            f"there are {steps}; use policy sobol, cmaes, nes, pgd or auto, or give "
-            "more `steps`"
+            f"numbers{combinations_text} are {renders_text} renders, and there are "
+            f"{steps}; use policy sobol, cmaes, nes, pgd or auto, or give more `steps`"
         )
     if points:
         return [n_options or points for n_options in options]

@@ -146,8 +146,7 @@ def _check_length(
     if isinstance(max_tokens, int) and n_tokens > max_tokens:
         raise InputError(
             f"prompt: expected picture, prompt and name to have at most {max_tokens} "
-            f"tokens for model {loaded.name}, "
-            f"got {n_tokens}"
+            f"tokens for model {loaded.name}, got {n_tokens}"
         )
 
 
@@ -254,9 +253,8 @@ class _LanguageModel(nn.Module):
         if not max_error <= LEVELS * float(expected.abs().max()):
             raise errors.ModelError(
                 f"model {spec}: its processor {type(self.processor).__name__} does "
-                "something else to numbers than to "
-                "8-bit pictures. Wrap network and processing in an nn.Module of yours, "
-                "and give that from Python"
+                "something else to numbers than to 8-bit pictures. Wrap network and "
+                "processing in an nn.Module of yours, and give that from Python"
             )
 
     def _process(self, image: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
@@ -509,10 +507,9 @@ def _check_torchvision_installed(spec: str) -> None:
     """
     if importlib.util.find_spec("torchvision") is None:
         raise errors.ModelError(
-            f"model {spec}: its processor cuts pictures into patches or "
-            "tiles, and lets gradients through "
-            "with torchvision only, which is not installed: pip install "
-            "'advsearch[torchvision]'"
+            f"model {spec}: its processor cuts pictures into patches or tiles, and "
+            "lets gradients through with torchvision only, which is not installed: "
+            "pip install 'advsearch[torchvision]'"
         )
 
 
@@ -663,7 +660,6 @@ def _make_unsupported_error(loaded: LoadedNetwork, what: str) -> errors.ModelErr
     """Return the error for a network that is none of those read here."""
     return errors.ModelError(
         f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; "
-        "expected one that goes on with the "
-        "text it is given, such as LlavaForConditionalGeneration or "
-        "Qwen2_5_VLForConditionalGeneration"
+        "expected one that goes on with the text it is given, such as "
+        "LlavaForConditionalGeneration or Qwen2_5_VLForConditionalGeneration"
     )

@@ -52,8 +52,7 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
         if tries:
             raise models.CodeNotAllowedError(
                 f"a file names the model {spec}, which is not on this machine and "
-                "would be fetched; "
-                f"{models.explain_how_to_allow(spec)}"
+                f"would be fetched; {models.explain_how_to_allow(spec)}"
             ) from error
         raise errors.ModelError(
             f"model {spec}: cannot be fetched or read ({models.get_first_line(error)}). "
@@ -325,9 +324,8 @@ def _make_processor_error(spec: str, processor: Any, what: str) -> errors.ModelE
     """Return the error for a processor that cannot be used, with what it does."""
     return errors.ModelError(
         f"model {spec}: its processor {type(processor).__name__} {what}, which no "
-        "size, mean and std stand for. Wrap "
-        "network and processing in an nn.Module of yours, and give that from Python or "
-        "as package.module:callable"
+        "size, mean and std stand for. Wrap network and processing in an nn.Module of "
+        "yours, and give that from Python or as package.module:callable"
     )
 
 
@@ -385,9 +383,8 @@ class LoadedNetwork:
         if self.processor is None:
             models.warn(
                 f"model {self.spec} comes without an image processor: pictures are "
-                "given as they are, RGB in [0, 1]. "
-                "Say `mean`, `std` and `input_size` of load_model if it wants them "
-                "otherwise"
+                "given as they are, RGB in [0, 1]. Say `mean`, `std` and `input_size` "
+                "of load_model if it wants them otherwise"
             )
             return Processing()
         return measure_processor(self.processor, self.spec)

@@ -54,8 +54,7 @@ half a minute.
 """
 
 ADVICE = (
-    "Give a folder that save_pretrained(..., safe_serialization=True) has made "
-    "as "
+    "Give a folder that save_pretrained(..., safe_serialization=True) has made as "
     "'hf:FOLDER'"
 )
 
@@ -229,14 +228,12 @@ def _find_family(architecture: str, network: Any, spec: str) -> Family:
             return family
     raise errors.ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has "
-        "ForImageClassification, "
-        "ForVideoClassification, ForSemanticSegmentation, ForUniversalSegmentation, "
-        "ForObjectDetection or "
-        "ForDepthEstimation in it, one that compares pictures with texts, as "
-        "CLIPModel, one that goes on in words, as "
-        "LlavaForConditionalGeneration, or one that has features, as Dinov2Model. Wrap "
-        "another in an nn.Module whose "
-        "output a task can judge, your own too, and give that from Python"
+        "ForImageClassification, ForVideoClassification, ForSemanticSegmentation, "
+        "ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, "
+        "one that compares pictures with texts, as CLIPModel, one that goes on in "
+        "words, as LlavaForConditionalGeneration, or one that has features, as "
+        "Dinov2Model. Wrap another in an nn.Module whose output a task can judge, "
+        "your own too, and give that from Python"
     )
 
 
@@ -259,9 +256,8 @@ def _load_config(
         if not find_file("config.json") and find_file("open_clip_config.json"):
             raise errors.ModelError(
                 f"model {spec}: is a repository of open_clip, which transformers can't "
-                "read; give the network as "
-                "transformers has it, such as hf:openai/clip-vit-base-patch32 or "
-                "hf:google/siglip-base-patch16-224"
+                "read; give the network as transformers has it, such as "
+                "hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
             )
         config: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(
             name, **hub_options
@@ -278,10 +274,9 @@ def _load_config(
         raise errors.ModelError(
             f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
             "repository of that name is in the "
-            f"cache{_format_suggestions(models.find_similar_names(name, cached))} or can be "
-            "had "
-            f"({models.get_first_line(error)}). Check the "
-            "name and the network, or give a folder"
+            f"cache{_format_suggestions(models.find_similar_names(name, cached))} or "
+            f"can be had ({models.get_first_line(error)}). Check the name and the "
+            "network, or give a folder"
         ) from error
 
 
@@ -500,9 +495,8 @@ def check_fits(
     if size > free:
         raise errors.ModelError(
             f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} "
-            "GB of memory are free. Give a "
-            "smaller network, one whose weights are stored in bfloat16, or a machine "
-            "with more memory"
+            "GB of memory are free. Give a smaller network, one whose weights are "
+            "stored in bfloat16, or a machine with more memory"
         )
 
 

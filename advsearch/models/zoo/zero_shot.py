@@ -74,9 +74,8 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     if is_trained_with_sigmoid:
         models.warn(
             f"model {name} judges each name by itself, with a sigmoid of its logit: "
-            "the scores that are shown are a "
-            f"softmax over the {len(names)} names, and margins are differences of "
-            "logits"
+            f"the scores that are shown are a softmax over the {len(names)} names, and "
+            "margins are differences of logits"
         )
     return source
 
@@ -107,8 +106,7 @@ def check_takes_pictures(network: Any, spec: str) -> None:
     if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
         raise errors.ModelError(
             f"model {spec}: takes patches of pictures of any size (NaFlex), which are "
-            "no picture; give a "
-            "checkpoint of a fixed resolution, such as "
+            "no picture; give a checkpoint of a fixed resolution, such as "
             "hf:google/siglip2-base-patch16-224"
         )
 
@@ -268,8 +266,7 @@ def warn_of_equal_texts(
         if first != index:
             models.warn(
                 f"model {name} reads {names[first]!r} (#{first}) and {names[index]!r} "
-                f"(#{index}) as the same text: "
-                "it cannot tell one from the other"
+                f"(#{index}) as the same text: it cannot tell one from the other"
             )
             return
 
@@ -349,8 +346,7 @@ def _build_grounding_dino(
     if other_prompts:
         raise InputError(
             f"prompt: model {name} reads all names in one text, in which several "
-            "prompts can't be averaged; give one, "
-            "or none for the names alone"
+            "prompts can't be averaged; give one, or none for the names alone"
         )
     text = ". ".join(prompt.replace("{}", word).strip().lower() for word in words) + "."
     tokens = torch.tensor(
@@ -366,9 +362,8 @@ def _build_grounding_dino(
     if len(token_index) != len(words):
         raise InputError(
             f"labels: model {name} reads the names as one text with full stops between "
-            "them, in which these "
-            f"{len(words)} are {len(token_index)}; leave . and ? out of names and "
-            "prompt"
+            f"them, in which these {len(words)} are {len(token_index)}; leave . and ? "
+            "out of names and prompt"
         )
 
     def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
