@@ -563,7 +563,8 @@ def _shorten(
         return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
     # The next length is the geometric mean of the bounds, but at most this factor away
-    # from the bound that was set last.
+    # from the bound that was set last. With a guess it is small at first, and squared
+    # after each trial.
     max_step = math.inf
     trial_length = math.sqrt(high * low)
     if likely is not None:

@@ -77,34 +77,40 @@ class Block:
                 f"bounds{where}: expected 0 <= low < high <= 1, got "
                 f"[{self.low}, {self.high}]"
             )
-        if self.norm == "box" and self.epsilon is not None:
-            raise InputError(
-                f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out"
-            )
-        if self.norm != "box" and not (
-            self.epsilon is not None and 0.0 < self.epsilon < math.inf
-        ):
-            raise InputError(
-                f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} "
-                "radius, in units where the "
-                f"parameter's whole range is 1), got {self.epsilon}; try `epsilon=0.1`"
-            )
-        if self.periodic and self.norm != "box":
-            raise InputError(
-                f"block{where}: a periodic block cannot have a norm "
-                "budget; use norm 'box'"
-            )
-        if self.reach is not None and (self.norm != "box" or not self.reach > 0.0):
-            raise InputError(
-                f"block{where}: expected a reach over 0 and norm 'box', got "
-                f"{self.reach} and {self.norm!r}"
-            )
+        self._check_budget(where)
         has_full_range = self.low == 0.0 and self.high == 1.0 and not self.periodic
         is_plain_number = self.size == 1 and self.norm == "box" and has_full_range
         if self.options and (self.options < 0 or not is_plain_number):
             raise InputError(
                 f"block{where}: expected a discrete choice to have at least one "
                 f"option, size 1, norm 'box' and bounds [0, 1], got {self}"
+            )
+
+    def _check_budget(self, where: str) -> None:
+        """Check what depends on the norm: a ball has an epsilon; only a box may be periodic
+        or have a reach.
+        """
+        is_box = self.norm == "box"
+        if is_box and self.epsilon is not None:
+            raise InputError(
+                f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out"
+            )
+        has_budget = self.epsilon is not None and 0.0 < self.epsilon < math.inf
+        if not is_box and not has_budget:
+            raise InputError(
+                f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} "
+                "radius, in units where the parameter's whole range is 1), got "
+                f"{self.epsilon}; try `epsilon=0.1`"
+            )
+        if self.periodic and not is_box:
+            raise InputError(
+                f"block{where}: a periodic block cannot have a norm "
+                "budget; use norm 'box'"
+            )
+        if self.reach is not None and (not is_box or not self.reach > 0.0):
+            raise InputError(
+                f"block{where}: expected a reach over 0 and norm 'box', got "
+                f"{self.reach} and {self.norm!r}"
             )
 
     @property
@@ -348,24 +354,32 @@ class Domain:
         for _ in range(n):
             u = torch.empty_like(self.start)
             for block, part in self.list_block_slices():
-                noise = torch.rand(block.size, generator=generator)
-                if block.options:
-                    noise = option_center(noise, block.options)
-                elif extreme and block.norm != "box":
-                    noise.round_()  # 0 or 1: a corner, or the signs of a direction
-                if block.norm != "l2" or block.epsilon is None:
-                    u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
-                elif extreme:
-                    # far beyond the ball in a direction of random signs; the projection
-                    # below brings it to the surface
-                    far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
-                    u[part] = self.start[part] + (noise * 2.0 - 1.0) * far_distance
-                else:
-                    u[part] = self.start[part] + _sample_ball(
-                        block.size, block.epsilon, float(noise[0]), generator
-                    )
+                u[part] = self._sample_block(block, part, generator, extreme=extreme)
             samples.append(self.project(u))
         return torch.stack(samples)
+
+    def _sample_block(
+        self, block: Block, part: slice, generator: torch.Generator, *, extreme: bool
+    ) -> Tensor:
+        """Return a random value (size,) of the slice of u that is a block; see `sample`.
+
+        It may lie outside of an l2 ball, or outside of the bounds around one.
+        """
+        noise = torch.rand(block.size, generator=generator)
+        if block.options:
+            noise = option_center(noise, block.options)
+        elif extreme and block.norm != "box":
+            noise.round_()  # 0 or 1: a corner, or the signs of a direction
+        if block.norm != "l2" or block.epsilon is None:
+            return torch.lerp(self.lower[part], self.upper[part], noise)
+        if extreme:
+            # far beyond the ball in a direction of random signs, so that the projection
+            # brings it to the surface
+            far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
+            return self.start[part] + (noise * 2.0 - 1.0) * far_distance
+        return self.start[part] + _sample_ball(
+            block.size, block.epsilon, float(noise[0]), generator
+        )
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
         """Return one unit step (d,) from u uphill, by the gradient (d,), finite.

@@ -609,26 +609,27 @@ def get_objective(
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
     kind = _find_kind(objective)
-    is_built_in = kind is not None and _BUILT_IN_KINDS.get(kind.name) is kind
-    takes_logits_of_task = False
     if kind is None:
         function = wrap_objective(objective)  # type: ignore[arg-type]
-    elif kind.of_task is not None:
+        return _orient_objective(
+            function, task, takes_logits_of_task=False, user_function=objective
+        )
+    # functions of other packages are called with copies, and their mistakes explained
+    is_built_in = _BUILT_IN_KINDS.get(kind.name) is kind
+    if kind.of_task is not None:
         # It knows target and direction itself.
-        return kind.of_task(task) if is_built_in else _pass_copies(kind.of_task(task))
-    elif kind.of_features is not None:
+        task_objective = kind.of_task(task)
+        return task_objective if is_built_in else _pass_copies(task_objective)
+    if kind.of_features is not None:
         function = _make_feature_objective(kind, features, clean)
         if not is_built_in:
             function = _pass_copies(function)
     else:
         form = kind.form(targeted=targeted)
         function = _ignore_inputs(form) if is_built_in else wrap_objective(form)
-        takes_logits_of_task = _has_other_outputs(task)
+    takes_logits_of_task = kind.of_features is None and _has_other_outputs(task)
     return _orient_objective(
-        function,
-        task,
-        takes_logits_of_task=takes_logits_of_task,
-        user_function=objective if kind is None else None,
+        function, task, takes_logits_of_task=takes_logits_of_task, user_function=None
     )
 
 
@@ -685,6 +686,7 @@ def _orient_objective(
             target its direction is checked once, at its first gradient.
     """
     targeted = task.target is not None
+    # set to False by the first call that has checked it
     must_check_direction = user_function is not None and targeted
 
     def oriented_objective(
@@ -697,9 +699,9 @@ def _orient_objective(
         if takes_logits_of_task:
             function_output = task.as_logits(output, labels)
         value = function(function_output, images, labels, more)
-        is_of_logits = isinstance(output, Tensor) and output.ndim == 2
-        has_gradient = value.requires_grad and is_of_logits and output.requires_grad
-        if must_check_direction and has_gradient:
+        has_logits = isinstance(output, Tensor) and output.ndim == 2
+        can_check = value.requires_grad and has_logits and output.requires_grad
+        if must_check_direction and can_check:
             must_check_direction = False
             name = get_name(user_function)  # type: ignore[arg-type]
             _warn_of_direction(name, value, output, labels)

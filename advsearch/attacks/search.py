@@ -185,19 +185,7 @@ def search(
         RuntimeError, ValueError: the policy left the domain or `evaluate` broke its
             contract; a bug.
     """
-    if steps < 1:
-        raise InputError(f"steps: expected at least 1, got {steps}")
-    if candidates < 0 or repeats < 1:
-        raise InputError(
-            "candidates and repeats: expected at least 0 and 1, got "
-            f"{candidates} and {repeats}"
-        )
-    if max_extra_repeats < 0:
-        raise InputError(
-            f"max_extra_repeats: expected at least 0, got {max_extra_repeats}"
-        )
-    if seconds is not None and not seconds > 0.0:
-        raise InputError(f"seconds: expected a number over 0, got {seconds}")
+    _check_limits(steps, candidates, repeats, max_extra_repeats, seconds)
     started = time.perf_counter()
     log = _Log(evaluate, domain, on_step, max(1, candidates), kind, render_seed)
     try:
@@ -217,6 +205,29 @@ def search(
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
     return _make_result(log, stopped, time.perf_counter() - started)
+
+
+def _check_limits(
+    steps: int,
+    candidates: int,
+    repeats: int,
+    max_extra_repeats: int,
+    seconds: float | None,
+) -> None:
+    """Raise InputError if a limit of a search is out of range."""
+    if steps < 1:
+        raise InputError(f"steps: expected at least 1, got {steps}")
+    if candidates < 0 or repeats < 1:
+        raise InputError(
+            "candidates and repeats: expected at least 0 and 1, got "
+            f"{candidates} and {repeats}"
+        )
+    if max_extra_repeats < 0:
+        raise InputError(
+            f"max_extra_repeats: expected at least 0, got {max_extra_repeats}"
+        )
+    if seconds is not None and not seconds > 0.0:
+        raise InputError(f"seconds: expected a number over 0, got {seconds}")
 
 
 def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
@@ -331,21 +342,8 @@ class _Log:
                 that are ranked share them.
             phase: phase of the search.
         """
-        queries = list[Query]()
         started = time.perf_counter()
-        for record_index, (proposal, seed_index) in enumerate(
-            zip(proposals, indices, strict=True), start=len(self.records)
-        ):
-            query = Query(
-                proposal.u.clone(),
-                seed=stream(self.render_seed, self.kind, seed_index),
-                kind=self.kind,
-                index=record_index,
-                phase=phase,
-                gradient=proposal.gradient,
-                samples=proposal.samples,
-            )
-            queries.append(query)
+        queries = self._make_queries(proposals, indices, phase)
         for proposal, query, raw in zip(
             proposals, queries, self.evaluate(queries), strict=True
         ):
@@ -359,6 +357,26 @@ class _Log:
                 self.on_step(self.records[-1], *copy_value((proposal.u, evaluation)))
             yield evaluation
             started = time.perf_counter()
+
+    def _make_queries(
+        self, proposals: Sequence[Proposal], seed_indices: Sequence[int], phase: Phase
+    ) -> list[Query]:
+        """Return the queries of proposals, numbered from the next record on."""
+        queries = list[Query]()
+        for record_index, (proposal, seed_index) in enumerate(
+            zip(proposals, seed_indices, strict=True), start=len(self.records)
+        ):
+            query = Query(
+                proposal.u.clone(),
+                seed=stream(self.render_seed, self.kind, seed_index),
+                kind=self.kind,
+                index=record_index,
+                phase=phase,
+                gradient=proposal.gradient,
+                samples=proposal.samples,
+            )
+            queries.append(query)
+        return queries
 
     def _count(self, proposal: Proposal, evaluation: Evaluation, phase: Phase) -> None:
         """Count the costs of an evaluation; one of the search may become a candidate.

@@ -166,8 +166,10 @@ def choose_spp(
     ladder: Sequence[int] = LADDER,
     trials: int = 0,
 ) -> SampleCount:
-    """Climb a ladder of sample counts with each configuration until more of them would
-    not change the verdict; return the highest rung that one of them needed.
+    """Choose a sample count at which more samples would not change the verdict.
+
+    A ladder of sample counts is climbed with each configuration until that holds; the
+    highest rung that one of them needed is returned.
 
     A verdict asks on which side of zero the margin is. A configuration has settled at a
     rung, with the mean margin m there and m' at the rung below, when on that side, with
@@ -285,11 +287,12 @@ def _climb_ladder(
     # (index of the rung, renders there), in the order in which one looks
     all_looks = list(product(range(1, len(ladder)), look_sizes))
     for look_index, (level, count) in enumerate(all_looks):
-        # whether this look or a later one may show that the margin has settled
-        if not any(
+        # at this look, or at a later one
+        may_settle_yet = any(
             _may_settle(margins_of_rungs, ladder, *level_and_count, n_looks)
             for level_and_count in all_looks[look_index:]
-        ):
+        )
+        if not may_settle_yet:
             break
         if not _may_settle(margins_of_rungs, ladder, level, count, n_looks):
             continue

@@ -388,9 +388,9 @@ def verify(
     def has_failed(new_trials: Sequence[Judgement]) -> bool:
         """Return whether too many trials fail for the claim to hold at any look."""
         all_trials = [*done, *new_trials]
+        # all that there may be
         n_total = looks[-1] if has_several_looks else rule.count_valid(clean_trials)
-        n_failures = _list_outcomes(rule, all_trials, clean_trials).count(False)
-        has_too_many = n_failures > rule.count_allowed_failures(n_total)
+        has_too_many = _fails_too_often(rule, all_trials, clean_trials, n_total)
         return len(all_trials) >= min_trials and has_too_many
 
     run = partial(run_trials, evaluate, spp=spp, seed=seed, first_index=first_index)
@@ -429,6 +429,17 @@ def verify(
         is_early=is_success and is_early,
         begin=first_index,
     )
+
+
+def _fails_too_often(
+    rule: Rule,
+    trials: Sequence[Judgement],
+    clean_trials: Sequence[Judgement],
+    n_total: int,
+) -> bool:
+    """Return whether more trials fail than the rule allows of `n_total` trials."""
+    n_failures = _list_outcomes(rule, trials, clean_trials).count(False)
+    return n_failures > rule.count_allowed_failures(n_total)
 
 
 def _choose_confidence(rule: Rule, *, has_several_looks: bool) -> float:

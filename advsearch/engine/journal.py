@@ -417,8 +417,11 @@ class Journal:
         for row in rows:
             # Rows of old runs may have no judgement.
             if row.correct is not None:
-                # a predicted image has no seed; its count of samples is stored as spp
-                predicted = 0 if row.seed is not None else row.spp or 1
+                # a predicted image has no seed; by how many samples it was predicted is
+                # stored as spp
+                predicted = 0
+                if row.seed is None:
+                    predicted = row.spp or 1
                 trials[row.step] = Evaluation.from_judgement(
                     read_judgement(row), predicted=predicted
                 )

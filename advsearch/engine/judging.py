@@ -262,7 +262,6 @@ def add_metrics(
     """
     # what the metrics returned, with an entry for each item of a mapping
     returned = dict[str, Any]()
-    values = dict[str, float | None]()
     image_output, image_truth = _unbatch(output, truth)
     with torch.no_grad():
         for name, metric in metrics.items():
@@ -271,17 +270,27 @@ def add_metrics(
                 returned |= {f"{name}.{key}": value for key, value in result.items()}
             else:
                 returned[name] = result
-        for name, result in returned.items():
-            try:
-                value = float(result)
-            except (TypeError, ValueError, RuntimeError):
-                raise InputError(
-                    f"metrics: {name}: expected a number, or a dict from names to "
-                    f"numbers, got {result!r:.80}"
-                ) from None
-            # neither JSON nor a column of rows has NaN or infinity
-            values[name] = value if math.isfinite(value) else None
+        values = {
+            name: _to_metric_value(name, result) for name, result in returned.items()
+        }
     return replace(judgement, metrics=values)
+
+
+def _to_metric_value(name: str, result: Any) -> float | None:
+    """Return what a metric returned as a number; None for NaN and infinity, which
+    neither JSON nor a column of rows has.
+
+    Raises:
+        InputError: it is no number.
+    """
+    try:
+        value = float(result)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(
+            f"metrics: {name}: expected a number, or a dict from names to "
+            f"numbers, got {result!r:.80}"
+        ) from None
+    return value if math.isfinite(value) else None
 
 
 def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:

@@ -601,10 +601,11 @@ def make_renderer(
     )
     has_exposure_time = any(space.exposure)
     _check_rig_times(description, space)
-    # knows how points move in the image: for derivatives at outlines, and for blur
+    # how points move in the image: for derivatives at outlines, and for blur
     motion = None
     if differentiated or has_exposure_time:
         motion = Motion(description, size, scene.assembly)
+    # of the exposure, whose images make up one with motion blur
     moments: tuple[Moment, ...] = ()
     if has_exposure_time and motion is not None:
         moments = choose_moments(space, motion, scene.assembly, size[0])

@@ -148,7 +148,7 @@ def load_models(
         )
     sentences = _take_model_warnings(caught)
     if config.camera is not None:
-        n_cameras = len(read_rig(config.camera))
+        n_cameras = len(read_rig(config.camera))  # 0 for a camera that is no rig
         if n_cameras:
             _check_task_of_rig(task, config.camera, n_cameras)
             loaded = tuple(replace(model, cameras=n_cameras) for model in loaded)
@@ -170,6 +170,7 @@ def _load_for_task(
     single_image_task = task.single_image_task
     labels = None
     prompt = None
+    # it reads classes, and the names of these come from nothing else
     needs_names = single_image_task.labelled and not single_image_task.names_source
     if is_only_task or needs_names:
         labels = config.labels
@@ -531,11 +532,12 @@ def _list_active_choices(
     searched: it is set to a number, another choice fixes it, or it has no default range
     and none is set.
     """
-    # parameters by name
+    # names of parameters: by a choice, or by a number
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
+    # those with a default range, and those with a range of their own
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }

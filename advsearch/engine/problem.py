@@ -628,6 +628,7 @@ class Problem:
             self.renderer.routes.get(name, frozenset()) for name in searched_groups
         ]
         input_names = frozenset().union(*routes) & find_linear_inputs(self.renderer)
+        # light paths may be shorter than those of a search, and are never longer
         depth = min(LIGHT_DEPTH, self.search_depth or LIGHT_DEPTH)
         with self.renderer.scene.limit_depth(depth):
             return LinearRenderer(
@@ -635,7 +636,7 @@ class Problem:
                 full_u,
                 seed,
                 spp=spp,
-                quick=True,
+                quick=True,  # there will be many of them
                 names=input_names,
                 collected=collected_light,
             )

@@ -363,22 +363,16 @@ def render(
     )
     progress = as_progress(progress)
     progress.stage("rendering", around or 1)
-    views = list[View]()
-    truth_warnings = list[str]()
-    remarks = tuple[str, ...]()
+    rendered_views = list[_RenderedView]()
     for view_description in _orbit_scene(description, around):
-        rendered = _render_view(view_description, model, model_task, settings)
-        views.append(rendered.view)
+        rendered_views.append(
+            _render_view(view_description, model, model_task, settings)
+        )
         # what the task has learned of the model's predictions holds for the next view
-        model_task = rendered.task
-        remarks = remarks or model_task.remarks
-        if rendered.truth_error:
-            truth_warnings = [
-                f"Nothing is drawn into the picture: {rendered.truth_error}"
-            ]
+        model_task = rendered_views[-1].task
         progress.advance(1)
     # Formation and space are the same for all views, exposure included.
-    space = rendered.space
+    space = rendered_views[-1].space
     return Rendering(
         replace(
             description,
@@ -386,16 +380,32 @@ def render(
         ),
         model.name,
         unbound_task.name,
-        rendered.formation,
+        rendered_views[-1].formation,
         spp,
-        tuple(views),
+        tuple(rendered.view for rendered in rendered_views),
         (
             *space.list_notes(description),
             *describe_adjusted_defaults(space.adjusted_defaults),
-            *truth_warnings,
-            *remarks,
+            *_list_view_warnings(rendered_views),
         ),
     )
+
+
+def _list_view_warnings(rendered_views: Sequence[_RenderedView]) -> list[str]:
+    """Return a sentence if no truth could be drawn into a view, and the first remarks
+    of the task.
+    """
+    sentences = list[str]()
+    truth_errors = [
+        rendered.truth_error for rendered in rendered_views if rendered.truth_error
+    ]
+    if truth_errors:
+        sentences.append(f"Nothing is drawn into the picture: {truth_errors[-1]}")
+    for rendered in rendered_views:
+        if rendered.task.remarks:
+            sentences += rendered.task.remarks
+            break
+    return sentences
 
 
 def _check_azimuth_is_free(controls: Sequence[Control]) -> None:

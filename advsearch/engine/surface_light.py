@@ -120,7 +120,9 @@ class SurfaceLight(PredictedSearch):
     _n_lights: int = 0
     _next_comparison: int = 0
     # what cameras see, by index of the conditions and begin of the batch
-    _looks: dict[tuple[int, int], list[LitCameraView]] = field(default_factory=dict)
+    _stored_views: dict[tuple[int, int], list[LitCameraView]] = field(
+        default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         """Find which coordinates move cameras, change environments and color surfaces.
@@ -138,15 +140,14 @@ class SurfaceLight(PredictedSearch):
             )
             for control in space.controls
         }
-        self._moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})[
-            :n_searched
-        ]
+        # the searched coordinates come first, those of the conditions after them
+        is_moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})
+        self._moving = is_moving[:n_searched]
         if self.moving_coordinates is not None:
             self._moving = torch.zeros(n_searched, dtype=torch.bool).index_fill_(
                 0, self.moving_coordinates, True
             )
         self._has_moving = bool(self._moving.any())
-        # the searched coordinates come first, those of the conditions after them
         is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
         self._searches_colors = bool(is_coloring.any())
         self.draws_conditions = problem.conditions is not None and self._searches_colors
@@ -154,6 +155,7 @@ class SurfaceLight(PredictedSearch):
         # else, the inputs of the conditions are enough.
         self._input_space = space
         if not self._has_moving:
+            # (without `n_searched` there are no conditions: then all controls count)
             conditions = space.controls[problem.n_searched or 0 :]
             self._input_space = replace(space, controls=conditions)
         self._needs_new_light = self._find_light_conditions()[n_searched:]
@@ -237,6 +239,7 @@ class SurfaceLight(PredictedSearch):
         problem = self.problem
         u = problem.domain.start if self.light_u is None else self.light_u
         with self.count_time(), torch.no_grad():
+            # without a seed, with conditions that leave the scene unchanged
             full_u = problem.add_conditions(u)
             self._renderer = SurfaceRenderer(
                 problem.renderer, full_u, seeds.stream(problem.seed, "surface light")
@@ -254,9 +257,9 @@ class SurfaceLight(PredictedSearch):
                 inputs = self._compute_inputs(torch.cat([u, condition]))
                 self._renderer.get_light(inputs)  # computes it, and stores it
                 tick(N_LIGHTS // len(self._bank_conditions))
-            self._n_lights = (
-                len(self._renderer.stored_lights) + self._renderer.n_dropped
-            )
+            # lights that did not fit into memory were dropped
+            n_stored = len(self._renderer.stored_lights)
+            self._n_lights = n_stored + self._renderer.n_dropped
         self._compare(u, index=0)
 
     @property
@@ -408,8 +411,8 @@ class SurfaceLight(PredictedSearch):
         u: Tensor,
         key: tuple[int, int] | None = None,
     ) -> Tensor:
-        """Return predicted images (n, H, W, 3) of u (d,) under conditions, with a
-        graph.
+        """Return predicted images (n, H, W, 3) of full configurations, with a graph
+        from their searched coordinates u (d,).
 
         What cameras see is stored under `key`, if there is one, for later calls.
         """
@@ -418,15 +421,15 @@ class SurfaceLight(PredictedSearch):
             torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations
         ]
         inputs = [self._compute_inputs(full_u) for full_u in full_configurations]
-        looks: Iterable[LitCameraView]
+        views: Iterable[LitCameraView]
         if key is None:
-            looks = self.renderer.trace_views(inputs)
+            views = self.renderer.trace_views(inputs)
         else:
-            if key not in self._looks:
-                self._looks[key] = list(self.renderer.trace_views(inputs))
-            looks = self._looks[key]
+            if key not in self._stored_views:
+                self._stored_views[key] = list(self.renderer.trace_views(inputs))
+            views = self._stored_views[key]
         return self.renderer.compose_images(
-            looks, inputs, color, variable_configurations
+            views, inputs, color, variable_configurations
         )
 
     def replay(self, query: Query) -> None:
@@ -471,6 +474,7 @@ class SurfaceLight(PredictedSearch):
         with self.count_time():
             generator = torch.Generator().manual_seed(seed)
             samples = problem.domain.sample(generator, N_VIEWS)  # (N_VIEWS, d)
+            # of each view: random where something moves, else as searched
             configurations = torch.where(self._moving, samples, u)
             configurations[0] = u
             conditions = self._choose_conditions(kind, index, N_VIEWS)

@@ -407,19 +407,7 @@ class Transport(PredictedSearch):
         # a baseline draws configurations by chance: there is nothing to keep up with
         if not is_due or not kind.startswith("search"):
             return predictor
-        seed = seeds.stream(self.problem.seed, "transport check", number)
-        renderer = self.problem.renderer
-        if self.window is not None:
-            renderer = renderer.copy_with(crop=predictor.path_renderer.crop)
-        deviation = self.compare(
-            lambda view: self.problem.compare_view(
-                predictor,
-                query.u,
-                seeds.stream(seed, "view", view),
-                self.problem.spp,
-                renderer=renderer,
-            )
-        )
+        deviation = self._compare_predictor(predictor, query)
         has_same_surroundings, current = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
@@ -434,6 +422,24 @@ class Transport(PredictedSearch):
             self._full_images[kind] = current
         self.n_renewals = (self.n_renewals or 0) + 1
         return self._current[kind]
+
+    def _compare_predictor(self, predictor: Predictor, query: Query) -> Deviation:
+        """Compare a predictor with traced images of a query's configuration, in the window
+        if there is one.
+        """
+        seed = seeds.stream(self.problem.seed, "transport check", query.index)
+        renderer = self.problem.renderer
+        if self.window is not None:
+            renderer = renderer.copy_with(crop=predictor.path_renderer.crop)
+        return self.compare(
+            lambda view: self.problem.compare_view(
+                predictor,
+                query.u,
+                seeds.stream(seed, "view", view),
+                self.problem.spp,
+                renderer=renderer,
+            )
+        )
 
     def _compare_surroundings(
         self, kind: str, u: Tensor

@@ -57,6 +57,7 @@ maximum delay in seconds, which doubles each time.
 """
 
 MAX_CONCURRENT = 64
+MAX_BATCH = 8  # images in one call of the model
 # HTTP statuses of a server that may answer later.
 RETRY_STATUSES = (408, 409, 425, 429, 500, 502, 503, 504, 529)
 MAX_ANSWER_BYTES = 1 << 20  # maximum size of an answer in bytes
@@ -99,36 +100,23 @@ def load(spec: str, purpose: models.Purpose) -> Model:
             f"a file names the model {spec}, to which pictures would be sent, and the "
             f"key in {models.KEY}; {models.explain_how_to_allow(spec)}"
         )
-    # A chat answers in words, another address with scores. After a # stands the name.
-    chat = address.path.endswith(CHAT_SUFFIX)
-    name = address.fragment or address.netloc
-    free, question = purpose.parse_question(name, "is behind an address")
-    if chat and not free:
-        raise InputError(
-            f"task: a chat such as {name} answers in words; use "
-            "`task=answer`, and say the right `label`"
-        )
-    if chat and not address.fragment:
-        raise InputError(
-            f"model {spec}: expected the name of the chat's model behind "
-            f"a #: {spec}#NAME"
-        )
+    is_chat = address.path.endswith(CHAT_SUFFIX)
+    name = address.fragment or address.netloc  # what stands after a #, or the host
+    is_free, question = purpose.parse_question(name, "is behind an address")
+    if is_chat:
+        _check_chat(spec, name, is_free=is_free, is_named=bool(address.fragment))
     module = AddressModel(
         url=urlunsplit(address._replace(fragment="")),
         name=name,
         spec=spec,
         limits=resolve_limits(purpose.ask),
-        chat=address.fragment if chat else "",
-        question=question or (models.QUESTION if free else ""),
+        chat=address.fragment if is_chat else "",
+        question=question or (models.QUESTION if is_free else ""),
         tokens=purpose.tokens,
-        times=purpose.times if free else 1,
+        times=purpose.times if is_free else 1,
     )
-    if not free:
-        # Without names by the user, those of its scores for a gray image are taken.
-        gray_image = np.full(
-            (models.DEFAULT_SIZE, models.DEFAULT_SIZE, 3), 128, np.uint8
-        )
-        module.names = purpose.names or tuple(module.request_scores([gray_image])[0])
+    if not is_free:
+        module.names = purpose.names or _request_names(module)
         if len(module.names) < 2:
             raise errors.ModelError(
                 f"model {name}: expected scores of two names at "
@@ -141,9 +129,32 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         preprocessing=models.Preprocessing(
             (models.DEFAULT_SIZE, models.DEFAULT_SIZE), resizes=False
         ),
-        batch_limits=(1, 8),
+        batch_limits=(1, MAX_BATCH),
         differentiable=False,
     )
+
+
+def _check_chat(spec: str, name: str, *, is_free: bool, is_named: bool) -> None:
+    """Raise InputError unless a chat is asked for free answers, and its model named."""
+    if not is_free:
+        raise InputError(
+            f"task: a chat such as {name} answers in words; use "
+            "`task=answer`, and say the right `label`"
+        )
+    if not is_named:
+        raise InputError(
+            f"model {spec}: expected the name of the chat's model behind "
+            f"a #: {spec}#NAME"
+        )
+
+
+def _request_names(module: AddressModel) -> tuple[str, ...]:
+    """Return the names to which a model behind an address gives scores, by those for a
+    gray image.
+    """
+    size = (models.DEFAULT_SIZE, models.DEFAULT_SIZE)
+    gray_image = np.full((*size, 3), 128, np.uint8)
+    return tuple(module.request_scores([gray_image])[0])
 
 
 def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
@@ -319,26 +330,32 @@ class AddressModel(models.RemoteNetwork):
     answer_cache: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __call__(self, pictures: Tensor) -> Any:
-        """Return logits (N, names) for images, or the texts about each; see the
-        class.
+        """Return logits (N, names) for images (N, 3, H, W), or without names the texts
+        about each.
         """
         levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8)
         images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
-        if self.names:
-            # Scores of 0 have no logarithm: they are `MIN_SCORE`.
-            rows = [
-                [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
-                for scores in self.request_scores(images)
-            ]
-            return torch.tensor(rows).log()
+        if not self.names:
+            return [{"texts": texts} for texts in self._request_texts(images)]
+        # Scores of 0 have no logarithm: they are `MIN_SCORE`.
+        rows = [
+            [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
+            for scores in self.request_scores(images)
+        ]
+        return torch.tensor(rows).log()
+
+    def _request_texts(self, images: Sequence[Image8Bit]) -> list[list[str]]:
+        """Return the texts about each image, one for each of `times` requests.
+
+        Of an answer with scores it is the likeliest name.
+        """
         requests = [(image, turn) for image in images for turn in range(self.times)]
         texts = []
         for answer in self._get_answers(requests):
             scores: dict[str, float] = answer.get("scores") or {answer["text"]: 1.0}
-            # The likeliest name, if there are scores.
             texts.append(max(scores, key=scores.__getitem__))
         return [
-            {"texts": texts[start : start + self.times]}
+            texts[start : start + self.times]
             for start in range(0, len(texts), self.times)
         ]
 
@@ -392,25 +409,30 @@ class AddressModel(models.RemoteNetwork):
             request = json.dumps([body, turn, self.spec]).encode()
             key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
             keys.append(key)
-            if self.store is None:
-                answers[key] = self.answer_cache.get(key)
-            else:
-                answers[key] = self.store.read_json_note(key)
+            answers[key] = self._read_stored_answer(key)
             if not isinstance(answers[key], dict):  # it is not stored, or damaged
                 new_bodies[key] = body
         new_keys = list(new_bodies)
+        read_answer = self._read_chat if self.chat else self._read_plain
         for index, response in self._send(list(new_bodies.values())):
             self._count_tokens(response)
             key = new_keys[index]
-            answer = (
-                self._read_chat(response) if self.chat else self._read_plain(response)
-            )
-            answers[key] = answer
-            if self.store is None:
-                self.answer_cache[key] = answer
-            else:
-                self.store.write_note(key, json.dumps(answer))
+            answers[key] = read_answer(response)
+            self._store_answer(key, answers[key])
         return [answers[key] for key in keys]
+
+    def _read_stored_answer(self, key: str) -> Any:
+        """Return the answer that is stored under a key; None if there is none."""
+        if self.store is None:
+            return self.answer_cache.get(key)
+        return self.store.read_json_note(key)
+
+    def _store_answer(self, key: str, answer: dict[str, Any]) -> None:
+        """Store an answer under a key."""
+        if self.store is None:
+            self.answer_cache[key] = answer
+        else:
+            self.store.write_note(key, json.dumps(answer))
 
     def _make_body(self, image: Image8Bit) -> dict[str, Any]:
         """Return the JSON body of a request about an image.
@@ -818,12 +840,13 @@ class AddressModel(models.RemoteNetwork):
             isinstance(count, int) and not isinstance(count, bool) and count >= 0
             for count in counts
         )
-        # Tokens of a limit that nobody set, and of no price, need not be known.
+        # Tokens need not be known without a limit (by default there is none) and a price.
+        needs_tokens = self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token
         if is_stated:
             tokens_in, tokens_out = counts
             self.spent.update({"tokens_in": tokens_in, "tokens_out": tokens_out})
             self._store_spent()
-        elif self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token:
+        elif needs_tokens:
             raise self._make_error(
                 "`usage` with prompt_tokens and completion_tokens, as "
                 "`ask` counts tokens",

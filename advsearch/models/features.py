@@ -256,8 +256,11 @@ def pooled(returned: Any, *, token: bool) -> Tensor | None:
             if isinstance(returned, Mapping)
             else getattr(returned, part, None)
         )
-        if isinstance(value, Tensor):
-            if value.dim() == 3:
-                return value[:, 0] if token else value.mean(dim=1)
-            return value.flatten(2).mean(dim=2) if value.dim() == 4 else value
+        if not isinstance(value, Tensor):
+            continue
+        if value.dim() == 3:  # tokens
+            return value[:, 0] if token else value.mean(dim=1)
+        if value.dim() == 4:  # maps
+            return value.flatten(2).mean(dim=2)
+        return value
     return returned if isinstance(returned, Tensor) else None

@@ -235,7 +235,8 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     """Return the source with what the program's signature shows: input size, layout,
     batch limits, dtype.
 
-    A program may take (N, K, 3, H, W) or (N, K, H, W, 3), all images of a rig at once.
+    A program may take (N, K, 3, H, W) or (N, K, H, W, 3), all images of a rig at once:
+    then it is wrapped as one of single images.
 
     Raises:
         ModelError: it takes something other than images.
@@ -250,7 +251,7 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     takes_sizes = (
         len(names) == 2 and names[1] in SIZE_INPUTS and inputs[1].shape[1] == 2
     )
-    if takes_sizes:  # the height and width of each image, which are known
+    if takes_sizes:  # the size of each image, which is known and passed as well
         size_type = inputs[1].dtype
         source = replace(source, size_type=size_type)
     else:

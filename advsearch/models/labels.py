@@ -407,26 +407,34 @@ def _read_file(path: Path) -> tuple[str, ...]:
         ) from None
     if not text.strip():
         raise FileFormatError(f"{where}: expected label names, got an empty file")
-    names: Any = [line.strip() for line in text.strip("\r\n").splitlines()]
-    # Text has a name on each line, even on an empty one within it.
-    if path.suffix.lower() == ".json" or text.lstrip()[0] in "[{":
-        try:
-            names = parse_json(text)
-        except json.JSONDecodeError as error:
-            raise FileFormatError(
-                f"{where}: not valid JSON (line {error.lineno}: {error.msg})"
-            ) from None
-        except ValueError as error:
-            raise FileFormatError(
-                f"{where}: expected label names, got {error}"
-            ) from None
+    is_json = path.suffix.lower() == ".json" or text.lstrip()[0] in "[{"
+    if is_json:
+        names = _parse_json_names(text, where)
+    else:  # a name on each line, even on an empty one within the text
+        names = [line.strip() for line in text.strip("\r\n").splitlines()]
+    return _check_names(names, FileFormatError, where)
+
+
+def _parse_json_names(text: str, where: str) -> list[Any]:
+    """Return the names in a JSON list, or in a JSON object from index to name.
+
+    `where` is the beginning of an error. Raises FileFormatError for anything else.
+    """
+    try:
+        names = parse_json(text)
+    except json.JSONDecodeError as error:
+        raise FileFormatError(
+            f"{where}: not valid JSON (line {error.lineno}: {error.msg})"
+        ) from None
+    except ValueError as error:
+        raise FileFormatError(f"{where}: expected label names, got {error}") from None
     if isinstance(names, dict):
-        names = _order_by_index(names, where)
+        return _order_by_index(names, where)
     if not isinstance(names, list):
         raise FileFormatError(
             f"{where}: expected a list of names or an object from index to name"
         )
-    return _check_names(names, FileFormatError, where)
+    return names
 
 
 def _check_names(

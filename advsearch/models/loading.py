@@ -351,26 +351,31 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
             "model: expected a name, a path, an nn.Module or a Model, "
             f"got {got}. {FORMS}"
         )
-    text = spec.strip()
+    return _find_named_source(spec.strip(), purpose)
+
+
+def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
+    """Find the source of a model that a text names, or the model itself."""
     network, weights = split_weights(text)
     if network == "reference":
         return reference.load(weights=weights)
-    source = text.partition(":")[0].lower()
-    if ":" in text and source in SOURCES:
-        load = SOURCES[source]
-        return load(text, purpose) if source in SOURCES_WITH_PURPOSE else load(text)
+    prefix = text.partition(":")[0].lower()
+    if ":" in text and prefix in SOURCES:
+        load = SOURCES[prefix]
+        return load(text, purpose) if prefix in SOURCES_WITH_PURPOSE else load(text)
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(
             f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'"
         )
     if parse_code_reference(text) is not None:
         return load_callable(text, SOURCES)
-    if (
+    is_path = (
         Path(text).suffix.lower() in files.SUFFIXES
         or "/" in text
         or os.sep in text
         or os.path.exists(text)
-    ):
+    )
+    if is_path:
         return files.load_file(Path(text))
     raise _make_unknown_error(text)
 
@@ -469,8 +474,9 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
     for key, choices in (("layout", ("NCHW", "NHWC")), ("channels", ("RGB", "BGR"))):
         if key in options:
             fields[key] = _parse_choice(key, options[key], choices)
-    # What is empty has the default of `Preprocessing`.
-    return Preprocessing(**{key: value for key, value in fields.items() if value})
+    # What neither states is left to the defaults of `Preprocessing`.
+    stated_fields = {key: value for key, value in fields.items() if value}
+    return Preprocessing(**stated_fields)
 
 
 def _parse_input_size(value: Any) -> tuple[int, int]:

@@ -38,20 +38,23 @@ class _Recomputed(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, ask: Callable[[Tensor], Any], structure: list[Any], images: Tensor
+        ctx: Any,
+        function: Callable[[Tensor], Any],
+        structures: list[Any],
+        images: Tensor,
     ) -> tuple[Tensor, ...]:
         """Return the tensors in what a function returns for images, without a graph.
 
         Args:
             ctx: stores what `backward` needs.
-            ask: the function; it is called again for the gradient.
-            structure: gets how the tensors are nested appended, as only tensors may be
-                returned.
+            function: the function; it is called again for the gradient.
+            structures: list to which it is appended how the tensors are nested, as only
+                tensors may be returned.
             images: (N, H, W, 3).
         """
-        tensors, tree = tree_flatten(ask(images))  # autograd is off in here
-        structure.append(tree)
-        ctx.ask = ask
+        tensors, structure = tree_flatten(function(images))  # autograd is off in here
+        structures.append(structure)
+        ctx.function = function
         ctx.save_for_backward(images)
         ctx.mark_non_differentiable(
             *(tensor for tensor in tensors if not tensor.is_floating_point())
@@ -70,7 +73,7 @@ class _Recomputed(torch.autograd.Function):
         create_graph = torch.is_grad_enabled()
         with torch.enable_grad():
             images = images if create_graph else images.detach().requires_grad_()
-            tensors, _ = tree_flatten(ctx.ask(images))
+            tensors, _ = tree_flatten(ctx.function(images))
         outputs = []
         output_gradients = []
         for tensor, gradient in zip(tensors, gradients, strict=True):
@@ -326,22 +329,10 @@ class Model:
                 output in it.
         """
         images = check_images(images)
-        max_batch = self.batch_limits[1]
-        recomputes = False
         if self.cameras > 1:
             # (N, H, cameras * W, 3) to (N * cameras, H, W, 3)
             images = images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
-            # the images of a rig stay in one batch, if they fit into it
-            full_rigs = max_batch - max_batch % self.cameras
-            max_batch = max(full_rigs, min(max_batch, self.cameras))
-            recomputes = (
-                not isinstance(self.module, AllAtOnce)
-                and len(images) > MAX_STORED_IMAGES
-                and images.requires_grad
-                and torch.is_grad_enabled()
-            )
-            if recomputes:
-                max_batch = min(max_batch, MAX_STORED_IMAGES)
+        recomputes = self._must_recompute(images)
 
         def return_to_device(output: Tensor) -> Tensor:
             # A copy, because a network may write into the same memory again.
@@ -355,16 +346,40 @@ class Model:
 
         outputs = [
             compute_checkpointed(run_batch, batch) if recomputes else run_batch(batch)
-            for batch in images.split(max_batch)
+            for batch in images.split(self._find_max_batch(recomputes=recomputes))
         ]
         output = outputs[0] if len(outputs) == 1 else join_outputs(outputs)
         if self.cameras == 1:
             return output
+        # of each rig, a tuple of the outputs for its images
         image_outputs = [output[index : index + 1] for index in range(len(output))]
         return [
             tuple(image_outputs[start : start + self.cameras])
             for start in range(0, len(image_outputs), self.cameras)
         ]
+
+    def _must_recompute(self, images: Tensor) -> bool:
+        """Return whether the activations of images (N, H, W, 3) of rigs would take too
+        much memory, so that the gradient computes them again.
+        """
+        return (
+            self.cameras > 1
+            and not isinstance(self.module, AllAtOnce)
+            and len(images) > MAX_STORED_IMAGES
+            and images.requires_grad
+            and torch.is_grad_enabled()
+        )
+
+    def _find_max_batch(self, *, recomputes: bool) -> int:
+        """Return the maximum number of images in a batch.
+
+        The images of a rig stay in one batch, if they fit into it.
+        """
+        max_batch = self.batch_limits[1]
+        if self.cameras > 1:
+            full_rigs = max_batch - max_batch % self.cameras
+            max_batch = max(full_rigs, min(max_batch, self.cameras))
+        return min(max_batch, MAX_STORED_IMAGES) if recomputes else max_batch
 
     def copy_network(self) -> nn.Module:
         """Return a copy of the network, to train it further.
@@ -521,7 +536,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
 
     Args:
         read: reads it; see `Read`.
-        returned: by the network.
+        returned: what the network returned.
         count: number of images.
         name: name of the model, for messages.
 
@@ -531,18 +546,11 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
     try:
         output = read(returned, count)
     except ValueError as error:
-        advice = _advise_on_missing_scores(returned)
-        if not advice:
-            likely_task = _guess_task(returned)
-            # `read` is usually the method of a task.
-            task = getattr(getattr(read, "__self__", None), "name", None)
-            # Actions look like rows of scores.
-            if likely_task and task not in (likely_task, "command"):
-                advice = _advise_other_task(likely_task)
-            else:
-                advice = "wrap the network, or ask for another task"
+        # `read` is usually the method of a task.
+        task = getattr(getattr(read, "__self__", None), "name", None)
         raise ModelError(
-            f"model {name}: {error}, got {describe_output(returned)}; {advice}"
+            f"model {name}: {error}, got {describe_output(returned)}; "
+            f"{_advise_on_output(returned, task)}"
         ) from None
     if len(output) != count:
         raise ModelError(
@@ -551,6 +559,18 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
         )
     mend_batch_norms(output)
     return output
+
+
+def _advise_on_output(returned: Any, task: str | None) -> str:
+    """Return what to do about an output that a task, by its name, cannot read."""
+    advice = _advise_on_missing_scores(returned)
+    if advice:
+        return advice
+    likely_task = _guess_task(returned)
+    # Actions, of task command, look like rows of scores.
+    if likely_task and task not in (likely_task, "command"):
+        return _advise_other_task(likely_task)
+    return "wrap the network, or ask for another task"
 
 
 def describe_output(returned: Any) -> str:

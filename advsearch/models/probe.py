@@ -9,7 +9,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -551,25 +551,18 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     """
     reason = "it is zero everywhere"
     try:
-        with DetachMode() as detaching:
-            try:
-                rows, gradient = _compute_gradient(model, images)
-            except RuntimeError as error:
-                # What the network detaches may be all that has a gradient.
-                if not (repeatable and detaching.has_detached):
-                    raise
-                reason = get_first_line(error)
-                with torch.no_grad():
-                    rows = _run(model, images)
-                gradient = torch.zeros_like(images)
-        if _has_no_output(model, rows):
+        probed = _compute_first_gradient(model, images, repeatable)
+        if probed.reason is not None:
+            reason = probed.reason
+        if _has_no_output(model, probed.rows):
             # It detects nothing in noise: rendered images will show its gradient.
             return dataclasses.replace(model, differentiable=True)
-        if repeatable and detaching.has_detached:
+        gradient = probed.gradient
+        if repeatable and probed.has_detached:
             model, gradient = _try_attached(model, images, gradient)
         has_gradient = bool((gradient != 0).any())
         if has_gradient and repeatable:
-            is_detached = detaching.has_detached and not model.attached
+            is_detached = probed.has_detached and not model.attached
             _check_gradient(model, images, gradient, is_detached)
     except (RuntimeError, ModelError) as error:
         has_gradient = False
@@ -588,6 +581,43 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     return dataclasses.replace(model, differentiable=has_gradient)
 
 
+class _FirstGradient(NamedTuple):
+    """The gradient of a network as it is.
+
+    Attributes:
+        rows: rows of `_run` for the images.
+        gradient: gradient by the images.
+        has_detached: whether the network detaches what has a gradient.
+        reason: why there is no gradient, if it is known.
+    """
+
+    rows: Tensor
+    gradient: Tensor
+    has_detached: bool
+    reason: str | None = None
+
+
+def _compute_first_gradient(
+    model: Model, images: Tensor, repeatable: bool
+) -> _FirstGradient:
+    """Compute the gradient of a network by images (N, H, W, 3).
+
+    It is zero where the network detaches all that has one, and its outputs are
+    repeatable, so that this can be mended; otherwise a RuntimeError is raised.
+    """
+    with DetachMode() as detaching:
+        try:
+            rows, gradient = _compute_gradient(model, images)
+        except RuntimeError as error:
+            if not (repeatable and detaching.has_detached):
+                raise
+            with torch.no_grad():
+                rows = _run(model, images)
+            reason = get_first_line(error)
+            return _FirstGradient(rows, torch.zeros_like(images), True, reason)
+    return _FirstGradient(rows, gradient, detaching.has_detached)
+
+
 def _try_attached(
     model: Model, images: Tensor, gradient: Tensor
 ) -> tuple[Model, Tensor]:
@@ -604,14 +634,12 @@ def _try_attached(
         min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
         for step_size in (STEP, SMALL_STEP):
             step = max(step_size, min_step) * (attached_gradient - gradient).sign()
-            change, predicted_changes, *_ = _measure_change(
-                model, images, step, attached_gradient, gradient
-            )
-            attached_change, detached_change = predicted_changes
-            detached_error = abs(change - detached_change)
+            change = _measure_change(model, images, step, attached_gradient, gradient)
+            attached_change, detached_change = change.predicted
+            detached_error = abs(change.actual - detached_change)
             # better than the network's own gradient, and good by itself
             max_error = min(detached_error, MAX_ATTACHED_ERROR * abs(attached_change))
-            if abs(change - attached_change) < max_error:
+            if abs(change.actual - attached_change) < max_error:
                 return attached, attached_gradient
     return model, gradient
 
@@ -647,10 +675,26 @@ def _compute_checked_value(rows: Tensor) -> Tensor:
     return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
 
 
+class _Change(NamedTuple):
+    """How the number of `_compute_checked_value` changes between two images.
+
+    Attributes:
+        actual: the change.
+        predicted: what each of some gradients predicts of it.
+        ends: the images.
+        total: sum of the absolute values of the outputs at the first of them.
+    """
+
+    actual: float
+    predicted: list[float]
+    ends: list[Tensor]
+    total: float
+
+
 @torch.no_grad()
 def _measure_change(
     model: Model, images: Tensor, step: Tensor, *gradients: Tensor
-) -> tuple[float, list[float], list[Tensor], float]:
+) -> _Change:
     """Measure how the number of `_compute_checked_value` changes around images.
 
     Args:
@@ -658,18 +702,14 @@ def _measure_change(
         images: (N, H, W, 3).
         step: (N, H, W, 3), taken to both sides; the images are clipped to [0, 1] there.
         *gradients: (N, H, W, 3) that predict the change.
-
-    Returns:
-        The change from one end to the other; what each gradient predicts of it; the
-        images at both ends; and the sum of the outputs' absolute values at one of them.
     """
     ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
     outputs = [_run(model, end) for end in ends]
-    change = float(_compute_checked_value(outputs[0] - outputs[1]))
+    actual = float(_compute_checked_value(outputs[0] - outputs[1]))
     predicted = [
         float(((ends[0] - ends[1]) * gradient).sum()) for gradient in gradients
     ]
-    return change, predicted, ends, float(outputs[0].abs().sum())
+    return _Change(actual, predicted, ends, float(outputs[0].abs().sum()))
 
 
 def _check_gradient(
@@ -679,7 +719,7 @@ def _check_gradient(
 
     Its gradient may be masked, cut off, or not that of this network. The change over a
     small step along the sign of the gradient is compared with what the gradient
-    predicts.
+    predicts; it is right if it holds for one of the steps.
 
     Args:
         model: model that is probed.
@@ -687,26 +727,20 @@ def _check_gradient(
         gradient: (N, H, W, 3) of `_compute_checked_value`.
         detached: whether the network detaches tensors, for the message.
     """
-    # A gradient that holds for one of two steps is right. Suppression of boxes may make
-    # outputs jump in the larger one only.
-    step_sizes = (STEP,) if model.read is None else (STEP, SMALL_STEP)
-    min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
-    if min_step > STEP:
-        # A network in half precision is nonlinear in the first, and rounds the second.
-        step_sizes = (min_step, min_step / 8.0)
-    for step_size in step_sizes:
-        change, (predicted,), ends, total = _measure_change(
-            model, images, step_size * gradient.sign(), gradient
-        )
+    for step_size in _choose_step_sizes(model):
+        step = step_size * gradient.sign()
+        change = _measure_change(model, images, step, gradient)
         if model.read is not None:
-            choices = {
-                _collect_discrete_values(model, image) for image in (images, *ends)
+            discrete_values = {
+                _collect_discrete_values(model, image)
+                for image in (images, *change.ends)
             }
-            if len(choices) > 1:
+            if len(discrete_values) > 1:
                 return  # outputs that jump cannot be compared with a gradient
-        size = max(abs(change), abs(predicted))
-        is_too_small_to_tell = size <= MIN_CHANGE * total
-        is_predicted = abs(change - predicted) <= MAX_GRADIENT_ERROR * size
+        (predicted,) = change.predicted
+        size = max(abs(change.actual), abs(predicted))
+        is_too_small_to_tell = size <= MIN_CHANGE * change.total
+        is_predicted = abs(change.actual - predicted) <= MAX_GRADIENT_ERROR * size
         if is_too_small_to_tell or is_predicted:
             return
     reason = "Steps that round, or a defence that masks gradients?"
@@ -717,10 +751,20 @@ def _check_gradient(
         )
     warn(
         f"the gradient of model {model.name} does not say how its outputs change: "
-        f"{predicted:.3g} expected, "
-        f"{change:.3g} seen for a small step along it. {reason} A search "
-        "that follows them may find nothing: try a policy without gradients beside it"
+        f"{predicted:.3g} expected, {change.actual:.3g} seen for a small step along "
+        f"it. {reason} A search that follows them may find nothing: try a policy "
+        "without gradients beside it"
     )
+
+
+def _choose_step_sizes(model: Model) -> tuple[float, ...]:
+    """Return the steps over which the gradient of a model is checked, in turn."""
+    min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
+    if min_step > STEP:
+        # A network in half precision is nonlinear in the first, and rounds the second.
+        return (min_step, min_step / 8.0)
+    # Suppression of boxes may make outputs jump in the larger step only.
+    return (STEP,) if model.read is None else (STEP, SMALL_STEP)
 
 
 @torch.no_grad()

@@ -411,27 +411,32 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
         try:
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
-            message = f"module {name!r} needs {error.name!r}, which is not installed"
-            # the module itself is missing, or a package that it is in, and not one that
-            # it imports
-            if error.name is not None and (
-                name == error.name or name.startswith(error.name + ".")
-            ):
-                near = find_similar_names(name, libraries)
-                meant = (
-                    f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?"
-                    if near
-                    else ""
-                )
+            missing = error.name
+            # the module itself or a package that it is in, and not one that it imports
+            is_module_itself = missing is not None and f"{name}.".startswith(
+                f"{missing}."
+            )
+            message = f"module {name!r} needs {missing!r}, which is not installed"
+            if is_module_itself:
                 message = (
-                    f"no module named {error.name!r} on the Python path or in "
-                    f"{os.getcwd()}{meant}"
+                    f"no module named {missing!r} on the Python path or in "
+                    f"{os.getcwd()}{_suggest_library(name, spec, libraries)}"
                 )
             raise ModelError(f"model {spec}: {message}") from error
         except Exception as error:  # the user's code may raise anything
             raise ModelError(
                 f"model {spec}: importing {name!r} failed ({_where(error)})"
             ) from error
+
+
+def _suggest_library(name: str, spec: str, libraries: Iterable[str]) -> str:
+    """Return the question whether a library is meant by the name of a module, "" if
+    none is similar.
+    """
+    similar = find_similar_names(name, libraries)
+    if not similar:
+        return ""
+    return f"; did you mean '{similar[0]}:{spec.partition(':')[2]}'?"
 
 
 def _where(error: BaseException) -> str:
@@ -460,9 +465,8 @@ def import_library(name: str, spec: str, extra: str) -> Any:
     """
     try:
         return importlib.import_module(name)
-    except (
-        Exception
-    ) as error:  # a build for another torch raises RuntimeError, among others
+    # a build for another torch raises RuntimeError, among others
+    except Exception as error:
         command = f"pip install 'advsearch[{extra}]'"
         if isinstance(error, ModuleNotFoundError) and error.name == name:
             raise ModelError(

@@ -97,9 +97,8 @@ class Measurements:
         the result of the rows taken.
 
         The summary is written after each new row, so that a kill leaves it. It never
-        has fewer rows than an earlier sitting left in it: stored rows are taken first,
-        and where an interrupt comes before they were all read, the earlier result is
-        returned.
+        has fewer rows than before the run was resumed: stored rows are taken first, and
+        if an interrupt comes before they were all read, the earlier result is returned.
 
         Args:
             rows: measures each row when it is taken.

@@ -423,9 +423,10 @@ class Extent(Fields):
             count: number of cases in which it happened.
             total: number of all cases.
             interval: interval of the share; None is the whole of [0, 1].
-            share: an estimate of the share, if it is not count over total.
+            share: an estimate of the share; it is left out if it is count over total.
         """
-        stated_share = share if total and share != count / total else None
+        is_known_from_counts = not total or share == count / total
+        stated_share = None if is_known_from_counts else share
         return cls(
             what=what,
             count=count,

@@ -394,20 +394,26 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     values = []
     for name in _ENCODED_FIELDS:
         value = getattr(row, name)
-        if name in _AS_JSON and value is not None:
-            is_empty_metrics = name == "metrics" and not value
-            try:
-                value = None if is_empty_metrics else _JSON.encode(value)
-            # numbers of numpy and NaN: they are turned into Python's and None first,
-            # which is slow, so only where it is needed
-            except (TypeError, ValueError):
-                value = _JSON.encode(to_json_value(value))
+        if name == "metrics" and not value:
+            value = None
+        elif name in _AS_JSON and value is not None:
+            value = _encode_json(value)
         else:
             is_finite_float = type(value) is float and math.isfinite(value)
             if type(value) not in _SIMPLE and not is_finite_float:
                 value = to_json_value(value)
         values.append(value)
     return (*values, stamp, row.id)
+
+
+def _encode_json(value: Any) -> str:
+    """Return a value as JSON."""
+    try:
+        return _JSON.encode(value)
+    # numbers of numpy and NaN: they are turned into Python's and None first, which is
+    # slow, so only where it is needed
+    except (TypeError, ValueError):
+        return _JSON.encode(to_json_value(value))
 
 
 _PYTHON_TYPES: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}

@@ -166,8 +166,8 @@ def _parse_array(data: bytes) -> NDArray[np.float32] | None:
         return None
     numbers: NDArray[np.float32] = np.frombuffer(
         data, np.float32, count=count, offset=header.end()
-    )
-    return numbers.copy()  # frombuffer is read-only
+    ).copy()  # frombuffer is read-only
+    return numbers
 
 
 VERSIONS_NOTE = "made with"  # the note of versions and of digests of files

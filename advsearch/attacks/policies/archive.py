@@ -456,8 +456,9 @@ class MapElites(Policy[ArchiveState]):
         rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:  # nothing could be evaluated so far
             return replace(state, points=domain.sample(rng, self.population))
-        is_resampled = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
-        n_new = int(is_resampled.sum())
+        # each configuration is sampled with this probability; only their number counts
+        is_sampled = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
+        n_new = int(is_sampled.sum())
         samples = domain.sample(rng, self.population)
         observations = state.observations
         if observations is None:

@@ -333,6 +333,7 @@ class RacingPolicy(Policy[Racing]):
 # configurations together, of which each search stores several; two always may
 MAX_COMBINATIONS = 256
 MAX_NUMBERS = 2**24
+MIN_LISTED_COMBINATIONS = 1024  # so many are always listed, and not sampled
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -515,7 +516,9 @@ def _select_combinations(
     sizes = torch.tensor(n_options)
     # index of the option of each choice; u = 1 belongs to the last
     initial = torch.floor(initial_point * sizes).long().clamp(max=sizes - 1)
-    if math.prod(n_options) <= max(1024, 4 * max_combinations):
+    # far more combinations are sampled until enough of them are different
+    max_listed = max(MIN_LISTED_COMBINATIONS, 4 * max_combinations)
+    if math.prod(n_options) <= max_listed:
         combinations = _shuffle_combinations(n_options, generator)
         is_initial = (combinations == initial).all(dim=1)
         selected = combinations[~is_initial][: max_combinations - 1]

@@ -69,7 +69,7 @@ def utilities(values: Sequence[float]) -> list[float]:
     descending = sorted(values, reverse=True)
     weight_of_value = {}
     for value in set(values):
-        first = descending.index(value)  # the first of its ranks, from 0
+        first = descending.index(value)  # index of the first of its ranks
         count = descending.count(value)
         mean_weight = math.fsum(rank_weights[first : first + count]) / count
         weight_of_value[value] = mean_weight / total - 1.0 / n
@@ -461,6 +461,7 @@ class CMAES(Policy[CMAESState]):
         has_converged = float(state.stds.max()) <= MIN_STEP_SIZE
         if not has_converged:
             return state.ask()
+        # of the best run so far: its best objective and its distribution
         best_run = state.best_run
         if best_run is None or state.best > best_run[0]:
             best_run = (state.best, state.distribution)

@@ -468,34 +468,18 @@ def measure_derivatives(
             another one, which has to be surer.
         stage: called with the name of what begins and its number of steps.
     """
-
-    def load_reference(probe: Probe) -> Reference:
-        """Return the reference along a probe, measured if it is not stored yet."""
-        # What acts on the finished image clips values, so that the mean depends on the
-        # noise: estimate and reference need the same sample count there.
-        acts_on_image = probe.group.estimator == "image"
-        spp = bench.spp if acts_on_image else max(bench.spp, reference_spp)
-        reference_bench = replace(bench, spp=spp)
-
-        def measure() -> dict[str, Any]:
-            """Measure the reference, and return it as JSON."""
-            return measure_reference(
-                reference_bench,
-                probe,
-                repeats=reference_repeats,
-                factors=reference_factors,
-            )._asdict()
-
-        reference = Reference(**bench.store(f"reference {probe.name}", measure))
-        bench.tick(bench.spp)
-        return reference
-
+    measure = partial(
+        measure_reference, repeats=reference_repeats, factors=reference_factors
+    )
     for control, control_probes in groupby(
         find_probes(bench), lambda probe: probe.group.control
     ):
         probes = list(control_probes)
         stage(f"references for {control}", len(probes))
-        references = {probe.name: load_reference(probe) for probe in probes}
+        references = {
+            probe.name: _load_reference(bench, probe, reference_spp, measure)
+            for probe in probes
+        }
         # One gradient gives the derivatives along all probes with equal estimators.
         probe_sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
         for probe in probes:
@@ -509,6 +493,29 @@ def measure_derivatives(
             yield from _try_estimators(
                 bench, members, references, list_tries(members[0].group), repeats
             )
+
+
+def _load_reference(
+    bench: Bench, probe: Probe, spp: int, measure: Callable[[Bench, Probe], Reference]
+) -> Reference:
+    """Return the reference along a probe, measured if it is not stored yet.
+
+    Args:
+        bench: bench of the renderer.
+        probe: direction along which the derivative is taken.
+        spp: samples per pixel, if more than the bench's.
+        measure: measures a reference.
+    """
+    # What acts on the finished image clips values, so that the mean depends on the
+    # noise: estimate and reference need the same sample count there.
+    acts_on_image = probe.group.estimator == "image"
+    reference_spp = bench.spp if acts_on_image else max(bench.spp, spp)
+    reference_bench = replace(bench, spp=reference_spp)
+    fields = bench.store(
+        f"reference {probe.name}", lambda: measure(reference_bench, probe)._asdict()
+    )
+    bench.tick(bench.spp)  # for the progress
+    return Reference(**fields)
 
 
 def _try_estimators(

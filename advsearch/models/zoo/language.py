@@ -227,16 +227,11 @@ class _LanguageModel(nn.Module):
             ModelError: the processor treats them differently.
         """
         height, width = self.image_size
-        vertical = torch.linspace(0, 200, height)[:, None]
-        horizontal = torch.linspace(0, 200, width)
-        # A different gradient in each channel.
-        levels = torch.stack(
-            [
-                vertical + 0 * horizontal,
-                horizontal + 0 * vertical,
-                (vertical + horizontal) / 4 + 100,
-            ]
-        ).round()
+        vertical = torch.linspace(0, 200, height)[:, None].expand(height, width)
+        horizontal = torch.linspace(0, 200, width).expand(height, width)
+        # A different gradient in each channel, (3, H, W).
+        diagonal = (vertical + horizontal) / 4 + 100
+        levels = torch.stack([vertical, horizontal, diagonal]).round()
         image_8bit = np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy())
         expected = self._process(image_8bit)["pixel_values"]
         image = levels / 255.0
@@ -608,7 +603,10 @@ class _FreeAnswerer(nn.Module):
 
 
 def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Tensor]:
-    """Return the inputs of a network for a prompt that tokens (n,) follow."""
+    """Return the inputs of a network for a prompt that tokens (n,) follow.
+
+    Masks and types, which the prompt has for each of its tokens, are extended.
+    """
     inputs = dict(prompt)
     inputs["input_ids"] = torch.cat([prompt["input_ids"], tokens[None]], dim=1)
     for key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
@@ -616,7 +614,8 @@ def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Te
             # In most networks type 1 is the image, but in PaliGemma, which marks
             # nothing before, it is the answer.
             is_answer = key == "token_type_ids" and not prompt[key].any()
-            value = 1 if key == "attention_mask" or is_answer else 0
+            is_attended = key == "attention_mask"
+            value = 1 if is_attended or is_answer else 0
             extension = torch.full_like(tokens, value)[None]
             inputs[key] = torch.cat([prompt[key], extension], dim=1)
     return inputs

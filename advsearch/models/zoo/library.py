@@ -32,24 +32,26 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
     Its message has `advice` on what else the user may give. Nothing is unpickled, and
     nothing is fetched for a model that only a file names.
     """
-    disabled = logging.root.manager.disable
-    # of single tries to connect: an error is raised in the end
+    disabled_before = logging.root.manager.disable
+    # Failed tries to connect are logged: an error is raised in the end anyway.
     logging.disable(logging.WARNING)
-    tries: list[object] = []
+    # connections that were not allowed, and made none
+    rejected_connections: list[object] = []
     try:
         with (
             models.without_unpickling(),
             warnings.catch_warnings(),
-            models.restrict_connections(models.is_fetch_allowed(spec), tries),
+            models.restrict_connections(
+                models.is_fetch_allowed(spec), rejected_connections
+            ),
         ):
             warnings.simplefilter("ignore")
             yield
     except errors.ModelError:
         raise
-    except (
-        Exception
-    ) as error:  # a library raises nearly anything for what is not there or damaged
-        if tries:
+    # a library raises nearly anything for what is not there or damaged
+    except Exception as error:
+        if rejected_connections:
             raise models.CodeNotAllowedError(
                 f"a file names the model {spec}, which is not on this machine and "
                 f"would be fetched; {models.explain_how_to_allow(spec)}"
@@ -61,7 +63,7 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
             f"unpickled. {advice}"
         ) from error
     finally:
-        logging.disable(disabled)
+        logging.disable(disabled_before)
 
 
 Array = npt.NDArray[np.float64]

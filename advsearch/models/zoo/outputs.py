@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -212,19 +212,8 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
         "masks, which is no logit: its "
         "logarithm is used, so that margins are logarithms of a ratio of scores"
     )
-    sentence = None
-    config = loaded.network.config
-    family = str(config.model_type)
-    if family == "oneformer":  # numbers of tokens (1, L), filled up with 0
-        fill = {
-            "padding": "max_length",
-            "max_length": config.task_seq_len,
-            "truncation": True,
-        }
-        tokens = loaded.load_part("AutoTokenizer")(
-            [SENTENCE], return_tensors="pt", **fill
-        )
-        sentence = torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
+    family = str(loaded.network.config.model_type)
+    sentence = _tokenize_sentence(loaded) if family == "oneformer" else None
 
     def run_network(network: Any, images: Tensor) -> Tensor:
         """Return the logarithms of scores (N, classes, H, W) for images (N, 3, H,
@@ -248,6 +237,18 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
         return scores.float().clamp_min(models.MIN_PROBABILITY).log()
 
     return loaded.make_source(run_network, labels=loaded.class_names or None)
+
+
+def _tokenize_sentence(loaded: LoadedNetwork) -> Tensor:
+    """Return the tokens (1, L) of the text that OneFormer reads, filled up with 0."""
+    tokens = loaded.load_part("AutoTokenizer")(
+        [SENTENCE],
+        return_tensors="pt",
+        padding="max_length",
+        max_length=loaded.network.config.task_seq_len,
+        truncation=True,
+    )
+    return torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
 
 
 # ---- ``timm:NAME`` and ``torchvision:NAME`` ----
@@ -346,8 +347,8 @@ def _make_timm_source(
         labels: names of classes, which replace timm's.
     """
     needs_features = purpose.task == TASK
-    n_classes = module.num_classes
-    if n_classes == 0 and not needs_features:
+    has_head = module.num_classes > 0
+    if not has_head and not needs_features:
         raise make_no_classes_error(
             name, "is a network without a head (num_classes is 0)"
         )
@@ -355,27 +356,35 @@ def _make_timm_source(
     if pretrained_config:
         options = {"pretrained_cfg": dict(pretrained_config)}
     config = timm.data.resolve_model_data_config(module, **options)
-    names = labels or module.pretrained_cfg.get("label_names")
-    if not names:
-        subset = timm.data.infer_imagenet_subset(module)
-        if subset:
-            names = timm.data.ImageNetInfo(subset).label_descriptions()
-    names_fit = names and (labels or len(names) == n_classes)
 
     def compute_features(network: Any, images: Tensor) -> Any:
         return network.forward_head(network.forward_features(images), pre_logits=True)
 
-    has_head = bool(n_classes)
+    network = module
+    if needs_features and has_head:
+        network = AdaptedNetwork(module, compute_features)
+    names = labels or _find_timm_names(timm, module)
     return models.make_source(
-        AdaptedNetwork(module, compute_features)
-        if needs_features and has_head
-        else module,
+        network,
         name,
         input_size=tuple(map(int, config["input_size"][1:])),
         mean=tuple(map(float, config["mean"])),
         std=tuple(map(float, config["std"])),
-        labels=tuple(map(str, names)) if names_fit and not needs_features else None,
+        labels=tuple(map(str, names)) if names and not needs_features else None,
     )
+
+
+def _find_timm_names(timm: Any, module: Any) -> Sequence[str]:
+    """Return the names of the classes of a network of timm; empty if they are not known
+    or not as many as its classes.
+    """
+    names = module.pretrained_cfg.get("label_names")
+    if not names:
+        subset = timm.data.infer_imagenet_subset(module)
+        if subset:
+            names = timm.data.ImageNetInfo(subset).label_descriptions()
+    has_all = names and len(names) == module.num_classes
+    return names if has_all else ()
 
 
 MAX_DETECTOR_BATCH = 4
