@@ -114,13 +114,7 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         signature = inspect.signature(callee)
     except ValueError:  # built in: nothing to look at
         return ObjectiveSignature()
-    parameters = signature.parameters.values()
-    by_position = [
-        parameter.name
-        for parameter in parameters
-        if parameter.kind
-        in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-    ]
+    by_position = _list_positional(signature)
     if by_position and by_position[0] in IMAGE_PARAMETERS:  # as a metric takes them
         raise InputError(
             f"objective {get_name(function)!r}: its first argument is called "
@@ -133,7 +127,8 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         if name in REQUESTABLE_INPUTS and name not in by_position[:2]
     )
     has_star_args = any(
-        parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters
+        parameter.kind is parameter.VAR_POSITIONAL
+        for parameter in signature.parameters.values()
     )
     takes_images = has_star_args or _has_image_parameter(
         [name for name in by_position if name not in requested_inputs]
@@ -147,6 +142,16 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
             f"{', '.join(REQUESTABLE_INPUTS)} by name: {error}"
         ) from None
     return ObjectiveSignature(takes_images, requested_inputs)
+
+
+def _list_positional(signature: inspect.Signature) -> list[str]:
+    """Return the names of the parameters that can be passed by position, in order."""
+    return [
+        parameter.name
+        for parameter in signature.parameters.values()
+        if parameter.kind
+        in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+    ]
 
 
 def _check_arguments(
@@ -219,11 +224,7 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         values = _check_values(name, result, count)
         if values.requires_grad and _are_written_into((argument_copies, input_copies)):
             # the derivative may be lost that way: it is computed now, to see
-            sources = [
-                tensor
-                for tensor in _list_tensors((output, inputs))
-                if tensor.requires_grad
-            ]
+            sources = _list_differentiable((output, inputs))
             _check_differentiable(name, values, sources or [images])
         _check_keeps_gradient(name, values, (images, output, *inputs.values()))
         return values
@@ -295,6 +296,11 @@ def _list_tensors(value: Any) -> list[Tensor]:
     elif isinstance(value, (list, tuple)):
         elements = value
     return [tensor for element in elements for tensor in _list_tensors(element)]
+
+
+def _list_differentiable(value: Any) -> list[Tensor]:
+    """Return the tensors in nested tuples, lists and mappings that need a gradient."""
+    return [tensor for tensor in _list_tensors(value) if tensor.requires_grad]
 
 
 def _check_differentiable(name: str, values: Tensor, sources: Sequence[Tensor]) -> None:

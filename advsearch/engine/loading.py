@@ -341,7 +341,7 @@ def load_scene(
         description = description.with_backdrop(backdrop, occluder)
     elif backdrop is None:
         _check_no_photograph(fixed_values or {}, occluder)
-    # assets have no name by which another session could load them
+    # no other session can load things that were given as objects, without a file
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
         for asset in (object, environment, backdrop)

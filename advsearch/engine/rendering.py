@@ -371,19 +371,20 @@ def render(
         # what the task has learned of the model's predictions holds for the next view
         model_task = rendered_views[-1].task
         progress.advance(1)
-    # Formation and space are the same for all views, exposure included.
+    # formation and space are the same for all views, exposure included
+    formation = rendered_views[-1].formation
     space = rendered_views[-1].space
     return Rendering(
-        replace(
+        scene=replace(
             description,
             environment_spec=space.environment or description.environment_spec,
         ),
-        model.name,
-        unbound_task.name,
-        rendered_views[-1].formation,
-        spp,
-        tuple(rendered.view for rendered in rendered_views),
-        (
+        model=model.name,
+        task=unbound_task.name,
+        formation=formation,
+        spp=spp,
+        views=tuple(rendered.view for rendered in rendered_views),
+        warnings=(
             *space.list_notes(description),
             *describe_adjusted_defaults(space.adjusted_defaults),
             *_list_view_warnings(rendered_views),

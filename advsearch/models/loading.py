@@ -147,16 +147,7 @@ def load_model(
             f"{task.names_source}; leave `labels` out"
         )
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
-    # Only tasks that read texts have `tokens` and `times`.
-    purpose = Purpose(
-        task=task.name if task else "classification",
-        names=names,
-        prompts=prompts,
-        tokens=getattr(task, "tokens", 16),
-        times=getattr(task, "times", 1),
-        ask=ask or {},
-    )
-    source = _find_source(spec, purpose)
+    source = _find_source(spec, _state_purpose(task, names, prompts, ask))
     switches = find_code_switches()
     if prompts is not None:
         _check_reads_text(source, spec)
@@ -177,6 +168,27 @@ def load_model(
     if isinstance(spec, (str, os.PathLike)) and is_named_alone:
         return replace(model, spec=os.fspath(spec))
     return model
+
+
+def _state_purpose(
+    task: Any,
+    names: tuple[str, ...] | None,
+    prompts: tuple[str, ...] | None,
+    ask: Mapping[str, float] | None,
+) -> Purpose:
+    """Return what a model is loaded for; arguments as for `load_model`, after reading.
+
+    Without a task it is classification.
+    """
+    return Purpose(
+        task=task.name if task else "classification",
+        names=names,
+        prompts=prompts,
+        # only tasks that read texts have these
+        tokens=getattr(task, "tokens", 16),
+        times=getattr(task, "times", 1),
+        ask=ask or {},
+    )
 
 
 def _drop_unset(**options: Any) -> dict[str, Any]:
