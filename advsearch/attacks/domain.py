@@ -87,8 +87,8 @@ class Block:
             )
 
     def _check_budget(self, where: str) -> None:
-        """Check what depends on the norm: a ball has an epsilon; only a box may be periodic
-        or have a reach.
+        """Check what depends on the norm: a ball has an epsilon; only a box may be
+        periodic or have a reach.
         """
         is_box = self.norm == "box"
         if is_box and self.epsilon is not None:
@@ -361,7 +361,7 @@ class Domain:
     def _sample_block(
         self, block: Block, part: slice, generator: torch.Generator, *, extreme: bool
     ) -> Tensor:
-        """Return a random value (size,) of the slice of u that is a block; see `sample`.
+        """Return a random value (size,) of a block, a slice of u; see `sample`.
 
         It may lie outside of an l2 ball, or outside of the bounds around one.
         """

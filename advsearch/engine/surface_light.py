@@ -341,8 +341,8 @@ class SurfaceLight(PredictedSearch):
         predicted.
         """
         problem = self.problem
-        # A random search ("baseline") uses few sets of conditions in turn, for which what
-        # cameras see is stored.
+        # A random search ("baseline") uses few sets of conditions in turn, for which
+        # what cameras see is stored.
         reuses_conditions = (
             query.kind == "baseline"
             and problem.conditions is not None

@@ -424,8 +424,8 @@ class Transport(PredictedSearch):
         return self._current[kind]
 
     def _compare_predictor(self, predictor: Predictor, query: Query) -> Deviation:
-        """Compare a predictor with traced images of a query's configuration, in the window
-        if there is one.
+        """Compare a predictor with traced images of a query's configuration, in the
+        window if there is one.
         """
         seed = seeds.stream(self.problem.seed, "transport check", query.index)
         renderer = self.problem.renderer
@@ -444,8 +444,8 @@ class Transport(PredictedSearch):
     def _compare_surroundings(
         self, kind: str, u: Tensor
     ) -> tuple[bool, FullImage | None]:
-        """Compare what is outside of the window at u (d,) with what a kind of search has
-        there.
+        """Compare what is outside of the window at u (d,) with what a kind of search
+        has there.
 
         Returns:
             Whether both are the same, up to what is allowed; and the full image at u.

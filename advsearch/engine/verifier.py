@@ -442,8 +442,8 @@ class Retrials:
         self._progress = progress
         self._n_trials = trials
         self._seed = seed
-        # The others are copies of the first journal, with the same rows and notes, which
-        # are read from the store only once.
+        # The others are copies of the first journal, with the same rows and notes,
+        # which are read from the store only once.
         first_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
         self._journals = {
             condition.name: replace(

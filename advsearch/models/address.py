@@ -840,7 +840,7 @@ class AddressModel(models.RemoteNetwork):
             isinstance(count, int) and not isinstance(count, bool) and count >= 0
             for count in counts
         )
-        # Tokens need not be known without a limit (by default there is none) and a price.
+        # without a limit (there is none by default) and a price, tokens may be unknown
         needs_tokens = self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token
         if is_stated:
             tokens_in, tokens_out = counts

@@ -206,7 +206,7 @@ def _describe_file(path: Path, head: bytes) -> str:
         head: its first 16 bytes.
     """
     suffix = path.suffix.lower()
-    # Safetensors begin with the length of a header in eight bytes, and the header, JSON.
+    # safetensors begin with the length of a header in eight bytes, and the header, JSON
     header_length = int.from_bytes(head[:8], "little")
     is_safetensors = head[8:9] == b"{" and header_length < 1 << 30
     if is_safetensors:

@@ -219,8 +219,8 @@ class Surrogate:
         # (m, n) correlations of the new points with the known ones
         cross = kernel(self.box.embed(x, lengths), self.box.embed(self.x, lengths))
         solved = torch.linalg.solve_triangular(self.factor, cross.mT, upper=False)
-        # fraction of the signal's variance that the known points leave; over 0, also at a
-        # known point
+        # fraction of the signal's variance that the known points leave; over 0, also at
+        # a known point
         unexplained = (1.0 - solved.square().sum(dim=0)).clamp_(min=1e-12)
         return self.mean + cross @ self.weights, (self.variance * unexplained).sqrt_()
 

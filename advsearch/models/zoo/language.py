@@ -431,7 +431,7 @@ class _NameClassifier(nn.Module):
         for index, name_tokens in enumerate(self.tokens):
             first_stem_row = 1 + _find_stem(stems, name_tokens[:-1]) * stem_length
             for position, token in enumerate(name_tokens):
-                # The first token comes after the prompt, any other after the one before.
+                # the first token comes after the prompt, any other after the last one
                 if position > 0:
                     rows[index, position] = first_stem_row + position - 1
                 columns[index, position] = token
@@ -473,7 +473,7 @@ def _make_prompt_text(processor: Any, question: str) -> str:
 
 
 def _read_image_size(config: Any) -> tuple[int, int]:
-    """Return the (height, width) of images in a network's ``config``, or the default."""
+    """Return (height, width) of images, of a network's ``config`` or the default."""
     vision_config = getattr(config, "vision_config", None)
     size = getattr(vision_config, "image_size", None) or models.DEFAULT_SIZE
     height, width = size if isinstance(size, (list, tuple)) else (size, size)
