@@ -431,7 +431,7 @@ class _NameClassifier(nn.Module):
         for index, name_tokens in enumerate(self.tokens):
             first_stem_row = 1 + _find_stem(stems, name_tokens[:-1]) * stem_length
             for position, token in enumerate(name_tokens):
-                # the first token comes after the prompt, any other after the last one
+                # the first token follows the prompt, any other the token before it
                 if position > 0:
                     rows[index, position] = first_stem_row + position - 1
                 columns[index, position] = token
