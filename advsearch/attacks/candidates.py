@@ -32,7 +32,7 @@ class Candidate:
         u: (d,) the configuration.
         objective: objective of the render that admitted it, biased upwards.
         success: whether the model was wrong in that render.
-        repeat_objectives: repeat objectives of its renders since then; -inf if one is
+        repeat_objectives: objectives of its renders since then; -inf for one that is
             not finite.
         successes: in how many of these the model was wrong.
     """
@@ -436,8 +436,9 @@ def shrink_towards_start(domain: Domain, u: Tensor, scale: float) -> Tensor:
 def find_smallest_change(
     search: Search, passes: Passes, domain: Domain, likely: Guess | None = None
 ) -> Bracket:
-    """Bracket the smallest scale of the domain's budgets at which a configuration
-    passes.
+    """Bracket the smallest change with which a configuration passes its trials.
+
+    The change is measured as a scale of the domain's budgets: 1 is all of them.
 
     1. A search in the whole budget. If what it finds fails the trials, there is nothing
     to shrink.
@@ -462,11 +463,12 @@ def find_smallest_change(
         The bracket. It is not `is_closed` if the searches did not suffice; if nothing
         passed in the full budget, its `low` is 1 and its `u` None.
     """
-    u = search(domain, 0)
+    full_u = search(domain, 0)
+    # nothing is known to pass yet: `high` is set by the first configuration that does
     bracket = Bracket(low=0.0, high=math.inf, u=None, searches=1, checks=1)
-    if not passes(u, 0):
+    if not passes(full_u, 0):
         return replace(bracket, low=1.0)
-    bracket = _shorten(bracket, u, 1.0, passes, domain, likely)
+    bracket = _shorten(bracket, full_u, 1.0, passes, domain, likely)
     while (
         bracket.searches < MAX_SEARCHES
         and bracket.high > RATIO * bracket.low  # not closed
@@ -514,10 +516,11 @@ def confirm_bracket(
         return bracket
     shortest_u = bracket.u
     shortest_scale = bracket.high
-    growth = 1.0  # of the change, since the shortest that passed
+    growth = 1.0  # factor of the change since the shortest that passed
     for _ in range(MAX_CONFIRMATIONS):
-        # the seeds of trials follow from the index of the check
-        if all(passes(bracket.u, bracket.checks + repeat) for repeat in range(times)):
+        # each check has an index of its own, from which the seeds of its trials follow
+        check_indices = range(bracket.checks, bracket.checks + times)
+        if all(passes(bracket.u, check_index) for check_index in check_indices):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
         growth *= math.sqrt(RATIO)
         scale = min(1.0, shortest_scale * growth)
@@ -560,7 +563,8 @@ def _shorten(
         return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
     # The next length is the geometric mean of the bounds, but at most this factor away
-    # from the bound that was set last.
+    # from the bound that was set last. With a guess it is small at first, and squared
+    # after each trial.
     max_step = math.inf
     trial_length = math.sqrt(high * low)
     if likely is not None:

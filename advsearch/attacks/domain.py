@@ -23,7 +23,7 @@ NORMS: tuple[str, ...] = get_args(Norm)
 
 TOLERANCE = 2e-6
 """How far outside its budget float32 rounding may put a configuration, absolute in u
-and relative to the radius; besides `Block.compute_rounding`, which adds up in an l2
+and relative to the radius; besides `Block.rounding_error`, which adds up in an l2
 norm.
 """
 
@@ -77,35 +77,40 @@ class Block:
                 f"bounds{where}: expected 0 <= low < high <= 1, got "
                 f"[{self.low}, {self.high}]"
             )
-        if self.norm == "box" and self.epsilon is not None:
-            raise InputError(
-                f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out"
-            )
-        if self.norm != "box" and not (
-            self.epsilon is not None and 0.0 < self.epsilon < math.inf
-        ):
-            raise InputError(
-                f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} "
-                "radius, in units where the "
-                f"parameter's whole range is 1), got {self.epsilon}; try `epsilon=0.1`"
-            )
-        if self.periodic and self.norm != "box":
-            raise InputError(
-                f"block{where}: a periodic block cannot have a norm "
-                "budget; use norm 'box'"
-            )
-        if self.reach is not None and (self.norm != "box" or not self.reach > 0.0):
-            raise InputError(
-                f"block{where}: expected a reach over 0 and norm 'box', got "
-                f"{self.reach} and {self.norm!r}"
-            )
+        self._check_budget(where)
         has_full_range = self.low == 0.0 and self.high == 1.0 and not self.periodic
         is_plain_number = self.size == 1 and self.norm == "box" and has_full_range
         if self.options and (self.options < 0 or not is_plain_number):
             raise InputError(
                 f"block{where}: expected a discrete choice to have at least one "
-                "option, size 1, norm 'box' and "
-                f"bounds [0, 1], got {self}"
+                f"option, size 1, norm 'box' and bounds [0, 1], got {self}"
+            )
+
+    def _check_budget(self, where: str) -> None:
+        """Check what depends on the norm: a ball has an epsilon; only a box may be
+        periodic or have a reach.
+        """
+        is_box = self.norm == "box"
+        if is_box and self.epsilon is not None:
+            raise InputError(
+                f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out"
+            )
+        has_budget = self.epsilon is not None and 0.0 < self.epsilon < math.inf
+        if not is_box and not has_budget:
+            raise InputError(
+                f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} "
+                "radius, in units where the parameter's whole range is 1), got "
+                f"{self.epsilon}; try `epsilon=0.1`"
+            )
+        if self.periodic and not is_box:
+            raise InputError(
+                f"block{where}: a periodic block cannot have a norm "
+                "budget; use norm 'box'"
+            )
+        if self.reach is not None and (not is_box or not self.reach > 0.0):
+            raise InputError(
+                f"block{where}: expected a reach over 0 and norm 'box', got "
+                f"{self.reach} and {self.norm!r}"
             )
 
     @property
@@ -124,8 +129,8 @@ class Block:
         return min(float(self.epsilon), diameter)
 
     @property
-    def compute_rounding(self) -> float:
-        """What rounding all elements of u to float32 may add to the l2 norm.
+    def rounding_error(self) -> float:
+        """How much rounding all elements of u to float32 may add to the l2 norm.
 
         It is half of the last bit of 1 for each element: they may all be rounded the
         same way, as in a texture of one colour.
@@ -322,7 +327,7 @@ class Domain:
             if block.norm == "l2" and block.epsilon is not None:
                 squares = (u[part] - self.start[part]).square_()
                 norm = math.sqrt(float(squares.sum(dtype=torch.float64)))
-                norm_excess = norm - block.epsilon - block.compute_rounding
+                norm_excess = norm - block.epsilon - block.rounding_error
                 excess = max(excess, norm_excess / max(1.0, block.epsilon))
         return math.inf if math.isnan(excess) else max(0.0, excess)
 
@@ -349,24 +354,32 @@ class Domain:
         for _ in range(n):
             u = torch.empty_like(self.start)
             for block, part in self.list_block_slices():
-                noise = torch.rand(block.size, generator=generator)
-                if block.options:
-                    noise = option_center(noise, block.options)
-                elif extreme and block.norm != "box":
-                    noise.round_()  # 0 or 1: a corner, or the signs of a direction
-                if block.norm != "l2" or block.epsilon is None:
-                    u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
-                elif extreme:
-                    # far beyond the ball in a direction of random signs; the projection
-                    # below brings it to the surface
-                    far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
-                    u[part] = self.start[part] + (noise * 2.0 - 1.0) * far_distance
-                else:
-                    u[part] = self.start[part] + _sample_ball(
-                        block.size, block.epsilon, float(noise[0]), generator
-                    )
+                u[part] = self._sample_block(block, part, generator, extreme=extreme)
             samples.append(self.project(u))
         return torch.stack(samples)
+
+    def _sample_block(
+        self, block: Block, part: slice, generator: torch.Generator, *, extreme: bool
+    ) -> Tensor:
+        """Return a random value (size,) of a block, a slice of u; see `sample`.
+
+        It may lie outside of an l2 ball, or outside of the bounds around one.
+        """
+        noise = torch.rand(block.size, generator=generator)
+        if block.options:
+            noise = option_center(noise, block.options)
+        elif extreme and block.norm != "box":
+            noise.round_()  # 0 or 1: a corner, or the signs of a direction
+        if block.norm != "l2" or block.epsilon is None:
+            return torch.lerp(self.lower[part], self.upper[part], noise)
+        if extreme:
+            # far beyond the ball in a direction of random signs, so that the projection
+            # brings it to the surface
+            far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
+            return self.start[part] + (noise * 2.0 - 1.0) * far_distance
+        return self.start[part] + _sample_ball(
+            block.size, block.epsilon, float(noise[0]), generator
+        )
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
         """Return one unit step (d,) from u uphill, by the gradient (d,), finite.
@@ -555,8 +568,8 @@ class Distribution:
 
 
 def compute_half_widths(domain: Domain) -> Tensor:
-    """Return (d,) float32, over 0: how far each element may go if all others of its
-    block go equally far.
+    """Return (d,) float32, over 0: how far each element may go from the start if all
+    others of its block go equally far.
 
     - "box": half of the bounds' distance, or the block's reach over the square root of
     its size if that is given;
@@ -564,14 +577,14 @@ def compute_half_widths(domain: Domain) -> Tensor:
     - "l2": epsilon over the square root of the block's size, at most half of the
     bounds' distance.
     """
-    half = (domain.upper - domain.lower) / 2.0
+    half_widths = (domain.upper - domain.lower) / 2.0
     for block, part in domain.list_block_slices():
         if block.norm == "l2" or block.reach is not None:
-            half[part] = min(
-                block.radius / math.sqrt(block.size), (block.high - block.low) / 2.0
-            )
+            # (x, x, ..., x) has the norm x sqrt(size)
+            in_ball = block.radius / math.sqrt(block.size)
+            half_widths[part] = min(in_ball, (block.high - block.low) / 2.0)
     # an epsilon below the resolution of float32 leaves no width
-    return half.clamp_(min=torch.finfo(torch.float32).tiny)
+    return half_widths.clamp_(min=torch.finfo(torch.float32).tiny)
 
 
 def find_periodic(domain: Domain) -> Tensor:
@@ -645,8 +658,7 @@ class SampleSequence:
         if sampler == "sobol" and dimensions > MAX_DIMENSIONS:
             raise InputError(
                 f"`sampler` sobol: expected at most {MAX_DIMENSIONS} numbers to draw, "
-                f"got {dimensions}; use "
-                "`sampler=random`"
+                f"got {dimensions}; use `sampler=random`"
             )
         self.dimensions = dimensions
         self._sampler = sampler
@@ -667,38 +679,40 @@ class SampleSequence:
         """
         if not self.dimensions or count < 1:
             return np.empty((max(0, count), self.dimensions))
-        blocks = []
+        chunks = []
         end = first + count
-        while first < end:  # a block at a time, of which the latest is cached
+        while first < end:  # from one block at a time
             block_index, first_row = divmod(first, self._rows)
             n_rows = min(self._rows - first_row, end - first)
-            if block_index != self._block_index:
-                if self._sampler == "sobol":
-                    self._block = self._sample_sobol(block_index)
-                else:
-                    seed = stream(self._seed, self._name, block_index)
-                    rng = np.random.default_rng(seed)
-                    self._block = rng.random((self._rows, self.dimensions))
-                self._block_index = block_index
-            blocks.append(self._block[first_row : first_row + n_rows])
+            self._load_block(block_index)
+            chunks.append(self._block[first_row : first_row + n_rows])
             first += n_rows
-        return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+        return chunks[0] if len(chunks) == 1 else np.concatenate(chunks)
+
+    def _load_block(self, block_index: int) -> None:
+        """Sample a block of points, unless it is the latest."""
+        if block_index == self._block_index:
+            return
+        if self._sampler == "sobol":
+            self._block = self._sample_sobol(block_index)
+        else:
+            seed = stream(self._seed, self._name, block_index)
+            rng = np.random.default_rng(seed)
+            self._block = rng.random((self._rows, self.dimensions))
+        self._block_index = block_index
 
     def _sample_sobol(self, block_index: int) -> Float64Array:
         """Return a block of points of a scrambled Sobol net, (rows, dimensions).
 
-        The engine goes on from the block before if that is of the same net; otherwise
-        it begins again and skips the points before this block.
+        The engine goes on from where it is if that is in the same net, before this
+        block; otherwise it begins again. Points before the block are skipped.
         """
         # takes a quarter of a second, and few runs draw from nets
         from scipy.stats import qmc
 
         net_index, first_row = divmod(block_index * self._rows, NET)
-        if (
-            net_index != self._net
-            or self._engine is None
-            or first_row < self._n_sampled
-        ):
+        is_behind = first_row < self._n_sampled  # the engine only goes forward
+        if net_index != self._net or self._engine is None or is_behind:
             seed = stream(self._seed, self._name, net_index)
             self._engine = qmc.Sobol(self.dimensions, scramble=True, seed=seed)
             self._net = net_index

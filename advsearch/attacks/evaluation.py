@@ -69,9 +69,9 @@ class Query:
     The evaluation costs as many times its renders: samples * (1 + gradient_cost) with a
     gradient, samples without.
     """
-    spp: int = 1  # samples per pixel of a trial: samples a pixel
-    # Draws conditions of a trial: whether conditions are drawn; otherwise the scene has
-    # those it comes with.
+    spp: int = 1  # samples per pixel of a trial
+    # of a trial: whether conditions are drawn; else the scene has those that it comes
+    # with
     draws_conditions: bool = True
     values: Mapping[str, Value] = field(default_factory=dict)
     """Of a trial: what its row says of the configuration, which trials of one kind may
@@ -136,8 +136,9 @@ class Evaluation:
 
     @property
     def required_judgement(self) -> Judgement:
-        """What the task says; a RuntimeError where there is no task, or something else
-        was wanted.
+        """The judgement of the task.
+
+        Raises RuntimeError if there is none: the query was for an image or for light.
         """
         if self.judgement is None:
             raise RuntimeError("this evaluation has no judgement")
@@ -149,14 +150,11 @@ class Evaluation:
         return math.isfinite(self.objective)
 
     def sanitize(self) -> Evaluation:
-        """Return the evaluation as policies may see it: every number in it can be
-        computed with.
+        """Return the evaluation as policies see it, without NaN.
 
-        The rule, the same for every policy:
-
-        - gradient elements that are NaN or infinite become zero and are added to
-        `non_finite`;
-        - an objective that is NaN or infinite becomes -inf ("the worst there is"), its
+        - Gradient elements that are NaN or infinite become zero and are added to
+          `non_finite`.
+        - An objective that is NaN or infinite becomes -inf ("the worst there is"), its
           gradient zero and its success false.
         """
         evaluation = self._sanitize_gradient()

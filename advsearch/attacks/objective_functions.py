@@ -45,8 +45,8 @@ SAME = 1e-12  # logits that lie closer together than this are all the same to `d
 
 
 def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """The largest wrong logit minus the largest right one: over 0 exactly where the
-    model is wrong.
+    """Return the largest wrong logit minus the largest right one, (N,): over 0 exactly
+    where the model is wrong.
 
     max over j not in Y of z_j, minus max over y in Y of z_y. In logits (log-odds),
     unbounded, and with a gradient of one at every confidence (Carlini and Wagner 2017,
@@ -63,8 +63,8 @@ def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 
 
 def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """The log-odds of a wrong prediction: like cross-entropy all classes count, and the
-    gradient never fades.
+    """Return the log-odds of a wrong prediction, (N,): like cross-entropy all classes
+    count, and the gradient never fades.
 
     log((1 - p) / p) with p the total probability of Y, as logsumexp over j not in Y
     minus logsumexp over Y. A growing function of `cross_entropy`, so the two rank
@@ -80,7 +80,7 @@ def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 
 
 def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """Minus the logarithm of the probability of the right labels, in nats.
+    """Return minus the logarithm of the probability of the right labels, (N,) in nats.
 
     -log p = softplus(l) with l the `log_odds`: that form neither overflows for logits
     of thousands nor cancels where p is near 1. Its slope in l is 1 - p and would be
@@ -100,11 +100,11 @@ def targeted_cross_entropy(logits: Tensor, images: Tensor, target: Labels) -> Te
 
 
 def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """The difference of logits ratio: `margin` over a distance between logits, so their
-    scale and offset cancel.
+    """Return the difference of logits ratio, (N,): `margin` over a distance between
+    logits, so that scale and offset of the logits cancel.
 
-    Let s be max over y in Y of z_y, w the largest wrong logit, and p_1 >= p_2 >= ...
-    the sorted list of s and all wrong logits. The value is
+    Let s be the largest right logit, w the largest wrong one, and p_1 >= p_2 >= ... the
+    sorted list of s and all wrong logits. The value is
 
         (w - s) / (p_1 - p_3)                 where the model is right (w <= s): from -1 to 0;
         (w - s) / (p_1 - (p_3 + p_4) / 2)     where it is wrong: over 0.
@@ -112,12 +112,14 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     The first line is the ratio of Croce and Hein 2020 (Auto-PGD), section 4, and the
     denominator of the second is that of their targeted form: with the first one the
     value would be 1, without a gradient, wherever s comes third, and a search goes on
-    after its first success. We depart from them in three more things. Of several right
-    labels only the largest takes part, or three of them at the top would divide by
-    zero. Where there is no fourth logit, p_2 stands in for it. And `RELIEF` times the
-    distance from the largest to the smallest logit is added to a denominator, so that
-    ties leave it finite and the value within 1 / `RELIEF`; where all logits are the
-    same, it is 1.
+    after its first success. We depart from them in three more things:
+
+    - Of several right labels only the largest takes part, or three of them at the top
+      would divide by zero.
+    - Where there is no fourth logit, p_2 stands in for it.
+    - `RELIEF` times the distance from the largest to the smallest logit is added to a
+      denominator, so that ties leave it finite and the value within 1 / `RELIEF`; where
+      all logits are the same, it is 1.
 
     Without scale there is no way to say *how far* beyond the others a logit lies. So
     the value is no measure of confidence: with p_2 = p_3 behind a right prediction it
@@ -127,27 +129,27 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
         InputError: fewer than two wrong classes. Of two numbers only the order is left
             without scale and offset.
     """
-    top, spread = _sort_logits(logits, make_class_mask(logits, labels), "label")
+    top_logits, spread = _sort_logits(logits, make_class_mask(logits, labels), "label")
     difference = margin(logits, images, labels)
-    gap = top[:, 0] - top[:, 2]
-    return difference / _add_relief(
-        torch.where(difference > 0.0, _compute_wide_gap(top), gap), spread
-    )
+    narrow_gap = top_logits[:, 0] - top_logits[:, 2]
+    wide_gap = _compute_wide_gap(top_logits)
+    is_wrong = difference > 0.0
+    gap = torch.where(is_wrong, wide_gap, narrow_gap)
+    return difference / _add_relief(gap, spread)
 
 
 def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
-    """`targeted_margin` over p_1 - (p_3 + p_4) / 2, with p the sorted list of max over
-    T and all logits not in T.
+    """Return the difference of logits ratio towards a target T, (N,).
 
-    The targeted ratio of Croce and Hein 2020, section 4, whose numerator is z_t - z_y
-    instead: that is over 0 also where a third class wins. Otherwise as `dlr`.
+    It is `targeted_margin` over p_1 - (p_3 + p_4) / 2, with p the sorted list of the
+    largest logit in T and all logits not in T. This is the targeted ratio of Croce and
+    Hein 2020, section 4, but for the numerator: theirs, z_t - z_y with the right label
+    y, is over 0 also where a third class wins. Otherwise as `dlr`.
     """
-    top, spread = _sort_logits(
-        logits, make_class_mask(logits, target, "target"), "target"
-    )
-    return targeted_margin(logits, images, target) / _add_relief(
-        _compute_wide_gap(top), spread
-    )
+    in_target = make_class_mask(logits, target, "target")
+    top_logits, spread = _sort_logits(logits, in_target, "target")
+    gap = _compute_wide_gap(top_logits)
+    return targeted_margin(logits, images, target) / _add_relief(gap, spread)
 
 
 def _compute_log_odds(logits: Tensor, group: Tensor) -> Tensor:
@@ -219,8 +221,8 @@ ReadFeatures = Callable[[Tensor], Tensor]
 def feature_distance(
     features: ReadFeatures, clean: Tensor
 ) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
-    """How far the features of the picture lie from those of the clean one, in lengths
-    of the clean ones.
+    """Return the objective of the distance of an image's features from those of the
+    clean image, as a multiple of the length of the latter.
 
     With f0 the features of the clean picture, e = (f - f0) / |f0|, r a fixed unit
     vector and h = `NEARBY`,
@@ -274,8 +276,8 @@ def feature_distance(
 def cosine_distance(
     features: ReadFeatures, clean: Tensor
 ) -> Callable[[Tensor, Tensor, tuple[int, ...]], Tensor]:
-    """One minus the cosine of the features and those of the clean picture: from 0 where
-    they are the same to 2.
+    """Return the objective of one minus the cosine of an image's features and those of
+    the clean image: from 0 where they are the same to 2.
 
     That is |e|^2 / 2 for e the difference of both at length 1. Its gradient is zero at
     the clean picture, where every search starts, so `h` e . r is added, with r and `h`
@@ -322,7 +324,6 @@ def _compute_reference(features: ReadFeatures, clean: Tensor) -> Tensor:
     if not bool(torch.isfinite(reference).all()):
         raise InputError(
             "objective: expected finite features of the clean picture, got NaN or "
-            "infinity; check that the "
-            "model predicts it"
+            "infinity; check that the model predicts it"
         )
     return reference.mean(dim=0)

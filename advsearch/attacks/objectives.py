@@ -114,13 +114,7 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         signature = inspect.signature(callee)
     except ValueError:  # built in: nothing to look at
         return ObjectiveSignature()
-    parameters = signature.parameters.values()
-    by_position = [
-        parameter.name
-        for parameter in parameters
-        if parameter.kind
-        in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-    ]
+    by_position = _list_positional(signature)
     if by_position and by_position[0] in IMAGE_PARAMETERS:  # as a metric takes them
         raise InputError(
             f"objective {get_name(function)!r}: its first argument is called "
@@ -133,24 +127,41 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         if name in REQUESTABLE_INPUTS and name not in by_position[:2]
     )
     has_star_args = any(
-        parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters
+        parameter.kind is parameter.VAR_POSITIONAL
+        for parameter in signature.parameters.values()
     )
     takes_images = has_star_args or _has_image_parameter(
         [name for name in by_position if name not in requested_inputs]
     )
-    n_positional = 3 if takes_images else 2
     try:
-        # a trial call, with None for every argument
-        signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
+        _check_arguments(signature, takes_images, requested_inputs)
     except TypeError as error:
         raise InputError(
             f"objective {get_name(function)!r}: expected a function that takes "
-            "(output, "
-            "images, truth) or (output, "
-            f"labels), and beside them any of {', '.join(REQUESTABLE_INPUTS)} by name: "
-            f"{error}"
+            "(output, images, truth) or (output, labels), and beside them any of "
+            f"{', '.join(REQUESTABLE_INPUTS)} by name: {error}"
         ) from None
     return ObjectiveSignature(takes_images, requested_inputs)
+
+
+def _list_positional(signature: inspect.Signature) -> list[str]:
+    """Return the names of the parameters that can be passed by position, in order."""
+    return [
+        parameter.name
+        for parameter in signature.parameters.values()
+        if parameter.kind
+        in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+    ]
+
+
+def _check_arguments(
+    signature: inspect.Signature, takes_images: bool, requested_inputs: Iterable[str]
+) -> None:
+    """Raise TypeError if a function can't be called with (output, images, truth), or
+    (output, labels), and the inputs that it requests by name.
+    """
+    n_positional = 3 if takes_images else 2
+    signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
 
 
 def _has_image_parameter(names: Sequence[str]) -> bool:
@@ -160,12 +171,13 @@ def _has_image_parameter(names: Sequence[str]) -> bool:
     A third parameter means the former, unless the second is called like the truth, as
     in a loss whose third parameter is an option.
     """
-    if len(names) < 2:  # neither; the caller refuses it
+    if len(names) < 2:  # neither; the caller rejects it whatever is returned
         return True
     second_name = names[1]
     if second_name in TRUTH_PARAMETERS:
         return False
     has_third = len(names) > 2
+    # a function whose second parameter is called like an image has forgotten the truth
     return has_third or second_name in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS)
 
 
@@ -188,7 +200,7 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
     def objective(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
-        """Call the function with what it asks for, and check what it returns, (N,)."""
+        """Call the function with what it requests, and check what it returns, (N,)."""
         inputs = {
             input_name: more(input_name) for input_name in signature.requested_inputs
         }
@@ -210,21 +222,20 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         if isinstance(result, Tensor) and result.ndim == 0 and count > 1:
             result = _evaluate_each_image(objective, output, images, truth, inputs)
         values = _check_values(name, result, count)
-        # torch counts in `_version` how often a tensor was written into
-        has_written_into_arguments = any(
-            tensor._version for tensor in _list_tensors((argument_copies, input_copies))
-        )
-        if values.requires_grad and has_written_into_arguments:
-            sources = [
-                tensor
-                for tensor in _list_tensors((output, inputs))
-                if tensor.requires_grad
-            ]
+        if values.requires_grad and _are_written_into((argument_copies, input_copies)):
+            # the derivative may be lost that way: it is computed now, to see
+            sources = _list_differentiable((output, inputs))
             _check_differentiable(name, values, sources or [images])
         _check_keeps_gradient(name, values, (images, output, *inputs.values()))
         return values
 
     return objective
+
+
+def _are_written_into(copies: Any) -> bool:
+    """Return whether a tensor in nested copies was written into since it was made."""
+    # torch counts in `_version` how often a tensor was written into
+    return any(tensor._version for tensor in _list_tensors(copies))
 
 
 def _is_label_set_rejected(labels: Any, error: TypeError) -> bool:
@@ -244,15 +255,16 @@ def _evaluate_each_image(
     """Return the values (N,) of an objective that is called with one image at a time.
 
     Args:
-        objective: returns a scalar.
+        objective: objective of a function that returns a scalar.
         output: output of the model for N images.
         images: (N, H, W, 3).
-        truth: equal for all images.
-        inputs: what the objective requests by name, for N images.
+        truth: what is right, equal for all images.
+        inputs: what the function requests, by the names of its parameters, for N
+            images.
     """
     values = []
     for index in range(images.shape[0]):
-        image_slice = slice(index, index + 1)
+        image_slice = slice(index, index + 1)  # a batch of one
         read_input = partial(_select_input, inputs, index)
         values.append(
             objective(output[image_slice], images[image_slice], truth, read_input)
@@ -269,9 +281,8 @@ def _check_keeps_gradient(name: str, values: Tensor, sources: tuple[Any, ...]) -
     if any(isinstance(source, Tensor) and source.requires_grad for source in sources):
         raise InputError(
             f"objective {name!r}: the result does not depend on the output or the "
-            "images differentiably; "
-            "remove .detach(), torch.no_grad() or argmax, or choose a policy "
-            "without gradients (random)"
+            "images differentiably; remove .detach(), torch.no_grad() or argmax, or "
+            "choose a policy without gradients (random)"
         )
 
 
@@ -287,6 +298,11 @@ def _list_tensors(value: Any) -> list[Tensor]:
     return [tensor for element in elements for tensor in _list_tensors(element)]
 
 
+def _list_differentiable(value: Any) -> list[Tensor]:
+    """Return the tensors in nested tuples, lists and mappings that need a gradient."""
+    return [tensor for tensor in _list_tensors(value) if tensor.requires_grad]
+
+
 def _check_differentiable(name: str, values: Tensor, sources: Sequence[Tensor]) -> None:
     """Raise InputError if a function wrote into its arguments in place, so that torch
     cannot differentiate its values (N,) by their sources.
@@ -298,10 +314,9 @@ def _check_differentiable(name: str, values: Tensor, sources: Sequence[Tensor]) 
             raise
         raise InputError(
             f"objective {name!r}: it writes into what it is given, and then torch "
-            "can't differentiate what it has "
-            "computed before; use the operation that makes a new tensor (`scatter` for "
-            "`scatter_`, "
-            "`logits.clone()` before `logits[...] = ...`)"
+            "can't differentiate what it has computed before; use the operation that "
+            "makes a new tensor (`scatter` for `scatter_`, `logits.clone()` before "
+            "`logits[...] = ...`)"
         ) from None
 
 
@@ -319,17 +334,16 @@ def _check_values(name: str, values: Any, count: int) -> Tensor:
     if not isinstance(values, Tensor):
         raise InputError(
             f"objective {name!r}: expected a torch tensor of shape ({count},), got "
-            f"{type(values).__name__}; "
-            "compute it with torch operations and don't call .item(), float() or "
-            ".numpy()"
+            f"{type(values).__name__}; compute it with torch operations and don't call "
+            ".item(), float() or .numpy()"
         )
     if not values.is_floating_point():
         raise InputError(
             f"objective {name!r}: expected floating-point values, got {values.dtype}; "
-            "a count or a comparison has "
-            "no gradient"
+            "a count or a comparison has no gradient"
         )
     value_per_image: Tensor = values
+    # a scalar is the value of a single image
     if values.ndim == 0 and count == 1:
         value_per_image = values.reshape(1)
     if value_per_image.shape != (count,):
@@ -436,9 +450,10 @@ def _pass_copies(objective: Objective) -> Objective:
     def with_copies(
         output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
     ) -> Tensor:
-        return objective(
-            *copy_value((output, images, truth)), lambda name: copy_value(more(name))
-        )
+        def read_copy(name: str) -> Any:
+            return copy_value(more(name))
+
+        return objective(*copy_value((output, images, truth)), read_copy)
 
     return with_copies
 
@@ -600,26 +615,27 @@ def get_objective(
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
     kind = _find_kind(objective)
-    is_built_in = kind is not None and _BUILT_IN_KINDS.get(kind.name) is kind
-    takes_logits_of_task = False
     if kind is None:
         function = wrap_objective(objective)  # type: ignore[arg-type]
-    elif kind.of_task is not None:
+        return _orient_objective(
+            function, task, takes_logits_of_task=False, user_function=objective
+        )
+    # functions of other packages are called with copies, and their mistakes explained
+    is_built_in = _BUILT_IN_KINDS.get(kind.name) is kind
+    if kind.of_task is not None:
         # It knows target and direction itself.
-        return kind.of_task(task) if is_built_in else _pass_copies(kind.of_task(task))
-    elif kind.of_features is not None:
+        task_objective = kind.of_task(task)
+        return task_objective if is_built_in else _pass_copies(task_objective)
+    if kind.of_features is not None:
         function = _make_feature_objective(kind, features, clean)
         if not is_built_in:
             function = _pass_copies(function)
     else:
         form = kind.form(targeted=targeted)
         function = _ignore_inputs(form) if is_built_in else wrap_objective(form)
-        takes_logits_of_task = _has_other_outputs(task)
+    takes_logits_of_task = kind.of_features is None and _has_other_outputs(task)
     return _orient_objective(
-        function,
-        task,
-        takes_logits_of_task=takes_logits_of_task,
-        user_function=objective if kind is None else None,
+        function, task, takes_logits_of_task=takes_logits_of_task, user_function=None
     )
 
 
@@ -640,8 +656,7 @@ def _make_feature_objective(
     if features is None or clean is None:
         raise InputError(
             f"objective {kind.name!r}: expected the model's features and a clean "
-            "picture, got none; use "
-            "get_objective(name, "
+            "picture, got none; use get_objective(name, "
             "features=advsearch.models.features.features_of(model), clean=picture)"
         )
     return _ignore_inputs(kind.of_features(features, clean))
@@ -677,6 +692,7 @@ def _orient_objective(
             target its direction is checked once, at its first gradient.
     """
     targeted = task.target is not None
+    # set to False by the first call that has checked it
     must_check_direction = user_function is not None and targeted
 
     def oriented_objective(
@@ -689,9 +705,9 @@ def _orient_objective(
         if takes_logits_of_task:
             function_output = task.as_logits(output, labels)
         value = function(function_output, images, labels, more)
-        is_of_logits = isinstance(output, Tensor) and output.ndim == 2
-        has_gradient = value.requires_grad and is_of_logits and output.requires_grad
-        if must_check_direction and has_gradient:
+        has_logits = isinstance(output, Tensor) and output.ndim == 2
+        can_check = value.requires_grad and has_logits and output.requires_grad
+        if must_check_direction and can_check:
             must_check_direction = False
             name = get_name(user_function)  # type: ignore[arg-type]
             _warn_of_direction(name, value, output, labels)
@@ -722,9 +738,8 @@ def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -
     if bool((slope[:, classes].sum(dim=1) < 0.0).all()):
         warnings.warn(
             f"objective {name!r} falls as the target becomes more likely, and an "
-            "objective is maximised: the search "
-            "walks away from the target. Negate it, or take a loss of advsearch.losses "
-            "that begins with targeted_.",
+            "objective is maximised: the search walks away from the target. Negate "
+            "it, or take a loss of advsearch.losses that begins with targeted_.",
             stacklevel=2,
         )
 
@@ -753,13 +768,11 @@ def check_objective(
     if targeted and minimise:
         raise InputError(
             "minimise: expected no `target` beside it; to make the object easier to "
-            "recognise as something else, "
-            "give that as `label`"
+            "recognise as something else, give that as `label`"
         )
     if isinstance(objective, str) and objective not in OBJECTIVE_KINDS:
         hint = (
-            "From Python, objective= also takes a function (output, images, "
-            "truth), "
+            "From Python, objective= also takes a function (output, images, truth), "
             "or (output, labels)."
         )
         raise UnknownNameError("objective", objective, OBJECTIVE_KINDS, hint)
@@ -769,10 +782,10 @@ def check_objective(
             f"truth), got {objective!r}"
         )
     kind = _find_kind(objective)
-    if kind is None:
-        read_signature(objective)  # type: ignore[arg-type]  # checks its arguments
-        return
-    _check_kind(kind, task, targeted=targeted, minimise=minimise)
+    if kind is not None:
+        _check_kind(kind, task, targeted=targeted, minimise=minimise)
+    else:  # a function: this raises if it takes other arguments
+        read_signature(objective)  # type: ignore[arg-type]
 
 
 def _check_kind(
@@ -791,8 +804,7 @@ def _check_kind(
         fitting = [name for name, other in OBJECTIVE_KINDS.items() if other.fits(task)]
         raise InputError(
             f"objective: expected an objective of task {task} ({', '.join(fitting)}), "
-            f"got {kind.name}, which takes "
-            f"outputs of {kind.task}"
+            f"got {kind.name}, which takes outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
         # a distance from the clean picture has no other use than to be maximised

@@ -185,19 +185,7 @@ def search(
         RuntimeError, ValueError: the policy left the domain or `evaluate` broke its
             contract; a bug.
     """
-    if steps < 1:
-        raise InputError(f"steps: expected at least 1, got {steps}")
-    if candidates < 0 or repeats < 1:
-        raise InputError(
-            "candidates and repeats: expected at least 0 and 1, got "
-            f"{candidates} and {repeats}"
-        )
-    if max_extra_repeats < 0:
-        raise InputError(
-            f"max_extra_repeats: expected at least 0, got {max_extra_repeats}"
-        )
-    if seconds is not None and not seconds > 0.0:
-        raise InputError(f"seconds: expected a number over 0, got {seconds}")
+    _check_limits(steps, candidates, repeats, max_extra_repeats, seconds)
     started = time.perf_counter()
     log = _Log(evaluate, domain, on_step, max(1, candidates), kind, render_seed)
     try:
@@ -219,11 +207,33 @@ def search(
     return _make_result(log, stopped, time.perf_counter() - started)
 
 
+def _check_limits(
+    steps: int,
+    candidates: int,
+    repeats: int,
+    max_extra_repeats: int,
+    seconds: float | None,
+) -> None:
+    """Raise InputError if a limit of a search is out of range."""
+    if steps < 1:
+        raise InputError(f"steps: expected at least 1, got {steps}")
+    if candidates < 0 or repeats < 1:
+        raise InputError(
+            "candidates and repeats: expected at least 0 and 1, got "
+            f"{candidates} and {repeats}"
+        )
+    if max_extra_repeats < 0:
+        raise InputError(
+            f"max_extra_repeats: expected at least 0, got {max_extra_repeats}"
+        )
+    if seconds is not None and not seconds > 0.0:
+        raise InputError(f"seconds: expected a number over 0, got {seconds}")
+
+
 def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     """Return what a search found, by its log.
 
-    An interrupted batch is passed to the policy as far as it was evaluated. An
-    interrupted search claims nothing, whatever it found.
+    An interrupted search claims nothing, whatever it found.
 
     Args:
         log: log of the search.
@@ -237,14 +247,7 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     if math.isfinite(best.mean_objective):
         best_objective = best.mean_objective
     is_claimed = best.success_rate >= 0.5 and stopped is not Ending.INTERRUPTED
-    final_policy = None
-    state = None
-    if log.state is not None:  # else the search ended before the first proposal
-        final_policy = log.policy
-        state = log.state
-        if final_policy is not None and log.evaluated_batch:
-            state = final_policy.update(state, log.evaluated_batch)
-    return SearchResult(
+    result = SearchResult(
         best_u=best.u,
         best_objective=best_objective,
         claimed_objective=best.objective,
@@ -259,11 +262,26 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         non_finite_elements=sum(record.non_finite for record in log.records),
         seconds=seconds,
         agreement=tuple(log.agreement),
-        counts=Counts() if final_policy is None else final_policy.counts(state),
-        distribution=(
-            None if final_policy is None else final_policy.distribution(state)
-        ),
-        failures=None if final_policy is None else final_policy.failures(state),
+    )
+    return _add_policy_findings(result, log)
+
+
+def _add_policy_findings(result: SearchResult, log: _Log) -> SearchResult:
+    """Return the result of a search with what its policy knows at the end.
+
+    An interrupted batch is passed to the policy as far as it was evaluated.
+    """
+    policy = log.policy
+    state = log.state
+    if policy is None or state is None:  # the search ended before the first proposal
+        return result
+    if log.evaluated_batch:
+        state = policy.update(state, log.evaluated_batch)
+    return replace(
+        result,
+        counts=policy.counts(state),
+        distribution=policy.distribution(state),
+        failures=policy.failures(state),
     )
 
 
@@ -324,21 +342,8 @@ class _Log:
                 that are ranked share them.
             phase: phase of the search.
         """
-        queries = list[Query]()
         started = time.perf_counter()
-        for record_index, (proposal, seed_index) in enumerate(
-            zip(proposals, indices, strict=True), start=len(self.records)
-        ):
-            query = Query(
-                proposal.u.clone(),
-                seed=stream(self.render_seed, self.kind, seed_index),
-                kind=self.kind,
-                index=record_index,
-                phase=phase,
-                gradient=proposal.gradient,
-                samples=proposal.samples,
-            )
-            queries.append(query)
+        queries = self._make_queries(proposals, indices, phase)
         for proposal, query, raw in zip(
             proposals, queries, self.evaluate(queries), strict=True
         ):
@@ -352,6 +357,26 @@ class _Log:
                 self.on_step(self.records[-1], *copy_value((proposal.u, evaluation)))
             yield evaluation
             started = time.perf_counter()
+
+    def _make_queries(
+        self, proposals: Sequence[Proposal], seed_indices: Sequence[int], phase: Phase
+    ) -> list[Query]:
+        """Return the queries of proposals, numbered from the next record on."""
+        queries = list[Query]()
+        for record_index, (proposal, seed_index) in enumerate(
+            zip(proposals, seed_indices, strict=True), start=len(self.records)
+        ):
+            query = Query(
+                proposal.u.clone(),
+                seed=stream(self.render_seed, self.kind, seed_index),
+                kind=self.kind,
+                index=record_index,
+                phase=phase,
+                gradient=proposal.gradient,
+                samples=proposal.samples,
+            )
+            queries.append(query)
+        return queries
 
     def _count(self, proposal: Proposal, evaluation: Evaluation, phase: Phase) -> None:
         """Count the costs of an evaluation; one of the search may become a candidate.
@@ -431,9 +456,9 @@ def _explore(
     """Let the policy propose until there is a reason to stop; return that.
 
     Reasons are that the budget is spent, the time is over (which counts as the same),
-    the policy has nothing more to propose, or objectives are not finite. The log has
-    the policy's state and the evaluations since then, so that an interrupted search can
-    use them.
+    the policy has nothing more to propose, or objectives are not finite. At any time,
+    the log has the policy's latest state and the evaluations since then: an interrupted
+    search ends with these.
 
     Args:
         log: log of the search; it is changed.
@@ -567,8 +592,7 @@ def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
     if u.shape != domain.start.shape or u.dtype != torch.float32:
         raise RuntimeError(
             f"policy {name!r} proposed {u.dtype} of shape {tuple(u.shape)}; expected "
-            "torch.float32 of shape "
-            f"{tuple(domain.start.shape)}"
+            f"torch.float32 of shape {tuple(domain.start.shape)}"
         )
     excess = domain.violation(u)
     if not excess <= TOLERANCE:  # so that NaN is rejected as well
@@ -597,13 +621,10 @@ def _check_evaluation(
     if proposal.gradient and gradient is not None and not is_like_u:
         raise RuntimeError(
             f"evaluate returned a gradient of {gradient.dtype}, shape "
-            f"{tuple(gradient.shape)}; expected "
-            f"{u.dtype}, shape {tuple(u.shape)}"
+            f"{tuple(gradient.shape)}; expected {u.dtype}, shape {tuple(u.shape)}"
         )
     if not min_cost <= evaluation.cost <= max_cost:
         raise RuntimeError(
             f"evaluate took {evaluation.cost} renders; expected {min_cost} to "
-            f"{max_cost}, by "
-            "the proposal's samples and the "
-            "domain's gradient_cost"
+            f"{max_cost}, by the proposal's samples and the domain's gradient_cost"
         )

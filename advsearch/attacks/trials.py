@@ -128,7 +128,7 @@ class Rung:
         mean: mean of the margins.
         half_width: half width of the one-sided 95 % interval of the mean (Student's t),
             all looks together.
-        drift: drift of the mean from the rung below; NaN at the first.
+        drift: difference of the mean from that of the rung below; NaN at the first.
         is_settled: whether more samples would not change the sign of the mean; see
             `choose_spp`.
     """
@@ -166,8 +166,10 @@ def choose_spp(
     ladder: Sequence[int] = LADDER,
     trials: int = 0,
 ) -> SampleCount:
-    """Climb a ladder of sample counts with each configuration until more of them would
-    not change the verdict; return the highest rung that one of them needed.
+    """Choose a sample count at which more samples would not change the verdict.
+
+    A ladder of sample counts is climbed with each configuration until that holds; the
+    highest rung that one of them needed is returned.
 
     A verdict asks on which side of zero the margin is. A configuration has settled at a
     rung, with the mean margin m there and m' at the rung below, when on that side, with
@@ -285,11 +287,12 @@ def _climb_ladder(
     # (index of the rung, renders there), in the order in which one looks
     all_looks = list(product(range(1, len(ladder)), look_sizes))
     for look_index, (level, count) in enumerate(all_looks):
-        # whether this look or a later one may show that the margin has settled
-        if not any(
+        # at this look, or at a later one
+        may_settle_yet = any(
             _may_settle(margins_of_rungs, ladder, *level_and_count, n_looks)
             for level_and_count in all_looks[look_index:]
-        ):
+        )
+        if not may_settle_yet:
             break
         if not _may_settle(margins_of_rungs, ladder, level, count, n_looks):
             continue
@@ -328,11 +331,12 @@ def _is_settled(
     extrapolated_error = math.hypot(
         2.0 * deviation, _compute_deviation(below)
     ) / math.sqrt(count)
+    # The trials that follow are judged by the mean of as many renders as these: its
+    # standard error counts. Otherwise each single one has to be on the same side.
+    has_renders_of_trials = count == trials
+    error = deviation / math.sqrt(count) if has_renders_of_trials else deviation
     sign = math.copysign(1.0, mean)
     quantile = _compute_quantile(count, looks)
-    # If the renders are as many as the trials, the standard error of their mean; else
-    # the deviation of a single render, as every trial has to be on the same side.
-    error = deviation / math.sqrt(count) if count == trials else deviation
     is_mean_sure = sign * mean > quantile * error
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
     is_sign_constant = all(sign * value > 0.0 for value in at_rung)
@@ -372,22 +376,35 @@ def _may_settle(
     drift = abs(mean - fmean(values[rendered_rungs[-2]]))
     standard_error = _compute_deviation(last_values) / math.sqrt(len(last_values))
     max_mean = abs(mean) + drift + standard_error
-
-    def estimate_deviation(rung: int) -> float:
-        """Return the standard deviation of the margins of a rung, rendered or not."""
-        if values[rung]:
-            return _compute_deviation(values[rung])
-        return _compute_deviation(last_values) * math.sqrt(
-            ladder[last_rung] / ladder[rung]
-        )
-
     # The mean m of the rung and m' of the one below have to show that 2 m - m' is not
     # zero (`_is_settled`): this is the deviation of a difference of single renders.
     deviation = math.hypot(
-        2.0 * estimate_deviation(level), estimate_deviation(level - 1)
+        2.0 * _estimate_deviation(values, ladder, last_rung, level),
+        _estimate_deviation(values, ladder, last_rung, level - 1),
     )
     min_mean = deviation * _compute_quantile(count, looks) / math.sqrt(count)
     return min_mean <= max_mean
+
+
+def _estimate_deviation(
+    values: Sequence[list[float]], ladder: Sequence[int], last_rung: int, rung: int
+) -> float:
+    """Return the standard deviation of the margins of a rung, rendered or not.
+
+    At a rung that was not rendered, it is that of the last rendered one, which falls
+    with the root of the samples.
+
+    Args:
+        values: margins of each rung; empty of one that was not rendered.
+        ladder: samples per pixel of the rungs.
+        last_rung: index of the last rung that was rendered.
+        rung: index of the rung.
+    """
+    if values[rung]:
+        return _compute_deviation(values[rung])
+    return _compute_deviation(values[last_rung]) * math.sqrt(
+        ladder[last_rung] / ladder[rung]
+    )
 
 
 def list_look_sizes(trials: int = 0) -> tuple[int, ...]:
@@ -463,9 +480,11 @@ def limit_ladder(
 def choose_rate_spp(
     margins: Mapping[str, MarginsOf], *, seed: int, ladder: Sequence[int] = OVER_LADDER
 ) -> SampleCount:
-    """Climb a ladder of sample counts with each configuration until more samples would
-    not change the fraction of conditions with a margin below zero; return the highest
-    rung that one of them needed.
+    """Choose a sample count at which more samples would not change how often a model is
+    wrong over conditions: the fraction with a margin below zero.
+
+    A ladder of sample counts is climbed with each configuration until that holds; the
+    highest rung that one of them needed is returned.
 
     Each is rendered under the same `N_CONDITIONS` at a rung and at the one below. It
     has settled if the mean change of the margin, taken once more and at either end
@@ -473,29 +492,48 @@ def choose_rate_spp(
     conditions over zero (`estimate_moved_fraction`). The error that is left falls with
     the sample count, so it is smaller than the change that led here
     (`benchmarks/verdicts.py` has how far the rate is off then). No render of it is a
-    trial. Arguments are as of `choose_spp`; conditions are sampled by the seeds.
+    trial.
+
+    Args:
+        margins: the configurations by name, as of `choose_spp`; conditions are sampled
+            by the seeds.
+        seed: root seed.
+        ladder: sample counts, ascending. A single one is returned unmeasured.
     """
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
     table = list[Rung]()
+    # index; nothing settles at the first rung, which has none below
     highest_rung = 1
     seeds = [stream(seed, "sample count", number) for number in range(N_CONDITIONS)]
     for name, render in margins.items():
-        below: FloatArray | None = None
-        for index, spp in enumerate(ladder):
-            at_rung = np.array(render(spp, seeds), dtype=np.float64)
-            table.append(_summarize_conditions(name, spp, at_rung, below))
-            if table[-1].is_settled:
-                highest_rung = max(highest_rung, index)
-                break
-            below = at_rung
-        else:  # not even the last rung has settled
+        rungs = _climb_until_settled(name, render, seeds, ladder)
+        table += rungs
+        if not rungs[-1].is_settled:
             return SampleCount(
                 ladder[-1], False, tuple(table), N_CONDITIONS * len(table)
             )
+        highest_rung = max(highest_rung, len(rungs) - 1)
     return SampleCount(
         ladder[highest_rung], True, tuple(table), N_CONDITIONS * len(table)
     )
+
+
+def _climb_until_settled(
+    name: str, render: MarginsOf, seeds: Sequence[int], ladder: Sequence[int]
+) -> list[Rung]:
+    """Return the rungs of a configuration under many conditions, up to the first at
+    which it has settled, or the last of the ladder.
+    """
+    rungs = list[Rung]()
+    below: FloatArray | None = None
+    for spp in ladder:
+        at_rung = np.array(render(spp, seeds), dtype=np.float64)
+        rungs.append(_summarize_conditions(name, spp, at_rung, below))
+        if rungs[-1].is_settled:
+            break
+        below = at_rung
+    return rungs
 
 
 def _summarize_conditions(

@@ -176,10 +176,11 @@ class Rule:
         """Return whether a configuration is a success by its trials.
 
         None if that depends on the noise: it succeeds too often to be called a failure
-        and fails too often to be called a success. Neither may happen more often than
-        the rule allows failures.
+        and fails too often to be called a success. Of trials that nearly all agree, the
+        others may be as many as the failures that the rule allows.
         """
-        n_exceptions = min(successes, trials - successes)
+        failures = trials - successes
+        n_exceptions = min(successes, failures)
         if n_exceptions > self.count_allowed_failures(trials):
             return None
         return successes >= self.count_needed(trials)
@@ -244,11 +245,14 @@ class Verification:
     @property
     def valid_trials(self) -> tuple[Judgement, ...]:
         """The adversarial trials that count; all of them if none does."""
-        trials = zip(self.adversarial_trials, self.outcomes, strict=True)
-        return (
-            tuple(trial for trial, outcome in trials if outcome is not None)
-            or self.adversarial_trials
+        valid_trials = tuple(
+            trial
+            for trial, outcome in zip(
+                self.adversarial_trials, self.outcomes, strict=True
+            )
+            if outcome is not None
         )
+        return valid_trials or self.adversarial_trials
 
     @property
     def successful_trials(self) -> tuple[Judgement, ...]:
@@ -361,13 +365,13 @@ def verify(
         spp: samples per pixel.
         seed: root seed. Must not be one that the search rendered with through the same
             stream.
-        trials: per group; or ascending numbers, see above.
+        trials: number of trials of each group; or ascending numbers, see above.
         clean: the first trials of the clean configuration, where `run_trials` has run
             them with the same spp and seed (one control group serves the attack and its
             baseline); what is missing is run here.
         rule: what counts as a success, and which ending it is.
         kind: kind of the queries of the adversarial configuration.
-        control_kind: control kind of those of the clean configuration.
+        control_kind: kind of the queries of the clean configuration.
         n_images: how many images of the adversarial trials are requested.
         curtailed: see above; for a claim of which only the verdict matters.
         first_index: index of the first trial; if the configuration was chosen by
@@ -384,9 +388,9 @@ def verify(
     def has_failed(new_trials: Sequence[Judgement]) -> bool:
         """Return whether too many trials fail for the claim to hold at any look."""
         all_trials = [*done, *new_trials]
+        # all that there may be
         n_total = looks[-1] if has_several_looks else rule.count_valid(clean_trials)
-        n_failures = _list_outcomes(rule, all_trials, clean_trials).count(False)
-        has_too_many = n_failures > rule.count_allowed_failures(n_total)
+        has_too_many = _fails_too_often(rule, all_trials, clean_trials, n_total)
         return len(all_trials) >= min_trials and has_too_many
 
     run = partial(run_trials, evaluate, spp=spp, seed=seed, first_index=first_index)
@@ -425,6 +429,17 @@ def verify(
         is_early=is_success and is_early,
         begin=first_index,
     )
+
+
+def _fails_too_often(
+    rule: Rule,
+    trials: Sequence[Judgement],
+    clean_trials: Sequence[Judgement],
+    n_total: int,
+) -> bool:
+    """Return whether more trials fail than the rule allows of `n_total` trials."""
+    n_failures = _list_outcomes(rule, trials, clean_trials).count(False)
+    return n_failures > rule.count_allowed_failures(n_total)
 
 
 def _choose_confidence(rule: Rule, *, has_several_looks: bool) -> float:
@@ -474,20 +489,22 @@ def _is_found(
     spp: int,
     is_early: bool,
 ) -> bool:
-    """Return whether enough trials succeed at a look, and the clean ones are not wrong.
+    """Return whether a claim is found to hold: enough trials succeed, and the model is
+    not wrong about the clean configuration already.
 
     Args:
         rule: says how many have to succeed.
         trials: trials of the adversarial configuration.
         clean_trials: clean trials of the same seeds, or more.
-        count: trials that are looked at, the first ones.
+        count: number of clean trials that count here, the first ones.
         spp: samples per pixel.
         is_early: whether more trials could follow.
     """
-    clean_looked_at = clean_trials[:count]
-    n_needed = rule.count_needed(rule.count_valid(clean_looked_at), early=is_early)
+    counted_clean_trials = clean_trials[:count]
+    n_valid = rule.count_valid(counted_clean_trials)
+    n_needed = rule.count_needed(n_valid, early=is_early)
     n_successes = _list_outcomes(rule, trials, clean_trials).count(True)
-    is_clean_wrong = rule.is_already_wrong(count_right(clean_looked_at, spp))
+    is_clean_wrong = rule.is_already_wrong(count_right(counted_clean_trials, spp))
     return n_successes >= n_needed and not is_clean_wrong
 
 
@@ -496,9 +513,11 @@ def _list_outcomes(
 ) -> tuple[bool | None, ...]:
     """Return whether each trial is a success; None where it does not count.
 
-    Over conditions it does not count where the clean configuration is wrong.
+    Where conditions vary (`Rule.is_conditional`), a trial does not count if the model
+    is wrong about the clean configuration under the same conditions.
     """
     outcomes: list[bool | None] = []
+    # there may be more clean trials than others
     for trial, clean in zip(trials, clean_trials, strict=False):
         if rule.is_conditional and not clean.right:
             outcomes.append(None)

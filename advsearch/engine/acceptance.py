@@ -113,20 +113,24 @@ class Deviation:
         return math.inf
 
     @property
+    def has_accepted_levels(self) -> bool:
+        """Whether the levels alone are small enough; False if they are NaN."""
+        return self.levels_fraction <= ACCEPTED_FRACTION
+
+    @property
     def is_accepted(self) -> bool:
         """Whether predictions may replace rendered images; False if anything is NaN."""
-        return (
-            self.levels_fraction <= ACCEPTED_FRACTION
-            and abs(self.logits) <= self.allowed_margin_bias
-        )
+        has_accepted_margin = abs(self.logits) <= self.allowed_margin_bias
+        return self.has_accepted_levels and has_accepted_margin
 
     @property
     def reason(self) -> str:
         """Why predictions may not replace rendered images, for a sentence."""
-        if not self.levels_fraction <= ACCEPTED_FRACTION:
+        if not self.has_accepted_levels:
+            max_levels = ACCEPTED_FRACTION * self.allowed_levels
             return (
                 f"{self.levels:.1f} levels of 255 off on the object, where "
-                f"{ACCEPTED_FRACTION * self.allowed_levels:.1f} would do"
+                f"{max_levels:.1f} would do"
             )
         return (
             f"{self.logits:+.2f} off in the margin, where "
@@ -234,7 +238,9 @@ def compute_level_errors(
         seed: seed of the noise of the traced images.
         spp: samples per pixel of each of the two traced images.
     """
-    halves = renderer.render_halves(u, seed, spp)[:2]
+    # the third image is the denoised one of both
+    first_half, second_half, _ = renderer.render_halves(u, seed, spp)
+    halves = (first_half, second_half)
     return [_root(compute_squared_error(image, halves)) for image in images]
 
 

@@ -131,7 +131,7 @@ class Bank(PredictedSearch):
 
     @property
     def n_samples(self) -> int:
-        return self._bank_size(0) * SPP
+        return self._count_conditions(0) * SPP
 
     def measure_size(self) -> tuple[int, int]:
         entries = sum(condition.renderer.n_entries for condition in self._conditions)
@@ -139,7 +139,7 @@ class Bank(PredictedSearch):
 
     def summarize_conditions(self) -> BankOfConditions:
         return BankOfConditions(
-            made=self._bank_size(self._latest_step),
+            made=self._count_conditions(self._latest_step),
             dropped=self._n_dropped,
             grown=len(self.growth_steps),
             gap=self.gaps[-1] if self.gaps else None,
@@ -192,8 +192,9 @@ class Bank(PredictedSearch):
         others. While configurations are ranked, after the search, none is new.
         """
         count = min(self.problem.n_draws, len(self._conditions))
+        # another kind of search comes later, and finds all conditions there
         previous_index = index - 1 if kind == "search" else self._latest_step
-        size_before = self._bank_size(previous_index)
+        size_before = self._count_conditions(previous_index)
         new = [
             condition
             for condition in self._conditions
@@ -237,25 +238,29 @@ class Bank(PredictedSearch):
         return torch.stack(images)
 
     def _render_image(self, u: Tensor) -> Tensor:
-        """Return the image (H, W, 3) of u (d,) without random conditions."""
+        """Return the image (H, W, 3) of u (d,) as the scene comes, without random
+        conditions.
+        """
         if self._image_renderer is None:
             seed = seeds.stream(self.problem.seed, "bank still")
+            # without a seed, the conditions are those that leave the scene unchanged
             start = self.problem.add_conditions(self.problem.domain.start)
             self._image_renderer = self.problem.make_linear_renderer(start, seed, SPP)
             self.n_traced += 1
         with torch.no_grad():
             return self._image_renderer(self.problem.add_conditions(u))
 
-    def _bank_size(self, index: int) -> int:
-        """Return how many conditions the bank has had by the evaluation with an index.
+    def _count_conditions(self, index: int) -> int:
+        """Return how many conditions the bank has had by the evaluation with an index,
+        those that were dropped since then included.
 
         It begins with `INITIAL_CONDITIONS` for each draw. It grows from the start on,
         and again from each comparison in `growth_steps`, until the next comparison: by
         one condition for every `DRAWS_PER_CONDITION` draws. In the second half of a
         search it does not grow.
         """
-        # no growth in the second half
-        index = min(index, self.steps // 2 - 1)
+        last_growing_index = self.steps // 2 - 1
+        index = min(index, last_growing_index)
         # evaluations so far at which the bank grew
         n_growing_steps = 0
         for begin in (0, *self.growth_steps):
@@ -275,7 +280,7 @@ class Bank(PredictedSearch):
             # comparisons after which this condition was added
             begin
             for begin in self.growth_steps
-            if self._bank_size(begin - 1) <= number
+            if self._count_conditions(begin - 1) <= number
         ]
         u = self._grown_at[starts[-1]] if starts else self.problem.domain.start
         bank_seed = seeds.stream(self.problem.seed, "bank")
@@ -290,7 +295,7 @@ class Bank(PredictedSearch):
             index: index of the evaluation.
             tick: called with the samples of each condition that is made.
         """
-        size = self._bank_size(index)
+        size = self._count_conditions(index)
         first_missing = self._conditions[-1].index + 1 if self._conditions else 0
         if first_missing >= size:
             return
@@ -311,7 +316,7 @@ class Bank(PredictedSearch):
         depend on how the comparison ends.
         """
         next_comparison = (index // COMPARISON_INTERVAL + 1) * COMPARISON_INTERVAL
-        self._collected_until = self._bank_size(next_comparison - 1)
+        self._collected_until = self._count_conditions(next_comparison - 1)
         queries = [
             self._make_query(number)
             for number in range(first_missing, self._collected_until)
@@ -325,26 +330,30 @@ class Bank(PredictedSearch):
             self._n_dropped += 1
 
     def _make_condition(self, number: int, light: LinearizedScene | None) -> Condition:
-        """Return the condition with an index, with the matrix of its light."""
+        """Return the condition with an index, with the matrix of its light.
+
+        `light` is what another process has collected; None to collect it here.
+        """
         query = self._make_query(number)
         dim = self.problem.domain.dim
         renderer = self.problem.make_linear_renderer(query.u, query.seed, SPP, light)
         self.n_traced += 1
+        # by name, the inputs of the scene at which the matrix was computed
+        inputs = renderer.linearized_at
         with torch.no_grad():
             searched_inputs = self.problem.searched_space.inputs(query.u[:dim])
-        # Whether the searched controls alone set all inputs of the matrix: then they
-        # have the same values without the condition's controls.
-        depends_on_searched_only = True
-        for name, value in renderer.linearized_at.items():
-            if name not in searched_inputs or not torch.equal(
-                searched_inputs[name], value
-            ):
-                depends_on_searched_only = False
+        # They depend on the searched controls only if these alone set all of them, to
+        # the same values as together with the condition's controls.
+        depends_on_searched_only = all(
+            name in searched_inputs and torch.equal(searched_inputs[name], value)
+            for name, value in inputs.items()
+        )
+        # Equal inputs of all matrices share one tensor.
+        for name, value in inputs.items():
             latest = self._latest_inputs.get(name)
             if latest is not None and torch.equal(latest, value):
-                # Equal inputs of all matrices share one tensor.
-                renderer.linearized_at[name] = latest
-        self._latest_inputs = dict(renderer.linearized_at)
+                inputs[name] = latest
+        self._latest_inputs = dict(inputs)
         return Condition(number, query.u[dim:], renderer, depends_on_searched_only)
 
     def _compare(self, u: Tensor, index: int) -> None:
@@ -390,9 +399,12 @@ class Bank(PredictedSearch):
             self.growth_steps.append(index)
 
     def _trace_unseen(self, u: Tensor, seed: int) -> list[float]:
-        """Return the objectives of u (d,) under conditions that are not in the bank."""
+        """Return the objectives of traced images of u (d,) under `N_COMPARED` new
+        conditions, which are not in the bank.
+        """
         objectives = []
         for index in range(N_COMPARED):
+            # of the conditions, and of the noise
             draw_seed = seeds.stream(seed, "draw", index)
             evaluation, _ = self.problem.evaluate_full(
                 Query(u, draw_seed),

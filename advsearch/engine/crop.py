@@ -71,13 +71,23 @@ class CroppedSearch(PredictedSearch):
             self.window = windowing.window
             self.deviations.append(windowing.deviation)
             tick(self.n_samples)
-            self.n_traced += 3
+            self.n_traced += 3  # the full images of `find_window`
             self._use(windowing, "start", 0, windowing.start)
 
     def _use(
         self, windowing: Windowing, kind: str, number: int, image: FullImage
     ) -> Renderer:
-        """Render the surroundings that a kind of search has from now on."""
+        """Render the surroundings that a kind of search has from now on.
+
+        Args:
+            windowing: the window.
+            kind: kind of the search.
+            number: index of the query, for the seed.
+            image: full image of the configuration whose surroundings they are.
+
+        Returns:
+            The renderer of the window, with these surroundings.
+        """
         problem = self.problem
         seed = seeds.stream(problem.seed, f"crop {kind}", number)
         with problem.renderer.scene.limit_depth(problem.search_depth):

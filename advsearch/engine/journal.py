@@ -253,28 +253,33 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
     while isinstance(function, partial):
         function = function.func
     # without decorators, and a method without its object
-    unwrapped: Any = inspect.unwrap(function)
-    unwrapped = getattr(unwrapped, "__func__", unwrapped)
+    callee: Any = inspect.unwrap(function)
+    callee = getattr(callee, "__func__", callee)
     arrays: list[Any] = []
-    is_callable_object = not hasattr(unwrapped, "__code__")
-    if is_callable_object:
-        attributes = sorted(getattr(unwrapped, "__dict__", {}).items())
-        simplified = [(name, _simplify(value)) for name, value in attributes]
-        arrays = [pair for pair in simplified if isinstance(pair[1], bytes)]
-        cls = type(unwrapped)
+    is_object = not hasattr(callee, "__code__")
+    if is_object:
+        arrays = _list_array_digests(callee)
         # a module of PyTorch computes in `forward`
-        unwrapped = getattr(cls, "forward", None) or cls.__call__
-    code = getattr(unwrapped, "__code__", None)
+        cls = type(callee)
+        callee = getattr(cls, "forward", None) or cls.__call__
+    code = getattr(callee, "__code__", None)
     if code is None:
         return None
-    closure = getattr(unwrapped, "__closure__", None) or ()
+    closure = getattr(callee, "__closure__", None) or ()
     components = (
-        _simplify_code(code, getattr(unwrapped, "__doc__", None)),
-        _simplify(getattr(unwrapped, "__defaults__", None)),
+        _simplify_code(code, getattr(callee, "__doc__", None)),
+        _simplify(getattr(callee, "__defaults__", None)),
         [_simplify(cell) for cell in closure],
         arrays,
     )
     return hashlib.sha256(repr(components).encode()).hexdigest()
+
+
+def _list_array_digests(holder: Any) -> list[tuple[str, Any]]:
+    """Return name and digest of each array that is an attribute of an object."""
+    attributes = sorted(getattr(holder, "__dict__", {}).items())
+    simplified = [(name, _simplify(value)) for name, value in attributes]
+    return [pair for pair in simplified if isinstance(pair[1], bytes)]
 
 
 def _simplify_code(code: CodeType, docstring: str | None = None) -> tuple[Any, ...]:
@@ -298,14 +303,14 @@ def _simplify(value: Any) -> Any:
     Numbers and strings stay, also in containers; arrays become their SHA-256, and other
     objects the name of their type.
     """
-    if isinstance(value, CellType):
+    if isinstance(value, CellType):  # a variable of a closure
         try:
             return _simplify(value.cell_contents)
         except ValueError:  # the cell is empty
             return None
     if isinstance(value, (tuple, list)):
         return [_simplify(item) for item in value]
-    # sorted, since the order differs from process to process
+    # the order of a set differs from process to process
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
     if isinstance(value, (np.ndarray, Tensor)):
@@ -412,8 +417,11 @@ class Journal:
         for row in rows:
             # Rows of old runs may have no judgement.
             if row.correct is not None:
-                # a predicted image has no seed; its count of samples is stored as spp
-                predicted = 0 if row.seed is not None else row.spp or 1
+                # a predicted image has no seed; by how many samples it was predicted is
+                # stored as spp
+                predicted = 0
+                if row.seed is None:
+                    predicted = row.spp or 1
                 trials[row.step] = Evaluation.from_judgement(
                     read_judgement(row), predicted=predicted
                 )
@@ -427,14 +435,14 @@ class Journal:
     def _read(self, query: Query) -> Evaluation | None:
         """Return the stored evaluation of a query; None if there is none.
 
-        A query without a phase is a trial, any other belongs to a search. As a side
-        effect the renderer counts the non-finite values that were stored with the
-        evaluation.
+        As a side effect the renderer counts the non-finite values that were stored with
+        the evaluation.
 
         Raises:
             InputError: the stored evaluation is one of another configuration.
         """
-        if query.phase is None:
+        is_trial = query.phase is None
+        if is_trial:
             return self._trials_of(query.kind).get(query.index)
         if self.run is None or query.index >= self._counts.get(query.kind, 0):
             return None
@@ -446,9 +454,8 @@ class Journal:
         if not is_same_query:
             raise InputError(
                 f"{self.run.path}: cannot resume: evaluation {query.index} of the "
-                f"{query.kind} is not the one that "
-                "was stored, so advsearch, its packages or the number of threads have "
-                "changed since; "
+                f"{query.kind} is not the one that was stored, so advsearch, its "
+                "packages or the number of threads have changed since; "
                 f"{self.run.restart_advice}"
             )
         if cached.non_finite:
@@ -478,7 +485,8 @@ class Journal:
         for query, evaluation in evaluated:
             self.n_lost += evaluation.is_lost
             self._note_machine(evaluation.machine)
-            if query.phase is None:
+            is_trial = query.phase is None
+            if is_trial:
                 row = self._row_of_trial(query, evaluation)
                 if not id_is_number:
                     # so that later calls find it; its image is stored elsewhere
@@ -493,13 +501,18 @@ class Journal:
                 row = replace(row, id=query.index + 1)  # ids begin at 1
             rows.append(row)
         if self.run is None:
-            # without a run, rows stay in memory, and get what the store would add
-            for row in rows:
-                row_id = row.id or len(self.rows) + 1
-                self.rows.append(replace(row, id=row_id, time=time.time()))
+            self._append_in_memory(rows)
         elif rows:
             self.run.append_rows(*rows, cached=cached)
         return rows
+
+    def _append_in_memory(self, rows: Iterable[Row]) -> None:
+        """Append rows to those of a journal without a run, with the id and the time
+        that the store of a run would add.
+        """
+        for row in rows:
+            row_id = row.id or len(self.rows) + 1
+            self.rows.append(replace(row, id=row_id, time=time.time()))
 
     def _note_machine(self, name: str | None) -> None:
         """Store the description of a machine that differs from this one, at its first
@@ -545,7 +558,9 @@ class Journal:
     def _row_of_search(
         self, query: Query, evaluation: Evaluation
     ) -> tuple[Row, CachedEvaluation]:
-        """Return the row of a search's evaluation, and what is stored with it."""
+        """Return the row of a search's evaluation, and what is stored beside it so that
+        the search can be resumed.
+        """
         problem = self.problem
         is_finite = evaluation.is_finite
         is_predicted = bool(evaluation.predicted)
@@ -600,10 +615,13 @@ class Journal:
         stored: Iterable[Row] = ()
         if self.run is not None and self.run.store.has_cached:
             stored = self.run.store.rows(kind)
-        phases = [(row.phase, row.seconds or 0.0) for row in stored]
-        search_seconds = [spent for phase, spent in phases if phase == "search"]
-        # rows of another phase are those of the ranking
-        has_ranking = len(phases) > len(search_seconds)
+        search_seconds = []
+        has_ranking = False
+        for row in stored:
+            if row.phase == "search":
+                search_seconds.append(row.seconds or 0.0)
+            else:
+                has_ranking = True
         seconds_left = seconds - math.fsum(search_seconds)
         started = time.perf_counter()
 
@@ -629,8 +647,7 @@ class Journal:
         )
         return [
             "Rows come from machines that are not alike, so that their last bits may "
-            "differ; beside the one that kept "
-            f"the run: {descriptions}."
+            f"differ; beside the one that kept the run: {descriptions}."
         ]
 
     # ---- notes

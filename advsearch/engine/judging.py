@@ -134,10 +134,9 @@ def check_metrics_importable(settings: Mapping[str, str]) -> None:
     for name in list_session_only_metrics(settings):
         bare_name = settings[name].rpartition(":")[2]
         raise InputError(
-            f"metrics: {name}: workers import a metric by its name, and "
-            f"{bare_name} has none "
-            "that they could; write it as a function of a module, or leave `workers` "
-            "and `cluster` out"
+            f"metrics: {name}: workers import a metric by its name, and {bare_name} "
+            "has none that they could; write it as a function of a module, or leave "
+            "`workers` and `cluster` out"
         )
 
 
@@ -157,9 +156,9 @@ def load_metrics(
     loaded: dict[str, Any] = {}
     for name, import_name in settings.items():
         function: Any = (python_functions or {}).get(name)
-        loaded[name] = (
-            function if callable(function) else _import_metric(name, import_name)
-        )
+        if not callable(function):
+            function = _import_metric(name, import_name)
+        loaded[name] = function
     return loaded
 
 
@@ -263,7 +262,6 @@ def add_metrics(
     """
     # what the metrics returned, with an entry for each item of a mapping
     returned = dict[str, Any]()
-    values = dict[str, float | None]()
     image_output, image_truth = _unbatch(output, truth)
     with torch.no_grad():
         for name, metric in metrics.items():
@@ -272,17 +270,27 @@ def add_metrics(
                 returned |= {f"{name}.{key}": value for key, value in result.items()}
             else:
                 returned[name] = result
-        for name, result in returned.items():
-            try:
-                value = float(result)
-            except (TypeError, ValueError, RuntimeError):
-                raise InputError(
-                    f"metrics: {name}: expected a number, or a dict from names to "
-                    f"numbers, got {result!r:.80}"
-                ) from None
-            # neither JSON nor a column of rows has NaN or infinity
-            values[name] = value if math.isfinite(value) else None
+        values = {
+            name: _to_metric_value(name, result) for name, result in returned.items()
+        }
     return replace(judgement, metrics=values)
+
+
+def _to_metric_value(name: str, result: Any) -> float | None:
+    """Return what a metric returned as a number; None for NaN and infinity, which
+    neither JSON nor a column of rows has.
+
+    Raises:
+        InputError: it is no number.
+    """
+    try:
+        value = float(result)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(
+            f"metrics: {name}: expected a number, or a dict from names to "
+            f"numbers, got {result!r:.80}"
+        ) from None
+    return value if math.isfinite(value) else None
 
 
 def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
@@ -450,8 +458,7 @@ def find_label_warnings(
         return []
     return [
         f"The label {label!r} is taken as the right label for every object, also for "
-        f"{', '.join(differing)}; "
-        "without a label, each object has its own."
+        f"{', '.join(differing)}; without a label, each object has its own."
     ]
 
 
@@ -763,16 +770,7 @@ def make_objective(
                 f"objective: {requested} compares the features of one model; "
                 "take another for `ensemble`"
             )
-        uses_task_objectives = requested == EnsembleTask.objective
-        objectives = [
-            get_objective(part.objective if uses_task_objectives else requested, part)
-            for part in task.tasks
-        ]
-        # A mean needs equal units, which the tasks' own objectives do not have.
-        default_ensemble: EnsembleReduction = (
-            "worst" if uses_task_objectives else "mean"
-        )
-        return reduce_objectives(objectives, ensemble or default_ensemble), ""
+        return _make_ensemble_objective(requested, task, ensemble), ""
     if not needs_features:
         return get_objective(requested, task), ""
     # A task that reads no logits compares the output of the model itself.
@@ -781,11 +779,26 @@ def make_objective(
         clean_image = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
     remark = ""
     if features is not None and not features.penultimate:
+        # they are not those before the last layer: says what they are instead
         remark = features.source
     objective = get_objective(
         requested, task, features=features or model, clean=clean_image
     )
     return objective, remark
+
+
+def _make_ensemble_objective(
+    requested: AnyObjective, task: EnsembleTask, ensemble: EnsembleReduction | None
+) -> Objective:
+    """Return the objective of several models; arguments as of `make_objective`."""
+    uses_task_objectives = requested == EnsembleTask.objective
+    objectives = [
+        get_objective(part.objective if uses_task_objectives else requested, part)
+        for part in task.tasks
+    ]
+    # A mean needs equal units, which the tasks' own objectives do not have.
+    default: EnsembleReduction = "worst" if uses_task_objectives else "mean"
+    return reduce_objectives(objectives, ensemble or default)
 
 
 def reduce_objectives(

@@ -149,7 +149,8 @@ class Scene:
     def with_environment(self, environment: EnvironmentAsset | None) -> Scene:
         """Return the scene under another environment; None for no environment map.
 
-        The environment counts as chosen by the user.
+        The environment counts as chosen by the user. In a folder of photographs, the
+        scene in each of them gets it.
 
         Raises:
             InputError: the ground of the scene shows the photograph of its environment,
@@ -180,9 +181,8 @@ class Scene:
         if name == "render":
             raise AttributeError(
                 "a scene has no `render`: advsearch.render(scene) makes a picture and "
-                "asks a model, and "
-                "scene.renderer(controls) returns render(u, seed, spp), which is "
-                "differentiable"
+                "asks a model, and scene.renderer(controls) returns render(u, seed, "
+                "spp), which is differentiable"
             )
         raise AttributeError(f"'Scene' object has no attribute {name!r}")
 
@@ -341,7 +341,7 @@ def load_scene(
         description = description.with_backdrop(backdrop, occluder)
     elif backdrop is None:
         _check_no_photograph(fixed_values or {}, occluder)
-    # assets have no name by which another session could load them
+    # no other session can load things that were given as objects, without a file
     has_asset = any(
         asset is not None and not isinstance(asset, (str, Path))
         for asset in (object, environment, backdrop)
@@ -365,8 +365,8 @@ def _put_into_photographs(
         spec: the photograph, or the folder.
         camera: as for `load_scene`.
         occluder: likewise.
-        has_environment: whether the user chose the light. If not, a photograph of a
-            folder is lit by the map beside it.
+        has_environment: whether the user chose the light. If not, the scene in each
+            photograph of a folder is lit by the map beside the photograph.
     """
     is_single_photograph = not is_photograph_folder(spec)
     if is_single_photograph:
@@ -528,8 +528,8 @@ def fit_camera(
             raise InputError(
                 "`set` camera.drops: of one camera, not of several; leave it out"
             )
-        # Drops need a camera model, whose rays are computed one by one. One without a
-        # name is such a pinhole, of an earlier picture size.
+        # Drops need a camera model, whose rays are computed one by one: a pinhole. One
+        # without a name is the pinhole of an earlier call, and has an older aspect.
         if camera_model is None or not camera_model.name:
             camera_model = make_pinhole(description.get_number("camera.fov"), aspect)
     if camera_model is not None:
@@ -601,10 +601,11 @@ def make_renderer(
     )
     has_exposure_time = any(space.exposure)
     _check_rig_times(description, space)
-    # knows how points move in the image: for derivatives at outlines, and for blur
+    # how points move in the image: for derivatives at outlines, and for blur
     motion = None
     if differentiated or has_exposure_time:
         motion = Motion(description, size, scene.assembly)
+    # of the exposure, whose images make up one with motion blur
     moments: tuple[Moment, ...] = ()
     if has_exposure_time and motion is not None:
         moments = choose_moments(space, motion, scene.assembly, size[0])
@@ -879,6 +880,7 @@ def list_session_only_controls(controls: Controls) -> list[str]:
     for name, control_settings in controls_to_settings(controls).items():
         for parameter, value in control_settings.items():
             if isinstance(value, PythonQuantiles):
+                # a distribution may be given as "control.parameter" at once
                 full_name = name if "." in name else f"{name}.{parameter}"
                 session_only.append(f"{full_name} (drawn by {value['name']})")
     return session_only

@@ -52,9 +52,14 @@ SCENE = "scene"
 def load_configured_scene(
     config: SceneConfig, name: str | None = None, environment: str | None = None
 ) -> Scene:
-    """Load the scene of a configuration: its only object, or a named one.
+    """Load the scene of a configuration.
 
-    A scene that a Python caller passed is returned as it is.
+    Args:
+        config: the configuration.
+        name: object of the scene; None for that of the configuration. A scene that a
+            Python caller passed in place of this is returned as it is.
+        environment: environment of a named object; that of the configuration belongs to
+            its own object.
     """
     if name is None:
         scene: Scene | None = config.python_object(SCENE, config.object)
@@ -143,7 +148,7 @@ def load_models(
         )
     sentences = _take_model_warnings(caught)
     if config.camera is not None:
-        n_cameras = len(read_rig(config.camera))
+        n_cameras = len(read_rig(config.camera))  # 0 for a camera that is no rig
         if n_cameras:
             _check_task_of_rig(task, config.camera, n_cameras)
             loaded = tuple(replace(model, cameras=n_cameras) for model in loaded)
@@ -165,6 +170,7 @@ def _load_for_task(
     single_image_task = task.single_image_task
     labels = None
     prompt = None
+    # it reads classes, and the names of these come from nothing else
     needs_names = single_image_task.labelled and not single_image_task.names_source
     if is_only_task or needs_names:
         labels = config.labels
@@ -195,7 +201,9 @@ def _take_model_warnings(caught: Iterable[warnings.WarningMessage]) -> list[str]
 
 
 def _check_task_of_rig(task: Task, camera: str, n_cameras: int) -> None:
-    """Raise InputError if a task cannot judge the pictures of several cameras."""
+    """Raise InputError if a task cannot judge the images of several cameras, which
+    `camera` names.
+    """
     if not task.judges_rig:
         raise InputError(
             f"camera: {camera} has {n_cameras} cameras, and task {task.name} "
@@ -212,9 +220,8 @@ def _check_n_images(model: Model) -> None:
     if isinstance(module, AllAtOnce) and module.cameras != model.cameras:
         verb = "is" if model.cameras == 1 else "are"
         raise InputError(
-            f"model: {model.name} takes {module.cameras} pictures at once, "
-            f"and {model.cameras} {verb} taken; give a `camera` that "
-            "is a rig of as many"
+            f"model: {model.name} takes {module.cameras} pictures at once, and "
+            f"{model.cameras} {verb} taken; give a `camera` that is a rig of as many"
         )
 
 
@@ -451,12 +458,13 @@ def check_run_settings(config: SceneConfig) -> None:
         }
         if isinstance(value, Mapping):
             _check_named_controls(setting, value, controls, rejecting_kinds)
-        elif rejecting_kinds:
-            # A curve of epsilons needs all controls, a single value any of them.
-            is_curve = isinstance(value, tuple)
-            if is_curve or len(rejecting_kinds) == len(controls):
-                name, kind = next(iter(rejecting_kinds.items()))
-                raise _make_unsupported_error(setting, name, kind)
+            continue
+        # A curve, which has several values, needs all controls; a single value any.
+        is_curve = isinstance(value, tuple)
+        is_rejected_by_all = len(rejecting_kinds) == len(controls)
+        if rejecting_kinds and (is_curve or is_rejected_by_all):
+            name, kind = next(iter(rejecting_kinds.items()))
+            raise _make_unsupported_error(setting, name, kind)
 
 
 def _check_named_controls(
@@ -467,9 +475,18 @@ def _check_named_controls(
 ) -> None:
     """Check that the controls which a setting names exist, and take it.
 
-    `rejecting_kinds` has the kinds of the controls that do not take the setting. Raises
-    UnknownNameError or InputError.
+    Args:
+        setting: name of the setting.
+        names: names of controls, as the setting has them.
+        controls: settings of all controls by qualified name, such as "light:key".
+        rejecting_kinds: kinds of the controls that do not take the setting, by
+            qualified name.
+
+    Raises:
+        UnknownNameError: there is no such control.
+        InputError: a control does not take the setting.
     """
+    # the setting has only the name: "key"
     qualified_names = {
         parse_control_name(qualified_name, control_settings)[1]: qualified_name
         for qualified_name, control_settings in controls.items()
@@ -515,11 +532,12 @@ def _list_active_choices(
     searched: it is set to a number, another choice fixes it, or it has no default range
     and none is set.
     """
-    # parameters by name
+    # names of parameters: by a choice, or by a number
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
+    # those with a default range, and those with a range of their own
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
@@ -544,8 +562,7 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
         instead = f", or search {bounded[0]} with it" if bounded else ""
         return InputError(
             f"`epsilon` {name}: the control has ranges and no epsilon; give its "
-            "ranges, as in "
-            f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{instead}"
+            f"ranges, as in `controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{instead}"
         )
     if setting in ("path", "shutter", "rolling"):
         return InputError(

@@ -159,8 +159,9 @@ class Problem:
     def plan(self, plan: GradientPlan) -> None:
         """Set the plan of the gradient.
 
-        Conditions are not differentiated. `domain` and `conditions` are made anew,
-        since the cost of a gradient depends on the plan.
+        Groups of conditions are forced to the estimator "none", as nothing asks for
+        their derivatives. `domain` and `conditions` are made anew, since the cost of a
+        gradient depends on the plan.
         """
         controls = self.space.controls
         n_searched = len(controls) if self.n_searched is None else self.n_searched
@@ -200,10 +201,8 @@ class Problem:
     def is_linear(self) -> bool:
         """Whether matrices of light transport predict the images of this problem."""
         conditions = self.space.controls[self.n_searched :]
-        return (
-            find_refusal(self.renderer, [control.name for control in conditions])
-            is None
-        )
+        condition_names = [control.name for control in conditions]
+        return find_refusal(self.renderer, condition_names) is None
 
     @property
     def rule(self) -> Rule:
@@ -247,8 +246,12 @@ class Problem:
             return round_to_8_bit(self.renderer(full_u, seed=seed, spp=spp))
 
     def judge(self, image: Tensor, full_u: Tensor) -> Judgement:
-        """Judge an image (H, W, 3) of a full configuration, with its objective."""
+        """Judge an image (H, W, 3) of a full configuration.
+
+        The judgement has the value of the objective, if there is one.
+        """
         if self.objective is None:
+            # `{}`: no stated values in place of the configuration's
             return self.judge_images(image[None], [full_u], [{}])[0]
         with torch.no_grad():
             output = self.model(image)
@@ -289,7 +292,7 @@ class Problem:
             judged = self._judge_outputs(output, images, truths, full_configurations)
         judgements_without_objective = []
         for judgement in judged:
-            # `of` makes a margin NaN that is not finite
+            # `of` makes a margin NaN that is not finite, and leaves the metrics out
             without_objective = Judgement.of(
                 judgement.score,
                 judgement.margin,
@@ -310,12 +313,13 @@ class Problem:
     ) -> list[Judgement]:
         """Judge a model's output for images (N, H, W, 3) by task and metrics.
 
-        If other things stand beside the object, payloads get what is visible of each.
-        That is rendered once for all configurations that differ in colors alone, and
-        cached.
+        If other things stand beside the object, the payload of each judgement gets what
+        is visible of each. That is rendered once for all configurations that differ in
+        colors alone, and cached.
         """
         judged = list(judge_images(self.task, output, pictures, truths, self.metrics))
-        if self.space.scene is None or not self.space.scene.things:
+        has_other_things = self.space.scene is not None and self.space.scene.things
+        if not has_other_things:
             return judged
         for index, full_u in enumerate(full_configurations):
             key = full_u.detach()[self._is_geometric].numpy().tobytes()
@@ -342,8 +346,8 @@ class Problem:
             full_u: the full configuration.
             seed: seed of the noise of the traced images.
             spp: samples per pixel of a rendered image.
-            is_random: (d,) bool, the searched coordinates that are random here: the
-                search has not moved them.
+            is_random: (d,) bool, the searched coordinates that are random here, and not
+                where the search has moved them.
             renderer: traces the images; None for that of the problem.
         """
         dim = self.domain.dim
@@ -408,18 +412,21 @@ class Problem:
         def describe() -> dict[str, Value]:
             """Describe the configuration, by stated values where there are any."""
             values = self.space.describe(full_u)
-            return {
-                name: (stated_values or {}).get(name, values[name]) for name in values
-            }
+            stated = stated_values or {}
+            return {name: stated.get(name, value) for name, value in values.items()}
 
         n_rig_cameras = 0 if self.space.scene is None else len(self.space.scene.rig)
-        looks = list_camera_renders(self.renderer, full_u, n_rig_cameras)
-        facts, *camera_facts = [self.make_facts(describe, look) for look in looks]
+        # of the main camera, then of each camera of a rig
+        renders = list_camera_renders(self.renderer, full_u, n_rig_cameras)
+        facts, *camera_facts = [
+            self.make_facts(describe, render_surfaces) for render_surfaces in renders
+        ]
         facts = replace(facts, views=tuple(camera_facts))
         truth = self.task.truth(facts)
         is_cacheable = not stated_values and len(geometric_u) <= MAX_CACHED_COORDINATES
-        # `numbers` is a cached property: it is there if the task has read it
-        if is_cacheable and "numbers" not in vars(facts):
+        # a cached property is among the attributes once it was read
+        has_read_numbers = "numbers" in vars(facts)
+        if is_cacheable and not has_read_numbers:
             _add_to_cache(self._truths, key, truth)
         return truth
 
@@ -511,12 +518,13 @@ class Problem:
     ) -> Iterator[Evaluation]:
         """Evaluate queries lazily, in their order.
 
-        `preparation` has the plan, sample count and depth that another process has
-        found for the same problem; they are set first.
+        `preparation` has the plan, sample count and depth of light paths that another
+        process has found for the same problem; they are set first.
         """
         if preparation is not None:
             self.spp = preparation.spp
             self.search_depth = preparation.search_depth
+            # setting an equal plan would only cost time
             if self.plan != preparation.plan:
                 self.plan = preparation.plan
         return map(self.evaluate, queries)
@@ -565,8 +573,8 @@ class Problem:
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
         """Evaluate a query of a search by its mean over sampled conditions.
 
-        Each condition has its own image. The image of the evaluation, if one is wanted,
-        is that without conditions.
+        Each condition has an image, whose noise has the same seed as the condition. The
+        image of the evaluation, if it is requested, is one without conditions.
         """
         condition_seeds = [
             seeds.stream(query.seed, "draw", index) for index in range(self.n_draws)
@@ -620,6 +628,7 @@ class Problem:
             self.renderer.routes.get(name, frozenset()) for name in searched_groups
         ]
         input_names = frozenset().union(*routes) & find_linear_inputs(self.renderer)
+        # light paths may be shorter than those of a search, and are never longer
         depth = min(LIGHT_DEPTH, self.search_depth or LIGHT_DEPTH)
         with self.renderer.scene.limit_depth(depth):
             return LinearRenderer(
@@ -627,7 +636,7 @@ class Problem:
                 full_u,
                 seed,
                 spp=spp,
-                quick=True,
+                quick=True,  # there will be many of them
                 names=input_names,
                 collected=collected_light,
             )
@@ -655,7 +664,7 @@ class Problem:
         # image and output of each call of the loss; the first is that of u itself, any
         # others are of finite differences
         calls: list[tuple[Tensor, Output]] = []
-        # of the objective by u, past the image; zero where it reads the image only
+        # derivative of the objective by u that does not go through the image
         input_gradient = torch.zeros(())
 
         def loss(image: Tensor) -> Tensor:
@@ -665,14 +674,9 @@ class Problem:
             calls.append((image.detach(), output))
             values = self._compute_objective(output, image[None], truth, inputs)
             objective = values[0]
-            # The derivative by inputs is exact, whatever the plan does with the image.
             is_at_u = len(calls) == 1
-            if inputs.used and is_at_u and objective.requires_grad:
-                (gradient_or_none,) = torch.autograd.grad(
-                    objective, variable_u, retain_graph=True, allow_unused=True
-                )
-                if gradient_or_none is not None:
-                    input_gradient = gradient_or_none
+            if inputs.used and is_at_u:
+                input_gradient = _differentiate_by_inputs(objective, variable_u)
             return objective
 
         spp = self.spp * query.samples
@@ -737,20 +741,19 @@ class Problem:
                 torch.cat([variable_u, full_u[len(variable_u) :]])
                 for full_u in full_configurations
             ]
-            # else one truth holds for all images
             if self.task.varies:
                 values = self._compute_objective_of_each(
                     outputs_of_images, images, truths, variable_configurations
                 )
-            else:
+            else:  # one truth holds for all images
                 values = self._compute_objective(
                     outputs,
                     images,
                     truths[0],
                     self.make_objective_inputs(*variable_configurations),
                 )
-            # zero where the objective depends on nothing that is searched
             derivative = torch.zeros_like(u) if gradient else None
+            # without a graph the objective depends on nothing that is searched
             if values.requires_grad:
                 weighted_sum = (values * compute_condition_weights(values)).sum()
                 (derivative,) = torch.autograd.grad(weighted_sum, variable_u)
@@ -785,7 +788,7 @@ class Problem:
         gradient: WhichGradient,
         batch_size: int,
     ) -> Evaluation:
-        """Evaluate the mean over conditions whose images are predicted.
+        """Evaluate the mean over conditions whose images are predicted, in batches.
 
         Args:
             render: render from a slice of the conditions and u to images (N, H, W, 3),
@@ -796,6 +799,7 @@ class Problem:
             batch_size: images in a batch of the model.
         """
         evaluated = []
+        # sum over the conditions; None without a gradient
         total_derivative = None
         for begin in range(0, len(full_configurations), batch_size):
             batch = slice(begin, begin + batch_size)
@@ -883,6 +887,21 @@ class Problem:
         output = self.model(image)
         values = self._compute_objective(output, image[None], self.find_truth(), inputs)
         return values[0]
+
+
+def _differentiate_by_inputs(objective: Tensor, variable_u: Tensor) -> Tensor:
+    """Return the derivative (d,) of an objective by u past the image, through what it
+    reads of the configuration; a zero if there is none.
+
+    It is exact, whatever the plan does with the image.
+    """
+    if objective.requires_grad:
+        (gradient,) = torch.autograd.grad(
+            objective, variable_u, retain_graph=True, allow_unused=True
+        )
+        if gradient is not None:
+            return gradient
+    return torch.zeros(())
 
 
 def compute_condition_weights(values: Tensor) -> Tensor:

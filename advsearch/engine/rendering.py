@@ -136,7 +136,8 @@ class Rendering:
         returned. `aovs` are names of `advsearch.scene.formation.AOVS`.
 
         Raises:
-            InputError: `render` was called without `aov`, or there are several views.
+            InputError: `render` was called without `aov`, or with several views
+                (`around`).
             StorageError: it could not be written.
         """
         surfaces = self.views[0].surfaces
@@ -362,39 +363,50 @@ def render(
     )
     progress = as_progress(progress)
     progress.stage("rendering", around or 1)
-    views = list[View]()
-    truth_warnings = list[str]()
-    remarks = tuple[str, ...]()
+    rendered_views = list[_RenderedView]()
     for view_description in _orbit_scene(description, around):
-        rendered = _render_view(view_description, model, model_task, settings)
-        views.append(rendered.view)
+        rendered_views.append(
+            _render_view(view_description, model, model_task, settings)
+        )
         # what the task has learned of the model's predictions holds for the next view
-        model_task = rendered.task
-        remarks = remarks or model_task.remarks
-        if rendered.truth_error:
-            truth_warnings = [
-                f"Nothing is drawn into the picture: {rendered.truth_error}"
-            ]
+        model_task = rendered_views[-1].task
         progress.advance(1)
-    # Formation and space are the same for all views, exposure included.
-    space = rendered.space
+    # formation and space are the same for all views, exposure included
+    formation = rendered_views[-1].formation
+    space = rendered_views[-1].space
     return Rendering(
-        replace(
+        scene=replace(
             description,
             environment_spec=space.environment or description.environment_spec,
         ),
-        model.name,
-        unbound_task.name,
-        rendered.formation,
-        spp,
-        tuple(views),
-        (
+        model=model.name,
+        task=unbound_task.name,
+        formation=formation,
+        spp=spp,
+        views=tuple(rendered.view for rendered in rendered_views),
+        warnings=(
             *space.list_notes(description),
             *describe_adjusted_defaults(space.adjusted_defaults),
-            *truth_warnings,
-            *remarks,
+            *_list_view_warnings(rendered_views),
         ),
     )
+
+
+def _list_view_warnings(rendered_views: Sequence[_RenderedView]) -> list[str]:
+    """Return a sentence if no truth could be drawn into a view, and the first remarks
+    of the task.
+    """
+    sentences = list[str]()
+    truth_errors = [
+        rendered.truth_error for rendered in rendered_views if rendered.truth_error
+    ]
+    if truth_errors:
+        sentences.append(f"Nothing is drawn into the picture: {truth_errors[-1]}")
+    for rendered in rendered_views:
+        if rendered.task.remarks:
+            sentences += rendered.task.remarks
+            break
+    return sentences
 
 
 def _check_azimuth_is_free(controls: Sequence[Control]) -> None:
@@ -549,8 +561,8 @@ def make_facts(
     Args:
         description: the scene.
         name: name of its object.
-        label: what is right, of the thing that is judged, or of the object where all
-            are.
+        label: right label of the thing that is judged; where all are, of the object.
+            All others have the labels of their own.
         describe: describes the configuration; other parameters have the values of the
             scene.
         render_surfaces: renders what the camera sees; it is called once at most.
@@ -562,59 +574,71 @@ def make_facts(
     """
     check_judged_thing(description, judge)
     # rendered once, however many things ask for it
-    cached_look = None if render_surfaces is None else cache(render_surfaces)
+    cached_render = None if render_surfaces is None else cache(render_surfaces)
+    collect_numbers = partial(_collect_numbers, description, describe)
 
-    def collect_numbers() -> dict[str, float]:
-        configuration = {key: value["value"] for key, value in describe().items()}
-        all_values = {**description.values, **configuration}
-        return {
-            key: float(value)
-            for key, value in all_values.items()
-            if isinstance(value, (int, float))
-        }
-
-    def make_thing_facts(mesh: str, thing_label: str | None) -> Facts:
+    def make_thing_facts(mesh: str) -> Facts:
+        """Return the facts of a single thing, the object or another one."""
+        labelled_mesh = OBJECT if judge == ALL_THINGS else judge
+        right_label = label if mesh == labelled_mesh else None
         sight = None
-        if cached_look is not None:
-            sight = partial(
-                _look_at, cached_look, mesh, metres=description.object.size_in_metres
-            )
+        if cached_render is not None:
+            metres = description.object.size_in_metres
+            sight = partial(_look_at, cached_render, mesh, metres=metres)
         # the object has the name that the caller states, any other thing its mesh's
         if mesh == OBJECT:
             own_label = description.object.label
-            return Facts(name, thing_label, own_label, collect_numbers, sight)
+            return Facts(name, right_label, own_label, collect_numbers, sight)
         own_label = description.things[mesh].label
-        return Facts(mesh, thing_label, own_label, collect_numbers, sight)
+        return Facts(mesh, right_label, own_label, collect_numbers, sight)
 
-    # `label` is that of the judged thing alone; all others have labels of their own
-    labelled_mesh = OBJECT if judge == ALL_THINGS else judge
-    single_facts = {
-        mesh: make_thing_facts(mesh, label if mesh == labelled_mesh else None)
-        for mesh in (OBJECT, *description.things)
-    }
-    facts_by_mesh = {}
-    for mesh, facts in single_facts.items():
-        # of each thing, the facts of all others
-        others = tuple(
-            other for other_mesh, other in single_facts.items() if other_mesh != mesh
-        )
-        facts_by_mesh[mesh] = replace(facts, others=others)
+    facts_by_mesh = _add_others(
+        {mesh: make_thing_facts(mesh) for mesh in (OBJECT, *description.things)}
+    )
     if judge == ALL_THINGS:
         return replace(facts_by_mesh[OBJECT], each=facts_by_mesh)
     return facts_by_mesh[judge]
 
 
-def _look_at(look: Callable[[], Surfaces], mesh: str, *, metres: float | None) -> Sight:
-    """Return what a task may know of one mesh, rendered when it is called."""
-    return make_sight(look(), mesh, metres)
+def _collect_numbers(
+    description: SceneDescription, describe: Callable[[], Mapping[str, Value]]
+) -> dict[str, float]:
+    """Return all parameters of a scene that are numbers, by name, with the values of
+    the configuration that `describe` describes.
+    """
+    configuration = {key: value["value"] for key, value in describe().items()}
+    all_values = {**description.values, **configuration}
+    return {
+        key: float(value)
+        for key, value in all_values.items()
+        if isinstance(value, (int, float))
+    }
+
+
+def _add_others(facts_by_mesh: Mapping[str, Facts]) -> dict[str, Facts]:
+    """Return the facts of each thing with those of all others."""
+    complete_facts = {}
+    for mesh, facts in facts_by_mesh.items():
+        others = tuple(
+            other for other_mesh, other in facts_by_mesh.items() if other_mesh != mesh
+        )
+        complete_facts[mesh] = replace(facts, others=others)
+    return complete_facts
+
+
+def _look_at(
+    render_surfaces: Callable[[], Surfaces], mesh: str, *, metres: float | None
+) -> Sight:
+    """Render what the camera sees, and return what a task may know of one mesh."""
+    return make_sight(render_surfaces(), mesh, metres)
 
 
 def make_sight(
     surfaces: Surfaces, mesh: str = OBJECT, metres: float | None = None
 ) -> Sight:
-    """Return what a task may know of what the camera sees: of one mesh, in metres.
+    """Return what a task may know of how the camera sees one mesh: its mask and depths.
 
-    `metres` is the size of the object, where it is known.
+    `metres` is the size of the object in metres, if it is known.
     """
     return Sight(surfaces.visible_mask(mesh), surfaces.depth, surfaces.z_depth, metres)
 
@@ -687,8 +711,7 @@ def _orbit_scene(
     if description.camera != ORBIT_CAMERA:
         raise InputError(
             "around: turns the camera that circles the object, and `camera` "
-            f"{description.camera} is fixed; leave one "
-            "of the two out"
+            f"{description.camera} is fixed; leave one of the two out"
         )
     first_azimuth = description.get_number("camera.azimuth")
     for index in range(around):

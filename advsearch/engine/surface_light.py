@@ -67,7 +67,8 @@ def find_surface_light_refusal(
         problem: problem of the search.
         steps: evaluations of the search.
         policy: policy by which it searches.
-        specialise: whether anything may be left out or predicted at all.
+        specialise: whether the search may leave out or predict anything at all (the
+            setting of this name).
     """
     if not specialise:
         return Refusal("nothing is left out")
@@ -78,7 +79,8 @@ def find_surface_light_refusal(
     moves_camera = bool(changed_inputs & CAMERA_INPUTS)
     if not moves_camera:
         return NO_CAMERA
-    if steps * problem.n_draws < MIN_IMAGES:
+    n_images = steps * problem.n_draws
+    if n_images < MIN_IMAGES:
         return Refusal(
             f"light on surfaces pays from {MIN_IMAGES} pictures on",
             RefusalCause.TOO_FEW_STEPS,
@@ -86,7 +88,8 @@ def find_surface_light_refusal(
     if policy.takes_differences(problem.domain, steps):
         return Refusal(f"{policy.name} takes derivatives that need rendered pictures")
     for group in problem.plan.groups:
-        # a prediction has derivatives of its own: no estimator that a user chose
+        # a prediction has derivatives of its own, and not by an estimator that the user
+        # has forced
         needs_estimator = group.estimator not in ("none", "image")
         if group.is_forced and needs_estimator:
             return Refusal(f"the estimator of {group.name} is forced")
@@ -117,7 +120,9 @@ class SurfaceLight(PredictedSearch):
     _n_lights: int = 0
     _next_comparison: int = 0
     # what cameras see, by index of the conditions and begin of the batch
-    _looks: dict[tuple[int, int], list[LitCameraView]] = field(default_factory=dict)
+    _stored_views: dict[tuple[int, int], list[LitCameraView]] = field(
+        default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         """Find which coordinates move cameras, change environments and color surfaces.
@@ -135,15 +140,14 @@ class SurfaceLight(PredictedSearch):
             )
             for control in space.controls
         }
-        self._moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})[
-            :n_searched
-        ]
+        # the searched coordinates come first, those of the conditions after them
+        is_moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})
+        self._moving = is_moving[:n_searched]
         if self.moving_coordinates is not None:
             self._moving = torch.zeros(n_searched, dtype=torch.bool).index_fill_(
                 0, self.moving_coordinates, True
             )
         self._has_moving = bool(self._moving.any())
-        # the searched coordinates come first, those of the conditions after them
         is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
         self._searches_colors = bool(is_coloring.any())
         self.draws_conditions = problem.conditions is not None and self._searches_colors
@@ -151,6 +155,7 @@ class SurfaceLight(PredictedSearch):
         # else, the inputs of the conditions are enough.
         self._input_space = space
         if not self._has_moving:
+            # (without `n_searched` there are no conditions: then all controls count)
             conditions = space.controls[problem.n_searched or 0 :]
             self._input_space = replace(space, controls=conditions)
         self._needs_new_light = self._find_light_conditions()[n_searched:]
@@ -234,6 +239,7 @@ class SurfaceLight(PredictedSearch):
         problem = self.problem
         u = problem.domain.start if self.light_u is None else self.light_u
         with self.count_time(), torch.no_grad():
+            # without a seed, with conditions that leave the scene unchanged
             full_u = problem.add_conditions(u)
             self._renderer = SurfaceRenderer(
                 problem.renderer, full_u, seeds.stream(problem.seed, "surface light")
@@ -251,9 +257,9 @@ class SurfaceLight(PredictedSearch):
                 inputs = self._compute_inputs(torch.cat([u, condition]))
                 self._renderer.get_light(inputs)  # computes it, and stores it
                 tick(N_LIGHTS // len(self._bank_conditions))
-            self._n_lights = (
-                len(self._renderer.stored_lights) + self._renderer.n_dropped
-            )
+            # lights that did not fit into memory were dropped
+            n_stored = len(self._renderer.stored_lights)
+            self._n_lights = n_stored + self._renderer.n_dropped
         self._compare(u, index=0)
 
     @property
@@ -273,15 +279,14 @@ class SurfaceLight(PredictedSearch):
         Images are predicted in batches if neither conditions nor colors vary: then they
         do not depend on the evaluations before.
         """
-        # images of queries that were predicted in one batch, by position
+        # images of the queries of the latest batch, by position
         predicted_images: dict[int, Tensor] = {}
+        can_batch = self.problem.conditions is None and not self._searches_colors
         for position, query in enumerate(queries):
             self.replay(query)
             if self._must_trace(query):
                 yield from trace(queries[position:])
                 return
-            can_batch = self.problem.conditions is None and not self._searches_colors
-            # the last batch is used up
             if can_batch and position not in predicted_images:
                 batch = queries[position : position + self.renderer.batch_size]
                 images = self.renderer.predict_images([batched.u for batched in batch])
@@ -304,13 +309,16 @@ class SurfaceLight(PredictedSearch):
         return self._evaluate_over_conditions(query)
 
     def _evaluate_trial(self, query: Query, image: Tensor | None) -> Evaluation:
-        """Evaluate a trial: judge the predicted image as a file would hold it."""
+        """Evaluate a trial: judge the predicted image as a file would hold it.
+
+        `image` is that image; None to predict it here.
+        """
         full_u = self.problem.add_conditions(query.u)
         with torch.no_grad():
             rounded = round_to_8_bit(self.renderer(full_u) if image is None else image)
         return Evaluation.from_judgement(
             self.problem.judge(rounded, full_u),
-            cost=0,
+            cost=0,  # nothing is rendered
             predicted=RAYS_PER_PIXEL,
             picture=rounded if query.with_image else None,
         )
@@ -333,14 +341,16 @@ class SurfaceLight(PredictedSearch):
         predicted.
         """
         problem = self.problem
-        # a random search uses few sets of conditions in turn, for which what cameras
-        # see is stored
+        # A random search ("baseline") uses few sets of conditions in turn, for which
+        # what cameras see is stored.
         reuses_conditions = (
             query.kind == "baseline"
             and problem.conditions is not None
             and not self._has_moving
         )
-        index = query.index % N_CONDITION_SETS if reuses_conditions else query.index
+        index = query.index
+        if reuses_conditions:
+            index = query.index % N_CONDITION_SETS
         conditions = self._choose_conditions(query.kind, index, problem.n_draws)
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
@@ -390,8 +400,9 @@ class SurfaceLight(PredictedSearch):
         computed, which are the last coordinates: the base color is then missing.
         """
         with torch.no_grad():
-            n_coordinates = len(self._input_space.start)
-            inputs = self._input_space.inputs(full_u[len(full_u) - n_coordinates :])
+            # all coordinates, or those of the conditions, which are the last
+            first = len(full_u) - len(self._input_space.start)
+            inputs = self._input_space.inputs(full_u[first:])
             return self.problem.renderer.scene.assembly(inputs)
 
     def _predict_images(
@@ -400,8 +411,8 @@ class SurfaceLight(PredictedSearch):
         u: Tensor,
         key: tuple[int, int] | None = None,
     ) -> Tensor:
-        """Return predicted images (n, H, W, 3) of u (d,) under conditions, with a
-        graph.
+        """Return predicted images (n, H, W, 3) of full configurations, with a graph
+        from their searched coordinates u (d,).
 
         What cameras see is stored under `key`, if there is one, for later calls.
         """
@@ -410,15 +421,15 @@ class SurfaceLight(PredictedSearch):
             torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations
         ]
         inputs = [self._compute_inputs(full_u) for full_u in full_configurations]
-        looks: Iterable[LitCameraView]
+        views: Iterable[LitCameraView]
         if key is None:
-            looks = self.renderer.trace_views(inputs)
+            views = self.renderer.trace_views(inputs)
         else:
-            if key not in self._looks:
-                self._looks[key] = list(self.renderer.trace_views(inputs))
-            looks = self._looks[key]
+            if key not in self._stored_views:
+                self._stored_views[key] = list(self.renderer.trace_views(inputs))
+            views = self._stored_views[key]
         return self.renderer.compose_images(
-            looks, inputs, color, variable_configurations
+            views, inputs, color, variable_configurations
         )
 
     def replay(self, query: Query) -> None:
@@ -463,6 +474,7 @@ class SurfaceLight(PredictedSearch):
         with self.count_time():
             generator = torch.Generator().manual_seed(seed)
             samples = problem.domain.sample(generator, N_VIEWS)  # (N_VIEWS, d)
+            # of each view: random where something moves, else as searched
             configurations = torch.where(self._moving, samples, u)
             configurations[0] = u
             conditions = self._choose_conditions(kind, index, N_VIEWS)

@@ -62,8 +62,7 @@ ADVICE = {
     RefusalCause.HAZE: "leave the haze out",
     RefusalCause.NOISE: "`denoise=oidn` takes the noise out",
     RefusalCause.TOO_LARGE: "take a lower `resolution` or texture resolution, or set "
-    "ADVSEARCH_LIMITS=2 where memory "
-    "allows it",
+    "ADVSEARCH_LIMITS=2 where memory allows it",
 }
 """What a user can do where rendering costs much, by the cause of a refusal."""
 
@@ -75,8 +74,10 @@ def find_matrix_refusal(
 
     Args:
         problem: problem of the search.
-        steps: its evaluations; None for any number.
-        specialise: the setting of this name.
+        steps: evaluations of the search; None if any number of them may follow, so that
+            a predictor pays in any case.
+        specialise: whether the search may leave out or predict anything at all (the
+            setting of this name).
     """
     if not specialise:
         return Refusal("nothing is left out")
@@ -94,7 +95,7 @@ def find_matrix_refusal(
     refusal = find_refusal(problem.renderer, condition_names)
     if refusal is not None or problem.conditions is not None or steps is None:
         return refusal
-    # one image for each light is rendered before the first prediction
+    # before the first prediction an image is rendered for each light
     min_steps = MIN_STEPS_PER_LIGHT * count_lights(problem.renderer)
     if steps < min_steps:
         return Refusal(
@@ -272,7 +273,7 @@ class PredictedSearch(ABC):
     def summarize(self) -> LinearTransport:
         """Return what a result stores of the predictor."""
         entries, n_bytes = self.measure_size()
-        error = None
+        error = None  # of the latest comparison
         if self.deviations:
             error = PredictionError.of(self.deviations[-1])
         return LinearTransport(
@@ -406,19 +407,7 @@ class Transport(PredictedSearch):
         # a baseline draws configurations by chance: there is nothing to keep up with
         if not is_due or not kind.startswith("search"):
             return predictor
-        seed = seeds.stream(self.problem.seed, "transport check", number)
-        renderer = self.problem.renderer
-        if self.window is not None:
-            renderer = renderer.copy_with(crop=predictor.path_renderer.crop)
-        deviation = self.compare(
-            lambda view: self.problem.compare_view(
-                predictor,
-                query.u,
-                seeds.stream(seed, "view", view),
-                self.problem.spp,
-                renderer=renderer,
-            )
-        )
+        deviation = self._compare_predictor(predictor, query)
         has_same_surroundings, current = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
@@ -434,12 +423,33 @@ class Transport(PredictedSearch):
         self.n_renewals = (self.n_renewals or 0) + 1
         return self._current[kind]
 
+    def _compare_predictor(self, predictor: Predictor, query: Query) -> Deviation:
+        """Compare a predictor with traced images of a query's configuration, in the
+        window if there is one.
+        """
+        seed = seeds.stream(self.problem.seed, "transport check", query.index)
+        renderer = self.problem.renderer
+        if self.window is not None:
+            renderer = renderer.copy_with(crop=predictor.path_renderer.crop)
+        return self.compare(
+            lambda view: self.problem.compare_view(
+                predictor,
+                query.u,
+                seeds.stream(seed, "view", view),
+                self.problem.spp,
+                renderer=renderer,
+            )
+        )
+
     def _compare_surroundings(
         self, kind: str, u: Tensor
     ) -> tuple[bool, FullImage | None]:
-        """Return whether what is outside of the window is still the same at u (d,).
+        """Compare what is outside of the window at u (d,) with what a kind of search
+        has there.
 
-        The second value is the image there; None if images are traced in full.
+        Returns:
+            Whether both are the same, up to what is allowed; and the full image at u.
+            True and None without a window, when nothing is outside.
         """
         if self.window is None:
             return True, None

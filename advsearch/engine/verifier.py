@@ -128,7 +128,7 @@ class Verifier:
         evaluate = None
         if predictor is not None:
             evaluate = partial(predictor.evaluate_all, trace=self.journal.evaluator)
-        if not self.has_success:
+        if not self.has_success:  # no prediction is sought, so that none is a success
             queries = [replace(query, has_success=False) for query in queries]
         evaluations = self.journal.evaluate_all(queries, evaluate)
         for query, evaluation in zip(queries, evaluations, strict=True):
@@ -158,13 +158,13 @@ class Verifier:
             search_samples: samples that the searches took, which bound those of this
                 choice where conditions vary.
         """
-        varies = self.problem.conditions is not None
+        has_conditions = self.problem.conditions is not None
         # sample counts to choose from, ascending; a single one is no choice
         ladder = self.ladder
         has_choice = len(ladder) > 1
         n_trials = self.looks[0]
-        # `max_samples` are those of every trial at every sample count, for the progress
-        if varies:
+        # for the progress: samples of every render at every sample count
+        if has_conditions:
             choose: Callable[..., SampleCount] = choose_rate_spp
             if has_choice:
                 ladder = self._condition_ladder(len(candidates), search_samples)
@@ -175,8 +175,7 @@ class Verifier:
         if len(ladder) > 1:
             hint = (
                 "more and more samples a pixel until noise no longer moves the result "
-                "(counted in samples a pixel); "
-                "`verify_spp=NUMBER` leaves it out"
+                "(counted in samples a pixel); `verify_spp=NUMBER` leaves it out"
             )
             title = "finding how many samples the check needs"
             self.stages.begin(
@@ -189,7 +188,7 @@ class Verifier:
                 f"sample count {name}",
                 u,
                 n_images=MAX_STORED_IMAGES,
-                draws_conditions=varies,
+                draws_conditions=has_conditions,
             )
             for name, u in candidates.items()
         }
@@ -209,12 +208,12 @@ class Verifier:
         return limit_ladder(OVER_LADDER, n_trials, searched)
 
     def try_clean(self) -> None:
-        """Run the trials of the control group, if they are missing at this sample
-        count.
+        """Run the trials of the clean configuration, the control group, if they are
+        missing at this sample count.
 
-        They are of the clean configuration, and have the seeds of every other group. If
-        the start looked wrong, they are run before the search, at a sample count of
-        their own, and once more after it.
+        They have the same seeds as those of the adversarial configuration. If the model
+        seemed to be wrong about the start, they are run before the search, at a sample
+        count of their own, and once more after it.
         """
         if self.has_clean_trials:
             return
@@ -226,7 +225,7 @@ class Verifier:
             self.problem.domain.start,
             spp=self._clean_spp,
             seed=self.problem.seed,
-            trials=self.looks[0],
+            trials=self.looks[0],  # more follow if the first look does not decide
             kind=self._clean_kind,
             n_images=MAX_STORED_IMAGES,
         )
@@ -246,13 +245,15 @@ class Verifier:
     ) -> Verification:
         """Verify the configuration that a search found against the control group.
 
-        The control group, the clean arm, is the scene without the change that was
-        found. If it has too few trials it gets more, which later calls use as well.
+        The control group is the scene without the change that was found, in trials of
+        the same seeds. If it has too few trials it gets more, which later calls use as
+        well.
 
         Args:
             kind: kind of the rows.
             result: result of the search.
-            curtailed: whether only the verdict matters, and not the rate.
+            curtailed: whether trials end as soon as the verdict stands: only this
+                matters, and not the rate.
             with_new_trials: whether both groups get new trials, numbered after all
                 others.
         """
@@ -441,6 +442,8 @@ class Retrials:
         self._progress = progress
         self._n_trials = trials
         self._seed = seed
+        # The others are copies of the first journal, with the same rows and notes,
+        # which are read from the store only once.
         first_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
         self._journals = {
             condition.name: replace(

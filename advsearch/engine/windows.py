@@ -93,18 +93,18 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         return refusal
     domain = problem.domain
     resolution = problem.renderer.formation.resolution
-    largest_area = MAX_AREA * resolution[0] * resolution[1]
+    max_area = MAX_AREA * resolution[0] * resolution[1]
     box = _find_box(problem)
     if box is None:
         return Refusal("nothing of what is searched is in the picture")
-    if box.grow(MARGINS[0], resolution).area > largest_area:
+    if box.grow(MARGINS[0], resolution).area > max_area:
         return Refusal("what is searched fills much of the picture")
     lower = domain.project(torch.zeros_like(domain.start))
     upper = domain.project(torch.ones_like(domain.start))
     start, *extremes = [render_full(problem, u) for u in (domain.start, lower, upper)]
-    for margin in MARGINS:
+    for margin in MARGINS:  # at least the first fits, as was checked
         window = box.grow(margin, resolution)
-        if window.area > largest_area:
+        if window.area > max_area:
             break
         deviation = measure_outside(problem, window, start, extremes)
         if deviation.is_accepted:
@@ -113,9 +113,9 @@ def find_window(problem: Problem) -> Windowing | Refusal:
 
 
 def find_crop_refusal(problem: Problem) -> Refusal | None:
-    """Return why a search renders whole images; None if a crop may be enough.
+    """Return why a search renders full images; None if a crop may be enough.
 
-    What it misses outside is measured only then.
+    Whether the search changes anything outside of the crop is measured later.
     """
     renderer = problem.renderer
     if renderer.composition_reason:
@@ -142,17 +142,17 @@ def _find_searched_refusal(problem: Problem) -> Refusal | None:
     it is.
     """
     light_inputs = find_light_inputs(problem.renderer)
-    names = _find_searched_inputs(problem)
-    if not names:
+    input_names = _find_searched_inputs(problem)  # such as "mug.bsdf.reflectance"
+    if not input_names:
         return Refusal("nothing that is searched needs a render")
-    shapes = problem.renderer.surfaces(problem.renderer.start).names
-    for name in sorted(names):
+    mesh_names = problem.renderer.surfaces(problem.renderer.start).names
+    for name in sorted(input_names):
         part = name.partition(".")[0]
         if name in light_inputs:
             return Refusal(f"{part} is light, which shows everywhere")
         if name.endswith(MOVING_SUFFIXES):
             return Refusal(f"{part} moves")
-        if part not in shapes:
+        if part not in mesh_names:
             return Refusal(f"{part} shows in more than a part of the picture")
     return None
 
@@ -173,9 +173,9 @@ def _find_box(problem: Problem) -> Window | None:
 
 
 def render_full(problem: Problem, u: Tensor) -> FullImage:
-    """Render the whole image of u (d,) that is compared with others.
+    """Render the full image of u (d,) that is compared with others.
 
-    It has the same noise for each u.
+    It is traced twice with independent noise (`halves`), which is the same for each u.
     """
     with torch.no_grad(), problem.renderer.scene.limit_depth(problem.search_depth):
         halves, radiance = problem.renderer.trace_halves(
@@ -224,13 +224,17 @@ def measure_outside(
 def _measure_square(
     problem: Problem, window: Window, before: FullImage, after: FullImage
 ) -> float:
-    """Return the mean squared difference outside of a window, in squared levels.
+    """Return the mean squared difference of two images outside of a window, in squared
+    levels of 255.
 
-    Images of one seed have nearly the same noise. The product of the differences of two
-    seeds is the square without what noise is left.
+    Each image has two halves, by two seeds. Images of one seed have nearly the same
+    noise. The product of the differences of two seeds is the square without what noise
+    is left.
     """
     outside = window.is_outside(problem.renderer.formation.resolution).float()
+    # levels of the displayed image for a difference of radiance
     slope = _compute_slope(problem, before)
+    # of both halves
     sums = [
         _sum_squares(255.0 * slope * (new - old)[..., :3] * outside[..., None])
         for old, new in zip(before.halves, after.halves, strict=True)
@@ -284,9 +288,9 @@ def _compute_margin(problem: Problem, radiance: Tensor, u: Tensor) -> float:
 def _describe(deviation: Deviation) -> str:
     """Return how far a deviation is over its limits, for a sentence."""
     if deviation.levels_fraction > ACCEPTED_FRACTION:
+        max_levels = ACCEPTED_FRACTION * deviation.allowed_levels
         return (
-            f"by {deviation.levels:.2f} levels of 255, where "
-            f"{ACCEPTED_FRACTION * deviation.allowed_levels:.2f} would do"
+            f"by {deviation.levels:.2f} levels of 255, where {max_levels:.2f} would do"
         )
     return (
         f"by {deviation.logits:+.2f} in the margin, where "

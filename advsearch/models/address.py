@@ -27,7 +27,7 @@ from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import wait as futures_wait
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 from urllib.parse import urlunsplit
 
 import numpy as np
@@ -57,20 +57,23 @@ maximum delay in seconds, which doubles each time.
 """
 
 MAX_CONCURRENT = 64
+MAX_BATCH = 8  # images in one call of the model
 # HTTP statuses of a server that may answer later.
 RETRY_STATUSES = (408, 409, 425, 429, 500, 502, 503, 504, 529)
 MAX_ANSWER_BYTES = 1 << 20  # maximum size of an answer in bytes
 # Maximum number of bytes that are read of the body of an HTTP error.
 MAX_ERROR_BYTES = 2000
-MAX_ANSWER_CHARACTERS = (
-    1000  # maximum number of characters that are stored of an answer in words
-)
+# Maximum number of characters that are stored of an answer in words.
+MAX_ANSWER_CHARACTERS = 1000
+# Maximum number of characters of an answer's keys in a message.
+MAX_KEYS_CHARACTERS = 100
+# Size in bytes of the pieces in which an answer is read.
+PIECE_BYTES = 1 << 16
 # Minimum score: its logarithm is the logit of a name that an answer leaves out.
 MIN_SCORE = 1e-6
 REFUSED = "(refused)"  # text of a model that declines to answer
-Image8Bit: TypeAlias = npt.NDArray[
-    np.uint8
-]  # An image (H, W, 3) with 8 bits per channel
+# An image (H, W, 3) with 8 bits per channel.
+Image8Bit: TypeAlias = npt.NDArray[np.uint8]
 
 
 class AnswerStore(Protocol):
@@ -95,39 +98,25 @@ def load(spec: str, purpose: models.Purpose) -> Model:
     if not models.is_fetch_allowed(spec):
         raise models.CodeNotAllowedError(
             f"a file names the model {spec}, to which pictures would be sent, and the "
-            f"key in {models.KEY}; "
-            f"{models.explain_how_to_allow(spec)}"
+            f"key in {models.KEY}; {models.explain_how_to_allow(spec)}"
         )
-    # A chat answers in words, another address with scores. After a # stands the name.
-    chat = address.path.endswith(CHAT_SUFFIX)
-    name = address.fragment or address.netloc
-    free, question = purpose.parse_question(name, "is behind an address")
-    if chat and not free:
-        raise InputError(
-            f"task: a chat such as {name} answers in words; use "
-            "`task=answer`, and say the right `label`"
-        )
-    if chat and not address.fragment:
-        raise InputError(
-            f"model {spec}: expected the name of the chat's model behind "
-            f"a #: {spec}#NAME"
-        )
+    is_chat = address.path.endswith(CHAT_SUFFIX)
+    name = address.fragment or address.netloc  # what stands after a #, or the host
+    is_free, question = purpose.parse_question(name, "is behind an address")
+    if is_chat:
+        _check_chat(spec, name, is_free=is_free, is_named=bool(address.fragment))
     module = AddressModel(
         url=urlunsplit(address._replace(fragment="")),
         name=name,
         spec=spec,
         limits=resolve_limits(purpose.ask),
-        chat=address.fragment if chat else "",
-        question=question or (models.QUESTION if free else ""),
+        chat=address.fragment if is_chat else "",
+        question=question or (models.QUESTION if is_free else ""),
         tokens=purpose.tokens,
-        times=purpose.times if free else 1,
+        times=purpose.times if is_free else 1,
     )
-    if not free:
-        # Without names by the user, those of its scores for a gray image are taken.
-        gray_image = np.full(
-            (models.DEFAULT_SIZE, models.DEFAULT_SIZE, 3), 128, np.uint8
-        )
-        module.names = purpose.names or tuple(module.request_scores([gray_image])[0])
+    if not is_free:
+        module.names = purpose.names or _request_names(module)
         if len(module.names) < 2:
             raise errors.ModelError(
                 f"model {name}: expected scores of two names at "
@@ -140,13 +129,36 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         preprocessing=models.Preprocessing(
             (models.DEFAULT_SIZE, models.DEFAULT_SIZE), resizes=False
         ),
-        batch_limits=(1, 8),
+        batch_limits=(1, MAX_BATCH),
         differentiable=False,
     )
 
 
+def _check_chat(spec: str, name: str, *, is_free: bool, is_named: bool) -> None:
+    """Raise InputError unless a chat is asked for free answers, and its model named."""
+    if not is_free:
+        raise InputError(
+            f"task: a chat such as {name} answers in words; use "
+            "`task=answer`, and say the right `label`"
+        )
+    if not is_named:
+        raise InputError(
+            f"model {spec}: expected the name of the chat's model behind "
+            f"a #: {spec}#NAME"
+        )
+
+
+def _request_names(module: AddressModel) -> tuple[str, ...]:
+    """Return the names to which a model behind an address gives scores, by those for a
+    gray image.
+    """
+    size = (models.DEFAULT_SIZE, models.DEFAULT_SIZE)
+    gray_image = np.full((*size, 3), 128, np.uint8)
+    return tuple(module.request_scores([gray_image])[0])
+
+
 def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
-    """Return every limit, as set by `ask` or by default.
+    """Return all limits of a run: those that the setting `ask` sets, else the defaults.
 
     Raises:
         InputError: a name is unknown, or a number is out of range.
@@ -154,27 +166,23 @@ def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
     for name, value in ask.items():
         if name not in LIMITS:
             raise errors.UnknownNameError("name in `ask`", name, LIMITS)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, (int, float))
-            or not value >= 0  # NaN is not either
-        ):
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not is_number or not value >= 0:  # NaN is not either
             raise InputError(
                 f"`ask` {name}: expected a number of at least 0, got {value!r}"
             )
     limits = {**LIMITS, **ask}
-    if not (
-        1 <= limits["at_once"] <= MAX_CONCURRENT
-        and limits["at_once"] == int(limits["at_once"])
-    ):
+    at_once = limits["at_once"]
+    if not 1 <= at_once <= MAX_CONCURRENT or at_once != int(at_once):
         raise InputError(
             "`ask` at_once: expected a whole number from 1 to "
-            f"{MAX_CONCURRENT}, got {limits['at_once']:g}"
+            f"{MAX_CONCURRENT}, got {at_once:g}"
         )
-    priced = any(
+    has_price = any(
         limits[name] for name in ("per_call", "per_million_in", "per_million_out")
     )
-    if "money" in ask and not priced:
+    # Without a price nothing is spent, and a limit of money would never be reached.
+    if "money" in ask and not has_price:
         raise InputError(
             "`ask` money: expected a price beside it; give `ask` per_call, or "
             "per_million_in and per_million_out"
@@ -188,13 +196,27 @@ class _Request:
 
     Attributes:
         index: index of its body.
-        tries: how many are left.
-        delay: before the next try, in seconds.
+        tries_left: how often it may be sent, this time included.
+        delay: seconds to wait if this try fails.
     """
 
     index: int
-    tries: int
+    tries_left: int
     delay: float
+
+
+class _Failure(NamedTuple):
+    """Why a request failed.
+
+    Attributes:
+        reason: the reason, for a message.
+        may_retry: whether another try may succeed.
+        retry_after: after how many seconds, if the server states it; else 0.
+    """
+
+    reason: str
+    may_retry: bool
+    retry_after: float = 0.0
 
 
 class _Connection(http.client.HTTPConnection):
@@ -245,13 +267,15 @@ class _TrackingHandler(urllib.request.AbstractHTTPHandler):
     def do_open(
         self, http_class: Any, req: urllib.request.Request, **options: Any
     ) -> Any:
-        """Send a request by a tracked connection, see the base."""
+        """Send a request as the base class does, over a connection that is listed and
+        has the deadline.
+        """
         is_secure = issubclass(http_class, http.client.HTTPSConnection)
-        kind = _SecureConnection if is_secure else _Connection
+        connection_class = _SecureConnection if is_secure else _Connection
 
         def make_connection(host: str, **settings: Any) -> _Connection:
-            """Make a connection to a host as `http_class` does, and note it."""
-            connection = kind(host, **settings)
+            """Make a connection to a host as `http_class` does, and list it."""
+            connection = connection_class(host, **settings)
             connection.deadline = self._deadline
             self._connections.append(connection)
             return connection
@@ -306,26 +330,32 @@ class AddressModel(models.RemoteNetwork):
     answer_cache: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __call__(self, pictures: Tensor) -> Any:
-        """Return logits (N, names) for images, or the texts about each; see the
-        class.
+        """Return logits (N, names) for images (N, 3, H, W), or without names the texts
+        about each.
         """
         levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8)
         images = list(levels.permute(0, 2, 3, 1).cpu().contiguous().numpy())
-        if self.names:
-            # Scores of 0 have no logarithm: they are `MIN_SCORE`.
-            rows = [
-                [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
-                for scores in self.request_scores(images)
-            ]
-            return torch.tensor(rows).log()
+        if not self.names:
+            return [{"texts": texts} for texts in self._request_texts(images)]
+        # Scores of 0 have no logarithm: they are `MIN_SCORE`.
+        rows = [
+            [max(scores.get(name, 0.0), MIN_SCORE) for name in self.names]
+            for scores in self.request_scores(images)
+        ]
+        return torch.tensor(rows).log()
+
+    def _request_texts(self, images: Sequence[Image8Bit]) -> list[list[str]]:
+        """Return the texts about each image, one for each of `times` requests.
+
+        Of an answer with scores it is the likeliest name.
+        """
         requests = [(image, turn) for image in images for turn in range(self.times)]
         texts = []
         for answer in self._get_answers(requests):
             scores: dict[str, float] = answer.get("scores") or {answer["text"]: 1.0}
-            # The likeliest name, if there are scores.
             texts.append(max(scores, key=scores.__getitem__))
         return [
-            {"texts": texts[start : start + self.times]}
+            texts[start : start + self.times]
             for start in range(0, len(texts), self.times)
         ]
 
@@ -379,28 +409,36 @@ class AddressModel(models.RemoteNetwork):
             request = json.dumps([body, turn, self.spec]).encode()
             key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
             keys.append(key)
-            if self.store is None:
-                answers[key] = self.answer_cache.get(key)
-            else:
-                answers[key] = self.store.read_json_note(key)
+            answers[key] = self._read_stored_answer(key)
             if not isinstance(answers[key], dict):  # it is not stored, or damaged
                 new_bodies[key] = body
         new_keys = list(new_bodies)
+        read_answer = self._read_chat if self.chat else self._read_plain
         for index, response in self._send(list(new_bodies.values())):
             self._count_tokens(response)
             key = new_keys[index]
-            answer = (
-                self._read_chat(response) if self.chat else self._read_plain(response)
-            )
-            answers[key] = answer
-            if self.store is None:
-                self.answer_cache[key] = answer
-            else:
-                self.store.write_note(key, json.dumps(answer))
+            answers[key] = read_answer(response)
+            self._store_answer(key, answers[key])
         return [answers[key] for key in keys]
 
+    def _read_stored_answer(self, key: str) -> Any:
+        """Return the answer that is stored under a key; None if there is none."""
+        if self.store is None:
+            return self.answer_cache.get(key)
+        return self.store.read_json_note(key)
+
+    def _store_answer(self, key: str, answer: dict[str, Any]) -> None:
+        """Store an answer under a key."""
+        if self.store is None:
+            self.answer_cache[key] = answer
+        else:
+            self.store.write_note(key, json.dumps(answer))
+
     def _make_body(self, image: Image8Bit) -> dict[str, Any]:
-        """Return the JSON body of a request about an image."""
+        """Return the JSON body of a request about an image.
+
+        It is one of the plain protocol, or of OpenAI's chat if `chat` is not empty.
+        """
         encoded = base64.b64encode(models.encode_levels(image)).decode()
         if not self.chat:
             body: dict[str, Any] = {"image": encoded}
@@ -440,7 +478,11 @@ class AddressModel(models.RemoteNetwork):
         raise self._make_error('{"scores": {NAME: SHARE}} or {"text": WORDS}', response)
 
     def _read_chat(self, response: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the text in a response of a chat."""
+        """Return the text in a response of a chat, `REFUSED` if it declines to answer.
+
+        Raises:
+            ModelError: there is no text.
+        """
         try:
             choice = response["choices"][0]
             message = choice["message"]
@@ -450,11 +492,11 @@ class AddressModel(models.RemoteNetwork):
             raise self._make_error(
                 "choices with a message, as a chat answers", response
             ) from None
-        if isinstance(content, list):  # in pieces
+        if isinstance(content, list):  # a text in pieces
             content = " ".join(
                 str(part.get("text", "")) for part in content if isinstance(part, dict)
             )
-        if not content:
+        if not content:  # None, or empty
             is_filtered = choice.get("finish_reason") == "content_filter"
             if refusal or is_filtered:
                 return {"text": REFUSED}
@@ -520,36 +562,37 @@ class AddressModel(models.RemoteNetwork):
         while pending:
             models.INTERRUPTS.look()
             count = self._reserve(min(max_concurrent, len(pending)))
-            wave = pending[:count]
+            batch = pending[:count]
             del pending[:count]
             responses = self._send_together(
-                [json.dumps(bodies[request.index]).encode() for request in wave]
+                [json.dumps(bodies[request.index]).encode() for request in batch]
             )
             failures = list[str]()
             retries = list[_Request]()
-            # whether nothing was sent before this wave, so that a refused connection
-            # means that there is no server
-            is_first = self.spent["calls"] <= len(wave)
-            for request, response in zip(wave, responses, strict=True):
+            # A refused connection to a server that never answered means that there is
+            # none; the calls of this batch are counted already.
+            is_first = self.spent["calls"] <= len(batch)
+            for request, response in zip(batch, responses, strict=True):
                 if isinstance(response, dict):
                     yield request.index, response
-                elif isinstance(response, errors.ModelError):
-                    failures.append(str(response))
+                    continue
+                reason, retry = self._plan_retry(request, response, first=is_first)
+                if retry is None:
+                    failures.append(reason)
                 else:
-                    reason, retry = self._plan_retry(request, response, first=is_first)
-                    if retry is None:
-                        failures.append(reason)
-                    else:
-                        retries.append(retry)
-            # After all responses of the wave, so that none is lost.
+                    retries.append(retry)
+            # only now, so that no response of the batch is lost
             if failures:
                 raise errors.ModelError(failures[0])
-            if retries:
-                time.sleep(min(max(request.delay for request in retries), MAX_DELAY))
-                delayed = [
-                    replace(request, delay=2 * request.delay) for request in retries
-                ]
-                pending = delayed + pending  # they come first
+            pending = self._wait_to_retry(retries) + pending
+
+    def _wait_to_retry(self, retries: Sequence[_Request]) -> list[_Request]:
+        """Wait for the longest delay of requests that failed, and return them with
+        twice the delay.
+        """
+        if retries:
+            time.sleep(min(max(request.delay for request in retries), MAX_DELAY))
+        return [replace(request, delay=2 * request.delay) for request in retries]
 
     def _max_concurrent(self) -> int:
         """Return how many requests may be sent at once."""
@@ -561,13 +604,18 @@ class AddressModel(models.RemoteNetwork):
     def _plan_retry(
         self, request: _Request, error: Exception, *, first: bool
     ) -> tuple[str, _Request | None]:
-        """Return why a request failed, and its next try; None if there is none."""
-        reason, may_retry, retry_after = self._explain_failure(error, first=first)
-        text = f"model {self.name}: {reason} ({self.url})"
-        if not may_retry or request.tries == 1:
+        """Return why a request failed, and its next try; None if there is none.
+
+        An error of ours explains itself, and would come again.
+        """
+        if isinstance(error, errors.ModelError):
+            return str(error), None
+        failure = self._explain_failure(error, first=first)
+        text = f"model {self.name}: {failure.reason} ({self.url})"
+        if not failure.may_retry or request.tries_left == 1:
             return text, None
-        delay = max(request.delay, retry_after)
-        return text, _Request(request.index, request.tries - 1, delay)
+        delay = max(request.delay, failure.retry_after)
+        return text, _Request(request.index, request.tries_left - 1, delay)
 
     def _reserve(self, max_count: int) -> int:
         """Count calls as spent before they are made, as many as the limits allow.
@@ -588,18 +636,21 @@ class AddressModel(models.RemoteNetwork):
             if reached and count:
                 break  # those counted so far may be made
             if reached:
-                name = reached[0]
-                limit = self.limits[name]
-                raise errors.ModelError(
-                    f"model {self.name}: {spent[name]:,.10g} {name} are spent, "
-                    f"and `ask` allows {limit:,.10g}; "
-                    f"`advsearch resume RUN ask.{name}={2 * limit or 1:.10g}` goes on "
-                    "with more, and asks nothing twice"
-                )
+                raise self._make_limit_error(reached[0], spent[reached[0]])
             self.spent["calls"] += 1
             count += 1
         self._store_spent()
         return count
+
+    def _make_limit_error(self, name: str, spent: float) -> errors.ModelError:
+        """Return the error for a limit that is reached, by its name."""
+        limit = self.limits[name]
+        advised_limit = 2 * limit or 1  # twice 0 would allow nothing either
+        return errors.ModelError(
+            f"model {self.name}: {spent:,.10g} {name} are spent, and `ask` allows "
+            f"{limit:,.10g}; `advsearch resume RUN ask.{name}={advised_limit:.10g}` "
+            "goes on with more, and asks nothing twice"
+        )
 
     def _send_together(
         self, bodies: Sequence[bytes]
@@ -612,7 +663,7 @@ class AddressModel(models.RemoteNetwork):
         seconds = self.limits["seconds"]
         deadline = time.monotonic() + seconds
         pool = ThreadPoolExecutor(len(bodies))
-        connections: list[_Connection] = []
+        connections: list[_Connection] = []  # each thread adds its own
         try:
             futures = [
                 pool.submit(self._try_to_send, body, deadline, connections)
@@ -632,12 +683,13 @@ class AddressModel(models.RemoteNetwork):
     ) -> dict[str, Any] | Exception:
         """Return the response to a body, or the error, as a later try may succeed.
 
-        The arguments are those of `_send_body`. The body of an HTTP error is read here,
-        as the connection is closed afterwards.
+        The arguments are those of `_send_body`.
         """
         try:
             return self._send_body(body, deadline, connections)
         except urllib.error.HTTPError as error:
+            # Its body can't be read once the connection is closed: it is copied, and
+            # left empty if it can't be read now.
             with error, suppress(OSError, http.client.HTTPException):
                 text = error.read(MAX_ERROR_BYTES)
                 error = urllib.error.HTTPError(
@@ -648,48 +700,50 @@ class AddressModel(models.RemoteNetwork):
         except (OSError, http.client.HTTPException, errors.ModelError) as error:
             return error
 
-    def _explain_failure(
-        self, error: Exception, *, first: bool
-    ) -> tuple[str, bool, float]:
-        """Explain a failure of a request.
+    def _explain_failure(self, error: Exception, *, first: bool) -> _Failure:
+        """Explain why a request failed.
 
         Args:
             error: error that was raised.
             first: no request has succeeded yet.
-
-        Returns:
-            The reason, whether another try may succeed, and after how many seconds.
         """
         if not isinstance(error, urllib.error.HTTPError):
-            cause = getattr(error, "reason", error)  # what urllib's error wraps
-            text = type(cause).__name__
-            if str(cause):
-                text += f": {cause}"
-            # Later a refused connection may mean that the server is restarted.
-            no_server = first and isinstance(cause, ConnectionRefusedError)
-            is_final = isinstance(cause, (ssl.SSLCertVerificationError, ValueError))
-            return self._clean(text), not no_server and not is_final, 0.0
+            return self._explain_connection_error(error, first=first)
         status = error.code
         with error:
-            if 300 <= status < 400:
-                location = self._clean(error.headers.get("Location", "elsewhere"))
-                reason = (
-                    f"sends on to {location}, and pictures and keys are not sent "
-                    "there; "
-                    "give that address if you trust it"
-                )
-            elif status in (401, 403):
-                problem = "is not accepted" if models.read_key() else "is missing"
-                reason = f"status {status}: the key in {models.KEY} {problem}"
-            else:
-                body = error.read(MAX_ERROR_BYTES).decode(errors="replace")
-                reason = (
-                    f"status {status} {self._clean(str(error.reason))}: "
-                    f"{self._clean(body)[:300]}"
-                )
+            reason = self._explain_status(error)
         retry_after = error.headers.get("Retry-After", "")
         seconds = float(retry_after) if retry_after.isdigit() else 0.0
-        return reason, status in RETRY_STATUSES, seconds
+        return _Failure(reason, status in RETRY_STATUSES, seconds)
+
+    def _explain_connection_error(self, error: Exception, *, first: bool) -> _Failure:
+        """Explain why there is no response; arguments as of `_explain_failure`."""
+        cause = getattr(error, "reason", error)  # what urllib's error wraps
+        text = type(cause).__name__
+        if str(cause):
+            text += f": {cause}"
+        # Later a refused connection may mean that the server is restarted.
+        has_no_server = first and isinstance(cause, ConnectionRefusedError)
+        is_final = isinstance(cause, (ssl.SSLCertVerificationError, ValueError))
+        return _Failure(self._clean(text), may_retry=not (has_no_server or is_final))
+
+    def _explain_status(self, error: urllib.error.HTTPError) -> str:
+        """Return what the status of a response means, which is that of an error."""
+        status = error.code
+        if 300 <= status < 400:
+            location = self._clean(error.headers.get("Location", "elsewhere"))
+            return (
+                f"sends on to {location}, and pictures and keys are not sent there; "
+                "give that address if you trust it"
+            )
+        if status in (401, 403):
+            problem = "is not accepted" if models.read_key() else "is missing"
+            return f"status {status}: the key in {models.KEY} {problem}"
+        body = error.read(MAX_ERROR_BYTES).decode(errors="replace")
+        return (
+            f"status {status} {self._clean(str(error.reason))}: "
+            f"{self._clean(body)[:300]}"
+        )
 
     def _send_body(
         self, body: bytes, deadline: float, connections: list[_Connection]
@@ -705,9 +759,9 @@ class AddressModel(models.RemoteNetwork):
             ModelError: the response is too long, or something else. OSError,
                 http.client.HTTPException: it cannot be sent, or there is no response.
         """
-        key = models.read_key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)
+        key = models.read_key()
         if key:  # never sent on to another address
             request.add_unredirected_header("Authorization", f"Bearer {key}")
         handlers: list[Any] = [
@@ -720,16 +774,25 @@ class AddressModel(models.RemoteNetwork):
         if models.is_local(host):  # no proxy leads to this machine
             handlers.append(urllib.request.ProxyHandler({}))
         opener = urllib.request.build_opener(*handlers)
+        with opener.open(request, timeout=self.limits["seconds"]) as response:
+            content = self._read_limited(response)
+        return self._parse_object(content)
+
+    def _read_limited(self, response: Any) -> bytearray:
+        """Return the content of a response; raise ModelError if it is too long."""
         max_size = stored_files.scale_limit(MAX_ANSWER_BYTES)
         content = bytearray()
-        with opener.open(request, timeout=self.limits["seconds"]) as response:
-            # Read in pieces: a server may send without end.
-            while chunk := response.read1(1 << 16):
-                content += chunk
-                if len(content) > max_size:
-                    raise self._make_error(
-                        f"an answer of at most {max_size:,} bytes", "a longer one"
-                    )
+        # In pieces: a server may send without end.
+        while piece := response.read1(PIECE_BYTES):
+            content += piece
+            if len(content) > max_size:
+                raise self._make_error(
+                    f"an answer of at most {max_size:,} bytes", "a longer one"
+                )
+        return content
+
+    def _parse_object(self, content: bytearray) -> dict[str, Any]:
+        """Return the JSON object in a content; raise ModelError for anything else."""
         try:
             answer = stored_files.parse_json(content.decode(), finite=True)
         except ValueError as error:  # UnicodeDecodeError is one
@@ -750,11 +813,15 @@ class AddressModel(models.RemoteNetwork):
     def _make_error(
         self, expected: str, got: str | Mapping[str, Any]
     ) -> errors.ModelError:
-        """Return the error for an answer that is something else, or an object with
-        other keys.
+        """Return the error for an answer that is not what was expected.
+
+        Args:
+            expected: what was expected.
+            got: what the answer is, or a JSON object, whose keys are named.
         """
         if isinstance(got, Mapping):
-            got = self._clean(", ".join(map(str, got)) or "nothing")[:100]
+            keys = self._clean(", ".join(map(str, got)) or "nothing")
+            got = keys[:MAX_KEYS_CHARACTERS]
         return errors.ModelError(
             f"model {self.name}: expected {expected}, got {got} ({self.url})"
         )
@@ -773,12 +840,13 @@ class AddressModel(models.RemoteNetwork):
             isinstance(count, int) and not isinstance(count, bool) and count >= 0
             for count in counts
         )
-        # Tokens of a limit that nobody set, and of no price, need not be known.
+        # without a limit (there is none by default) and a price, tokens may be unknown
+        needs_tokens = self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token
         if is_stated:
             tokens_in, tokens_out = counts
             self.spent.update({"tokens_in": tokens_in, "tokens_out": tokens_out})
             self._store_spent()
-        elif self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token:
+        elif needs_tokens:
             raise self._make_error(
                 "`usage` with prompt_tokens and completion_tokens, as "
                 "`ask` counts tokens",

@@ -39,18 +39,19 @@ class AllAtOnce(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return the output (N * K, ...) for pictures (N * K, 3, H, W), those of each
         configuration together.
+
+        Each row is that of its configuration. A count that is no multiple of K is
+        allowed, as loading a model runs it on one or two images: copies of the last
+        picture fill it up, and have no row.
         """
         count = len(images)
-        # who loads a model tries it with a picture or two
-        missing = -count % self.cameras
-        full = (
-            torch.cat([images, images[-1:].expand(missing, -1, -1, -1)])
-            if missing
-            else images
-        )
-        together = full.unflatten(0, (-1, self.cameras))
-        together = (
-            together if self.layout == "NKCHW" else together.permute(0, 1, 3, 4, 2)
-        )
-        output: Tensor = self.network(together)
+        n_missing = -count % self.cameras
+        padded = images
+        if n_missing:
+            copies = images[-1:].expand(n_missing, -1, -1, -1)
+            padded = torch.cat([images, copies])
+        rigs = padded.unflatten(0, (-1, self.cameras))  # (N, K, 3, H, W)
+        if self.layout == "NKHWC":
+            rigs = rigs.permute(0, 1, 3, 4, 2)
+        output: Tensor = self.network(rigs)
         return output.repeat_interleave(self.cameras, dim=0)[:count]

@@ -123,7 +123,9 @@ their order.
 """
 
 
-def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
+def _find_last_layer(
+    trace_calls: Calls, model: Model, x: Tensor
+) -> tuple[Read, str] | None:
     """Find the features (N, F) of the last layer of a network.
 
     The head is the last layer whose output has a channel for each class. Features are
@@ -131,7 +133,7 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
     over all axes but the batch and the channels.
 
     Args:
-        calls: traces the layers of a network.
+        trace_calls: runs a network, and returns the calls of its layers.
         model: model with the network.
         x: a batch for it.
 
@@ -141,20 +143,22 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
     """
     # layers whose output has a row for each image
     usable = [
-        call for call in calls(model.module, x, None) if len(call.output) == len(x)
+        call
+        for call in trace_calls(model.module, x, None)
+        if len(call.output) == len(x)
     ]
     if not usable:
         return None
-    # layers with an output for each class
     heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     last = (heads or usable)[-1]
-    attribute = "input" if heads else "output"
+    attribute = "input" if heads else "output"  # of the call, which has the features
     if getattr(last, attribute) is None:  # a head whose input is a weight
         return None
 
     def read(batch: Tensor) -> Tensor:
         """Return the features (N, F) of a batch, by running the network on it."""
-        call = calls(model.module, batch, last.layer)[-1]
+        # the last call, if the network calls the layer several times
+        call = trace_calls(model.module, batch, last.layer)[-1]
         value: Tensor = getattr(call, attribute)
         channels_last = value.movedim(last.axis, -1)
         if value.dim() > 2:
@@ -165,17 +169,16 @@ def _find_last_layer(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] 
 
 
 def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
-    """Return the calls of the layers of a module in their order, by hooks.
+    """Return the calls of the layers (`LAYERS`) of a module in their order, by hooks.
 
     Args:
-        network: any; other things than modules, and programs, have no such calls.
+        network: any network; a program, or what is no module, has no such calls.
         x: a batch to run it on.
         only: the only layer of interest; None for all.
     """
     calls: list[_Call] = []
-    if not isinstance(network, nn.Module) or isinstance(
-        network, torch.jit.ScriptModule
-    ):
+    is_program = isinstance(network, torch.jit.ScriptModule)
+    if is_program or not isinstance(network, nn.Module):
         return calls
     names: dict[nn.Module, str] = {
         layer: name
@@ -189,19 +192,14 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         kwargs: dict[str, Tensor],
         output: Tensor,
     ) -> None:
-        """Record a call of a layer, which a hook calls after it."""
+        """Record a call of a layer, after it."""
         input = args[0] if args else kwargs["input"]
-        if len(input) == len(output) and input.dim() > 1:
+        keeps_batch = len(input) == len(output) and input.dim() > 1
+        if keeps_batch:
             name = f"{names[layer] or 'the network'} ({type(layer).__name__})"
-            calls.append(
-                _Call(
-                    layer,
-                    name,
-                    input,
-                    output,
-                    -1 if isinstance(layer, nn.Linear) else 1,
-                )
-            )
+            # Convolutions have (N, channels, ...).
+            channel_axis = -1 if isinstance(layer, nn.Linear) else 1
+            calls.append(_Call(layer, name, input, output, channel_axis))
 
     with ExitStack() as hooks:
         for layer in names if only is None else [only]:
@@ -258,8 +256,11 @@ def pooled(returned: Any, *, token: bool) -> Tensor | None:
             if isinstance(returned, Mapping)
             else getattr(returned, part, None)
         )
-        if isinstance(value, Tensor):
-            if value.dim() == 3:
-                return value[:, 0] if token else value.mean(dim=1)
-            return value.flatten(2).mean(dim=2) if value.dim() == 4 else value
+        if not isinstance(value, Tensor):
+            continue
+        if value.dim() == 3:  # tokens
+            return value[:, 0] if token else value.mean(dim=1)
+        if value.dim() == 4:  # maps
+            return value.flatten(2).mean(dim=2)
+        return value
     return returned if isinstance(returned, Tensor) else None

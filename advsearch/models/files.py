@@ -54,11 +54,13 @@ SUFFIXES = (
     ".onnx",
 )
 
+# Suffixes of files that are pickles in most cases.
+PICKLE_SUFFIXES = (".pkl", ".pickle", ".pth", ".ckpt", ".bin")
+
 EXPORT_HINT = (
     "Export the network instead: torch.export.save(torch.export.export(net.eval(), "
-    "(example,)), 'net.pt2'); or pass "
-    "the nn.Module through the Python API; or store its state dict as safetensors and "
-    "name what builds it: "
+    "(example,)), 'net.pt2'); or pass the nn.Module through the Python API; or store "
+    "its state dict as safetensors and name what builds it: "
     "'package.module:callable@weights.safetensors'"
 )
 
@@ -91,24 +93,31 @@ def load_file(path: Path) -> Source:
             )
         if path.suffix.lower() == ".onnx":
             return load_onnx(path)
-        if head[:2] != b"PK":  # as every zip archive begins
+        is_zip_archive = head[:2] == b"PK"
+        if not is_zip_archive:
             raise FileFormatError(f"model file {path}: {_describe_file(path, head)}")
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
         if _find_archive_kind(archive) == "torchscript":
             return _load_torchscript(archive)
-        checked = exported_programs.rewrite_program(archive)
-        logger = logging.getLogger("torch.export")
-        with (
-            _report_corrupt(path, "torch.export"),
-            without_unpickling(),
-            ExitStack() as stack,
-        ):
-            # torch logs a traceback of what is rejected with a message anyway.
-            stack.callback(logger.setLevel, logger.level)
-            logger.setLevel(logging.CRITICAL)
-            program = torch.export.load(checked)
-            module = program.module()
-        return _apply_signature(make_source(module, path.stem), program)
+        return _load_exported(archive)
+
+
+def _load_exported(archive: Archive) -> Source:
+    """Load the network in an archive of torch.export."""
+    path = archive.path
+    checked = exported_programs.rewrite_program(archive)
+    logger = logging.getLogger("torch.export")
+    with (
+        _report_corrupt(path, "torch.export"),
+        without_unpickling(),
+        ExitStack() as stack,
+    ):
+        # torch logs a traceback of what is rejected with a message anyway.
+        stack.callback(logger.setLevel, logger.level)
+        logger.setLevel(logging.CRITICAL)
+        program = torch.export.load(checked)
+        module = program.module()
+    return _apply_signature(make_source(module, path.stem), program)
 
 
 def _make_missing_hint(path: Path) -> str:
@@ -124,10 +133,14 @@ def _make_missing_hint(path: Path) -> str:
 
 
 def _load_torchscript(archive: Archive) -> Source:
-    """Load the network in a TorchScript archive."""
+    """Load the network in a TorchScript archive.
+
+    Raises:
+        FileFormatError: it is corrupt, or loading it fails or does not end.
+    """
     path = archive.path
     checked, runs_while_loading = rewrite_torchscript(archive)
-    if runs_while_loading:
+    if runs_while_loading:  # code that may never end: it is tried elsewhere first
         problem = try_torchscript(checked)
         if problem:
             raise FileFormatError(f"model file {path}: {problem}")
@@ -192,27 +205,23 @@ def _describe_file(path: Path, head: bytes) -> str:
         path: path of the file, whose suffix is looked at.
         head: its first 16 bytes.
     """
-    # Eight bytes with the length of a header in JSON, and the header.
-    is_safetensors = head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30
+    suffix = path.suffix.lower()
+    # safetensors begin with the length of a header in eight bytes, and the header, JSON
+    header_length = int.from_bytes(head[:8], "little")
+    is_safetensors = head[8:9] == b"{" and header_length < 1 << 30
     if is_safetensors:
         return (
             "safetensors hold weights but no network; name what builds it: "
             "'package.module:callable@weights.safetensors' or "
             "'torchvision:NAME@weights.safetensors'"
         )
-    if path.suffix.lower() == ".py":
+    if suffix == ".py":
         return (
             "is Python code; name what makes the network in it: "
             f"'{path.stem}:NAME', from the folder of the file"
         )
     # The first byte of a pickle is 0x80.
-    if head[:1] == b"\x80" or path.suffix.lower() in (
-        ".pkl",
-        ".pickle",
-        ".pth",
-        ".ckpt",
-        ".bin",
-    ):
+    if head[:1] == b"\x80" or suffix in PICKLE_SUFFIXES:
         return (
             f"is a pickle, or something like it, which is never opened. {EXPORT_HINT}"
         )
@@ -226,7 +235,8 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     """Return the source with what the program's signature shows: input size, layout,
     batch limits, dtype.
 
-    A program may take (N, K, 3, H, W) or (N, K, H, W, 3), all images of a rig at once.
+    A program may take (N, K, 3, H, W) or (N, K, H, W, 3), all images of a rig at once:
+    then it is wrapped as one of single images.
 
     Raises:
         ModelError: it takes something other than images.
@@ -241,7 +251,7 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     takes_sizes = (
         len(names) == 2 and names[1] in SIZE_INPUTS and inputs[1].shape[1] == 2
     )
-    if takes_sizes:  # the height and width of each image, which are known
+    if takes_sizes:  # the size of each image, which is known and passed as well
         size_type = inputs[1].dtype
         source = replace(source, size_type=size_type)
     else:
@@ -287,8 +297,10 @@ def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
 
 
 def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
-    """Check the inputs of a program; return whether they are the images of a rig (N, K,
-    ...).
+    """Check the inputs of a program, and return whether it takes rigs.
+
+    It takes a batch of images (N, ...), which may be followed by vectors (N, ...); or
+    rigs (N, K, ...): K images, one of each camera of a rig.
 
     Args:
         source: source of the program, for messages.
@@ -296,26 +308,27 @@ def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
         inputs: example values of each, with their shapes.
 
     Raises:
-        ModelError: it takes neither these nor images, with or without vectors.
+        ModelError: it takes something else.
     """
     are_tensors = bool(inputs) and all(isinstance(value, Tensor) for value in inputs)
-    is_rig = (
+    takes_rigs = (
         are_tensors
         and len(inputs) == 1
         and inputs[0].dim() == 5
+        # the number of cameras is fixed; a free size is no int but a symbol
         and isinstance(inputs[0].shape[1], int)
     )
-    is_image = (
+    takes_images = (
         are_tensors
         and inputs[0].dim() == 4
         and all(value.dim() == 2 for value in inputs[1:])
     )
-    if not is_rig and not is_image:
+    if not takes_rigs and not takes_images:
         raise ModelError(
             f"model {source.name}: expected a program with one input, a batch of "
             f"images of 4 dimensions{_advise_on_second_input(names)}"
         )
-    return is_rig
+    return takes_rigs
 
 
 def _find_batch_limits(
@@ -344,17 +357,15 @@ def make_eight_bit(source: Source) -> Source:
 
 
 def _advise_on_second_input(names: list[str]) -> str:
-    """Return what to do about a network of two inputs whose second is unknown; "" for
-    others.
+    """Return advice on the second input of a network that cannot be used, by the names
+    of its inputs; "" if there are not two.
     """
     if len(names) != 2:
         return ""
     return (
         f"; its second input {names[1][:60]!r} is not known: of two inputs, the second "
-        "may be the size of the "
-        "pictures, (N, 2) in pixels, (width, height), named 'orig_target_sizes'. "
-        "Export a network that takes pictures "
-        "alone"
+        "may be the size of the pictures, (N, 2) in pixels, (width, height), named "
+        "'orig_target_sizes'. Export a network that takes pictures alone"
     )
 
 
@@ -397,6 +408,7 @@ class OnnxNetwork(nn.Module):
 
     def forward(self, *tensors: Tensor) -> Tensor | tuple[Tensor, ...]:
         """Return the only output, or all outputs in order, for the inputs in order."""
+        # Options by which a run was ended would end the next one as well.
         self.options = self.new_options()
         names = [tensor.name for tensor in self.session.get_inputs()]
         named = {
@@ -429,10 +441,12 @@ def load_onnx(path: Path) -> Source:
     _check_onnx_inputs(path, inputs)
     images = inputs[0]
     is_eight_bit = images.type == "tensor(uint8)"
-    batch = images.shape[0]
+    batch_size = images.shape[0]  # an int, or a name if it is free; so are other sizes
+    has_fixed_batch = isinstance(batch_size, int)
     is_channels_last = images.shape[3] == 3 and images.shape[1] != 3
-    metadata = session.get_modelmeta().custom_metadata_map
     input_size = images.shape[1:3] if is_channels_last else images.shape[2:4]
+    # `imgsz` and `names` are what YOLO's exports state.
+    metadata = session.get_modelmeta().custom_metadata_map
     if not all(isinstance(size, int) for size in input_size):
         input_size = _parse_image_size(metadata.get("imgsz", ""))
     source = Source(
@@ -441,8 +455,9 @@ def load_onnx(path: Path) -> Source:
         input_size=(input_size[0], input_size[1]) if input_size else None,
         layout="NHWC" if is_channels_last else "NCHW",
         labels=parse_names(metadata.get("names", "")),
-        batch_limits=(batch, batch) if isinstance(batch, int) else (1, MAX_BATCH),
+        batch_limits=(batch_size, batch_size) if has_fixed_batch else (1, MAX_BATCH),
         dtype=torch.float32 if is_eight_bit else FLOATS[images.type],
+        # a second input is the sizes of the images, see `_check_onnx_inputs`
         size_type=SIZE_TYPES[inputs[1].type] if len(inputs) > 1 else None,
     )
     return make_eight_bit(source) if is_eight_bit else source
@@ -455,10 +470,8 @@ def _open_session(path: Path) -> tuple[Any, Any]:
     if release is None or (int(release[1]), int(release[2])) < MIN_VERSION:
         raise ModelError(
             f"model {path}: needs onnxruntime {'.'.join(map(str, MIN_VERSION))} or "
-            "newer, "
-            f"got {runtime.__version__}, which "
-            "may read weights from anywhere that a file names: pip install -U "
-            "'advsearch[onnx]'"
+            f"newer, got {runtime.__version__}, which may read weights from anywhere "
+            "that a file names: pip install -U 'advsearch[onnx]'"
         )
     options = runtime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
@@ -481,30 +494,31 @@ def _open_session(path: Path) -> tuple[Any, Any]:
 
 
 def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
-    """Raise ModelError unless the inputs are images (N, ...), and at most their sizes
-    (N, 2).
+    """Raise ModelError unless the inputs of a network are images (N, ...), maybe with
+    their sizes (N, 2).
     """
-    shape = inputs[0].shape if inputs else []
-    is_image = (
-        len(shape) == 4
+    image_shape = inputs[0].shape if inputs else []
+    fixed_sizes = [size for size in image_shape if isinstance(size, int)]
+    takes_images = (
+        len(image_shape) == 4
         and (inputs[0].type == "tensor(uint8)" or inputs[0].type in FLOATS)
-        and min((size for size in shape if isinstance(size, int)), default=1) > 0
+        and min(fixed_sizes, default=1) > 0
     )
-    rest = inputs[1:]
-    is_size = (
-        len(rest) == 1
-        and rest[0].name in SIZE_INPUTS
-        and rest[0].type in SIZE_TYPES
-        and len(rest[0].shape) == 2
-        and rest[0].shape[1] in (2, None)
+    other_inputs = inputs[1:]
+    takes_sizes = (
+        len(other_inputs) == 1
+        and other_inputs[0].name in SIZE_INPUTS
+        and other_inputs[0].type in SIZE_TYPES
+        and len(other_inputs[0].shape) == 2
+        and other_inputs[0].shape[1] in (2, None)
     )
-    if is_image and (not rest or is_size):
+    if takes_images and (not other_inputs or takes_sizes):
         return
     got = ", ".join(f"{tensor.name} {tensor.type} {tensor.shape}" for tensor in inputs)
+    advice = _advise_on_second_input([tensor.name for tensor in inputs])
     raise ModelError(
-        f"model file {path}: expected one input, a batch of floating-point images "
-        "of 4 dimensions (or of uint8), "
-        f"got {got or 'none'}{_advise_on_second_input([tensor.name for tensor in inputs])}"
+        f"model file {path}: expected one input, a batch of floating-point images of 4 "
+        f"dimensions (or of uint8), got {got or 'none'}{advice}"
     )
 
 

@@ -142,6 +142,9 @@ class WithState(nn.Module):
         select = getattr(self.network, "select_action", None)
         if select is None:
             return self.network(images, state) if state else self.network(images)
-        getattr(self.network, "reset", lambda: None)()
+        reset = getattr(self.network, "reset", None)
+        if reset is not None:
+            reset()
+        # A policy may switch gradients off or on as it runs: this restores the mode.
         with torch.set_grad_enabled(torch.is_grad_enabled()):
             return select({PICTURE: images, **state})

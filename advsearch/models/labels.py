@@ -81,7 +81,7 @@ def find_label_set(
     Args:
         text: the terms, e.g. ``"coffee mug,cup"``, or a sequence of terms and indices.
         labels: the model's label names in index order.
-        named: False if the names are placeholders, for messages.
+        named: whether the labels are names; else they are placeholders ("class 0").
 
     Raises:
         InputError: no term, an unknown name (with near matches), a name of several
@@ -105,17 +105,19 @@ def find_label_set(
 def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     """Find the classes whose names resemble a word, best first, then its synonyms.
 
-    Resemblance is that of `find_similar_names`; synonyms ("cup" for "mug") come from a table of
-    everyday things.
+    Resemblance is that of `find_similar_names`; synonyms ("cup" for "mug") come from a
+    table of everyday things. A synonym is a better suggestion than a name that is only
+    spelled alike: with synonyms, names count only if one of them contains the word.
 
     Returns:
         Index and name of each class; the name is the part of the label that matched:
         "frying pan" of "frying pan, frypan, skillet".
     """
-    table = {
+    # A label with commas is left out: its parts have entries of their own.
+    indices_of_name = {
         name: indices
         for name, indices in _make_name_table(labels).items()
-        if "," not in name  # full labels: their synonyms are in the table, too
+        if "," not in name
     }
     synonym_groups = json.loads((DATA / "synonyms.json").read_text("utf-8"))
     key = _normalize_name(word)
@@ -123,14 +125,13 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
     for group in synonym_groups:
         names = [_normalize_name(name) for name in group]
         if key in names:
-            synonyms += [name for name in names if name in table]
-    similar = find_similar_names(word, table)
-    # If nothing contains the word, the similar names are only spelled like it.
+            synonyms += [name for name in names if name in indices_of_name]
+    similar = find_similar_names(word, indices_of_name)
     if synonyms and not any(key in name for name in similar):
         similar = []
     name_of_index: dict[int, str] = {}
     for name in (*similar, *synonyms):
-        for index in table[name]:
+        for index in indices_of_name[name]:
             name_of_index.setdefault(index, name)
     return list(name_of_index.items())
 
@@ -144,7 +145,7 @@ def _find_class(
         term: a name, or an index such as "#504".
         table: indices by name.
         labels: labels of the model.
-        named: whether these are names, not placeholders.
+        named: whether the labels are names; else they are placeholders ("class 0").
 
     Raises:
         InputError: there is no such class, or several.
@@ -180,15 +181,15 @@ def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
     Args:
         term: term that is unknown.
         labels: labels of the model.
-        named: whether these are names, not placeholders.
+        named: whether the labels are names; else they are placeholders ("class 0").
     """
     if not named:
-        fitting = "".join(
+        sets_of_names = "".join(
             f" or `labels={name}`" for name in list_sets_of_size(len(labels))
         )
         return (
             f"Its {len(labels)} classes have no names: give a label file "
-            f"(`labels`){fitting}, or an index such as '#0'"
+            f"(`labels`){sets_of_names}, or an index such as '#0'"
         )
     similar = find_similar_labels(term, labels)[:MAX_SUGGESTIONS]
     if similar:
@@ -279,15 +280,14 @@ _FLAT = re.compile(
 
 
 def _is_name_list(source: str | os.PathLike[str]) -> bool:
-    """Whether a text is names with commas between them, not the path of a file, which
-    may be missing.
+    """Return whether a text is names with commas between them, and not the path of a
+    file.
+
+    A text that ends like a label file is a path even if there is no such file.
     """
     text = str(source)
-    return (
-        isinstance(source, str)
-        and "," in text
-        and not (os.path.isfile(text) or text.endswith((".json", ".txt")))
-    )
+    is_path = os.path.isfile(text) or text.endswith((".json", ".txt"))
+    return isinstance(source, str) and "," in text and not is_path
 
 
 class LabelsOrigin(NamedTuple):
@@ -407,26 +407,34 @@ def _read_file(path: Path) -> tuple[str, ...]:
         ) from None
     if not text.strip():
         raise FileFormatError(f"{where}: expected label names, got an empty file")
-    names: Any = [line.strip() for line in text.strip("\r\n").splitlines()]
-    # Text has a name on each line, even on an empty one within it.
-    if path.suffix.lower() == ".json" or text.lstrip()[0] in "[{":
-        try:
-            names = parse_json(text)
-        except json.JSONDecodeError as error:
-            raise FileFormatError(
-                f"{where}: not valid JSON (line {error.lineno}: {error.msg})"
-            ) from None
-        except ValueError as error:
-            raise FileFormatError(
-                f"{where}: expected label names, got {error}"
-            ) from None
+    is_json = path.suffix.lower() == ".json" or text.lstrip()[0] in "[{"
+    if is_json:
+        names = _parse_json_names(text, where)
+    else:  # a name on each line, even on an empty one within the text
+        names = [line.strip() for line in text.strip("\r\n").splitlines()]
+    return _check_names(names, FileFormatError, where)
+
+
+def _parse_json_names(text: str, where: str) -> list[Any]:
+    """Return the names in a JSON list, or in a JSON object from index to name.
+
+    `where` is the beginning of an error. Raises FileFormatError for anything else.
+    """
+    try:
+        names = parse_json(text)
+    except json.JSONDecodeError as error:
+        raise FileFormatError(
+            f"{where}: not valid JSON (line {error.lineno}: {error.msg})"
+        ) from None
+    except ValueError as error:
+        raise FileFormatError(f"{where}: expected label names, got {error}") from None
     if isinstance(names, dict):
-        names = _order_by_index(names, where)
+        return _order_by_index(names, where)
     if not isinstance(names, list):
         raise FileFormatError(
             f"{where}: expected a list of names or an object from index to name"
         )
-    return _check_names(names, FileFormatError, where)
+    return names
 
 
 def _check_names(
@@ -453,7 +461,6 @@ def _find_problem(names: Sequence[Any]) -> str:
         if len(name) > MAX_NAME_CHARACTERS:
             return (
                 f"expected a name of at most {MAX_NAME_CHARACTERS} characters for "
-                "class "
-                f"{index}, got {len(name):,}"
+                f"class {index}, got {len(name):,}"
             )
     return ""

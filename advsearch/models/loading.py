@@ -147,16 +147,7 @@ def load_model(
             f"{task.names_source}; leave `labels` out"
         )
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
-    # Only tasks that read texts have `tokens` and `times`.
-    purpose = Purpose(
-        task=task.name if task else "classification",
-        names=names,
-        prompts=prompts,
-        tokens=getattr(task, "tokens", 16),
-        times=getattr(task, "times", 1),
-        ask=ask or {},
-    )
-    source = _find_source(spec, purpose)
+    source = _find_source(spec, _state_purpose(task, names, prompts, ask))
     switches = find_code_switches()
     if prompts is not None:
         _check_reads_text(source, spec)
@@ -177,6 +168,27 @@ def load_model(
     if isinstance(spec, (str, os.PathLike)) and is_named_alone:
         return replace(model, spec=os.fspath(spec))
     return model
+
+
+def _state_purpose(
+    task: Any,
+    names: tuple[str, ...] | None,
+    prompts: tuple[str, ...] | None,
+    ask: Mapping[str, float] | None,
+) -> Purpose:
+    """Return what a model is loaded for; arguments as for `load_model`, after reading.
+
+    Without a task it is classification.
+    """
+    return Purpose(
+        task=task.name if task else "classification",
+        names=names,
+        prompts=prompts,
+        # only tasks that read texts have these
+        tokens=getattr(task, "tokens", 16),
+        times=getattr(task, "times", 1),
+        ask=ask or {},
+    )
 
 
 def _drop_unset(**options: Any) -> dict[str, Any]:
@@ -294,13 +306,16 @@ def _probe_source(
         origin: origin of the names, for messages.
     """
     min_batch, max_batch = source.batch_limits
-    max_batch = min(max_batch, options.get("max_batch") or max_batch)  # 0: not set
+    requested_max_batch = options.get("max_batch")
+    if requested_max_batch:
+        max_batch = min(max_batch, requested_max_batch)
     preprocessing = _make_preprocessing(source, options)
     model = Model(
         module=_adapt_to_images_alone(source, preprocessing),
         name=name or source.name,
         labels=(),
         preprocessing=preprocessing,
+        # a network that needs larger batches gets them whatever the option is
         batch_limits=(min_batch, max(min_batch, max_batch)),
         dtype=source.dtype,
         device=source.device,
@@ -348,32 +363,38 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
             "model: expected a name, a path, an nn.Module or a Model, "
             f"got {got}. {FORMS}"
         )
-    text = spec.strip()
+    return _find_named_source(spec.strip(), purpose)
+
+
+def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
+    """Find the source of a model that a text names, or the model itself."""
     network, weights = split_weights(text)
     if network == "reference":
         return reference.load(weights=weights)
-    source = text.partition(":")[0].lower()
-    if ":" in text and source in SOURCES:
-        load = SOURCES[source]
-        return load(text, purpose) if source in SOURCES_WITH_PURPOSE else load(text)
+    prefix = text.partition(":")[0].lower()
+    if ":" in text and prefix in SOURCES:
+        load = SOURCES[prefix]
+        return load(text, purpose) if prefix in SOURCES_WITH_PURPOSE else load(text)
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(
             f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'"
         )
     if parse_code_reference(text) is not None:
         return load_callable(text, SOURCES)
-    if (
+    is_path = (
         Path(text).suffix.lower() in files.SUFFIXES
         or "/" in text
         or os.sep in text
         or os.path.exists(text)
-    ):
+    )
+    if is_path:
         return files.load_file(Path(text))
     raise _make_unknown_error(text)
 
 
 def _make_unknown_error(text: str) -> UnknownNameError:
-    """Return the error for a model's name that means nothing."""
+    """Return the error for a model's name that means nothing, with similar names."""
+    # what stands after the colon; NAME for other sources
     forms = {
         "hf": "hf:REPOSITORY",
         "http": "http://ADDRESS",
@@ -382,7 +403,8 @@ def _make_unknown_error(text: str) -> UnknownNameError:
     names = ["reference", *(forms.get(source, f"{source}:NAME") for source in SOURCES)]
     hint = FORMS
     may_be_of_library = re.fullmatch(r"[\w.-]+", text)
-    if may_be_of_library and not find_similar_names(text, ["reference"]):
+    is_misspelt_reference = bool(find_similar_names(text, ["reference"]))
+    if may_be_of_library and not is_misspelt_reference:
         hint = (
             "A library's network is written with its library: "
             f"'torchvision:{text}' or 'timm:{text}'. {FORMS}"
@@ -464,8 +486,9 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
     for key, choices in (("layout", ("NCHW", "NHWC")), ("channels", ("RGB", "BGR"))):
         if key in options:
             fields[key] = _parse_choice(key, options[key], choices)
-    # What is empty has the default of `Preprocessing`.
-    return Preprocessing(**{key: value for key, value in fields.items() if value})
+    # What neither states is left to the defaults of `Preprocessing`.
+    stated_fields = {key: value for key, value in fields.items() if value}
+    return Preprocessing(**stated_fields)
 
 
 def _parse_input_size(value: Any) -> tuple[int, int]:
@@ -480,14 +503,15 @@ def _parse_input_size(value: Any) -> tuple[int, int]:
 
 
 def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Parse `mean` and `std` (3,) each; a preset for one fills the other too, unless
-    that is given.
+    """Parse the options `mean` and `std`, three numbers each.
+
+    The name of a preset ("imagenet") for one of them sets both, unless the user gave
+    the other one too.
     """
     fields: dict[str, Any] = {}
     for key in ("mean", "std"):
         value = options.get(key)
         if isinstance(value, str) and value.strip().lower() in PRESETS:
-            # A preset sets both, but does not replace what the user gave for the other.
             preset_mean, preset_std = PRESETS[value.strip().lower()]
             if key == "mean" or "mean" not in options:
                 fields["mean"] = preset_mean
@@ -496,8 +520,8 @@ def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
         elif value is not None:
             expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
             numbers = _parse_numbers(key, value, (1, 3), expected)
-            # The first, middle and last of three; of one number three times this.
-            fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
+            is_single = len(numbers) == 1  # for all channels
+            fields[key] = (numbers * 3) if is_single else numbers
     return fields
 
 

@@ -38,20 +38,23 @@ class _Recomputed(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, ask: Callable[[Tensor], Any], structure: list[Any], images: Tensor
+        ctx: Any,
+        function: Callable[[Tensor], Any],
+        structures: list[Any],
+        images: Tensor,
     ) -> tuple[Tensor, ...]:
         """Return the tensors in what a function returns for images, without a graph.
 
         Args:
             ctx: stores what `backward` needs.
-            ask: the function; it is called again for the gradient.
-            structure: gets how the tensors are nested appended, as only tensors may be
-                returned.
+            function: the function; it is called again for the gradient.
+            structures: list to which it is appended how the tensors are nested, as only
+                tensors may be returned.
             images: (N, H, W, 3).
         """
-        tensors, tree = tree_flatten(ask(images))  # autograd is off in here
-        structure.append(tree)
-        ctx.ask = ask
+        tensors, structure = tree_flatten(function(images))  # autograd is off in here
+        structures.append(structure)
+        ctx.function = function
         ctx.save_for_backward(images)
         ctx.mark_non_differentiable(
             *(tensor for tensor in tensors if not tensor.is_floating_point())
@@ -70,7 +73,7 @@ class _Recomputed(torch.autograd.Function):
         create_graph = torch.is_grad_enabled()
         with torch.enable_grad():
             images = images if create_graph else images.detach().requires_grad_()
-            tensors, _ = tree_flatten(ctx.ask(images))
+            tensors, _ = tree_flatten(ctx.function(images))
         outputs = []
         output_gradients = []
         for tensor, gradient in zip(tensors, gradients, strict=True):
@@ -92,16 +95,18 @@ class _Recomputed(torch.autograd.Function):
 
 
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
-    """Return `function(images)` without storing activations: tensors, or lists and
-    mappings of them.
+    """Return `function(images)` without storing activations.
+
+    It returns a tensor, or lists and mappings of tensors.
 
     The gradient computes the function a second time, and takes the memory of one batch
     instead of that of all (Chen et al. 2016, *Training Deep Nets with Sublinear Memory
     Cost*, section 3).
     """
-    structure: list[Any] = []
-    tensors = _Recomputed.apply(function, structure, images)  # type: ignore[no-untyped-call]
-    return tree_unflatten(list(tensors), structure[0])
+    # `apply` returns tensors only, and appends the structure that they belong to
+    structures: list[Any] = []
+    tensors = _Recomputed.apply(function, structures, images)  # type: ignore[no-untyped-call]
+    return tree_unflatten(list(tensors), structures[0])
 
 
 CPU = torch.device("cpu")
@@ -324,22 +329,10 @@ class Model:
                 output in it.
         """
         images = check_images(images)
-        max_batch = self.batch_limits[1]
-        recomputes = False
         if self.cameras > 1:
             # (N, H, cameras * W, 3) to (N * cameras, H, W, 3)
             images = images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
-            # the images of a rig stay in one batch, if they fit into it
-            full_rigs = max_batch - max_batch % self.cameras
-            max_batch = max(full_rigs, min(max_batch, self.cameras))
-            recomputes = (
-                not isinstance(self.module, AllAtOnce)
-                and len(images) > MAX_STORED_IMAGES
-                and images.requires_grad
-                and torch.is_grad_enabled()
-            )
-            if recomputes:
-                max_batch = min(max_batch, MAX_STORED_IMAGES)
+        recomputes = self._must_recompute(images)
 
         def return_to_device(output: Tensor) -> Tensor:
             # A copy, because a network may write into the same memory again.
@@ -353,16 +346,40 @@ class Model:
 
         outputs = [
             compute_checkpointed(run_batch, batch) if recomputes else run_batch(batch)
-            for batch in images.split(max_batch)
+            for batch in images.split(self._find_max_batch(recomputes=recomputes))
         ]
         output = outputs[0] if len(outputs) == 1 else join_outputs(outputs)
         if self.cameras == 1:
             return output
+        # of each rig, a tuple of the outputs for its images
         image_outputs = [output[index : index + 1] for index in range(len(output))]
         return [
             tuple(image_outputs[start : start + self.cameras])
             for start in range(0, len(image_outputs), self.cameras)
         ]
+
+    def _must_recompute(self, images: Tensor) -> bool:
+        """Return whether the activations of images (N, H, W, 3) of rigs would take too
+        much memory, so that the gradient computes them again.
+        """
+        return (
+            self.cameras > 1
+            and not isinstance(self.module, AllAtOnce)
+            and len(images) > MAX_STORED_IMAGES
+            and images.requires_grad
+            and torch.is_grad_enabled()
+        )
+
+    def _find_max_batch(self, *, recomputes: bool) -> int:
+        """Return the maximum number of images in a batch.
+
+        The images of a rig stay in one batch, if they fit into it.
+        """
+        max_batch = self.batch_limits[1]
+        if self.cameras > 1:
+            full_rigs = max_batch - max_batch % self.cameras
+            max_batch = max(full_rigs, min(max_batch, self.cameras))
+        return min(max_batch, MAX_STORED_IMAGES) if recomputes else max_batch
 
     def copy_network(self) -> nn.Module:
         """Return a copy of the network, to train it further.
@@ -419,10 +436,11 @@ class Model:
         Returns:
             The output; with `raw`, what the network itself returns.
         """
-        INTERRUPTS.look()
+        INTERRUPTS.look()  # ends here after Ctrl-C
+        # A model that is `attached` has a gradient through what its network detaches.
         ignores_detach = self.attached and torch.is_grad_enabled()
         mode = DetachMode(ignored=True) if ignores_detach else nullcontext()
-        # The network may switch gradients off as it runs.
+        # The network may switch gradients off as it runs: this restores the mode.
         with mode, torch.set_grad_enabled(torch.is_grad_enabled()):
             returned = self.module(x)
         if raw:
@@ -442,16 +460,16 @@ def copy_sharing_weights(module: nn.Module) -> nn.Module:
     differentiated through them.
     """
 
-    def without_inference(weights: torch.Tensor) -> torch.Tensor:
+    def make_differentiable(weights: torch.Tensor) -> torch.Tensor:
         return weights.clone() if weights.is_inference() else weights
 
-    # What `deepcopy` is to take in place of a copy of each parameter and buffer.
+    # `deepcopy` takes the objects in here, by id, in place of copies of them.
     memo: dict[int, Any] = {}
     for parameter in module.parameters():
-        weights = without_inference(parameter.detach())
+        weights = make_differentiable(parameter.detach())
         memo[id(parameter)] = nn.Parameter(weights, parameter.requires_grad)
     for buffer in module.buffers():
-        memo[id(buffer)] = without_inference(buffer)
+        memo[id(buffer)] = make_differentiable(buffer)
     return copy.deepcopy(module, memo)
 
 
@@ -518,7 +536,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
 
     Args:
         read: reads it; see `Read`.
-        returned: by the network.
+        returned: what the network returned.
         count: number of images.
         name: name of the model, for messages.
 
@@ -528,18 +546,11 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
     try:
         output = read(returned, count)
     except ValueError as error:
-        advice = _advise_on_missing_scores(returned)
-        if not advice:
-            likely_task = _guess_task(returned)
-            # `read` is usually the method of a task.
-            task = getattr(getattr(read, "__self__", None), "name", None)
-            # Actions look like rows of scores.
-            if likely_task and task not in (likely_task, "command"):
-                advice = _advise_other_task(likely_task)
-            else:
-                advice = "wrap the network, or ask for another task"
+        # `read` is usually the method of a task.
+        task = getattr(getattr(read, "__self__", None), "name", None)
         raise ModelError(
-            f"model {name}: {error}, got {describe_output(returned)}; {advice}"
+            f"model {name}: {error}, got {describe_output(returned)}; "
+            f"{_advise_on_output(returned, task)}"
         ) from None
     if len(output) != count:
         raise ModelError(
@@ -548,6 +559,18 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
         )
     mend_batch_norms(output)
     return output
+
+
+def _advise_on_output(returned: Any, task: str | None) -> str:
+    """Return what to do about an output that a task, by its name, cannot read."""
+    advice = _advise_on_missing_scores(returned)
+    if advice:
+        return advice
+    likely_task = _guess_task(returned)
+    # Actions, of task command, look like rows of scores.
+    if likely_task and task not in (likely_task, "command"):
+        return _advise_other_task(likely_task)
+    return "wrap the network, or ask for another task"
 
 
 def describe_output(returned: Any) -> str:
@@ -619,31 +642,15 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     expected = (
         f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
     )
-    advice = _advise_on_missing_scores(output)
-    if advice:
-        got = describe_output(output if tensor is None else tensor)
-        raise ModelError(f"{expected}, got {got}; {advice}")
-    likely_task = _guess_task(output)
-    # A map of scores for each pixel gets the advice on its shape below instead.
-    is_map = tensor is not None and tensor.dim() == 4
-    has_other_task = likely_task in ("detection", "segmentation", "depth", "similarity")
-    if likely_task and has_other_task and not is_map:
-        raise ModelError(
-            f"{expected}, got {describe_output(output)}; "
-            f"{_advise_other_task(likely_task)}"
-        )
+    _check_is_classifier(output, tensor, expected)
     if tensor is None:
         raise ModelError(
             f"{expected}, got {type(output).__name__}; wrap the network "
             "so that it returns one tensor"
         )
     shape = tuple(tensor.shape)
-    if (
-        len(shape) != 2
-        or shape[0] != count
-        or shape[1] < 2
-        or (classes is not None and shape[1] != classes)
-    ):
+    has_rows = len(shape) == 2 and shape[0] == count and shape[1] >= 2
+    if not has_rows or (classes is not None and shape[1] != classes):
         raise ModelError(f"{expected}, got {shape}; {_advise_on_shape(shape)}")
     if not tensor.is_floating_point():
         raise ModelError(
@@ -652,6 +659,30 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
         )
     mend_batch_norms(tensor)
     return tensor.float()
+
+
+def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> None:
+    """Raise ModelError for an output that looks like that of another task, of training,
+    or after an argmax.
+
+    Args:
+        output: output of the network.
+        tensor: tensor of logits in it; None if there is none.
+        expected: beginning of the message.
+    """
+    advice = _advise_on_missing_scores(output)
+    if advice:
+        got = describe_output(output if tensor is None else tensor)
+        raise ModelError(f"{expected}, got {got}; {advice}")
+    likely_task = _guess_task(output)
+    has_other_task = likely_task in ("detection", "segmentation", "depth", "similarity")
+    # A map of scores for each pixel gets the caller's advice on its shape instead.
+    is_map = tensor is not None and tensor.dim() == 4
+    if likely_task and has_other_task and not is_map:
+        raise ModelError(
+            f"{expected}, got {describe_output(output)}; "
+            f"{_advise_other_task(likely_task)}"
+        )
 
 
 def mend_batch_norms(output: Any) -> None:
@@ -737,29 +768,37 @@ def _advise_on_missing_scores(returned: Any) -> str:
 
 def _guess_task(returned: Any) -> str | None:
     """Return the task whose networks return such an output; None if there is none."""
-    is_sequence = isinstance(returned, (tuple, list))
-    first = returned[0] if is_sequence and returned else returned
-    names = first if isinstance(first, Mapping) else dir(first)
-    if not isinstance(first, Tensor) and ("boxes" in names or "pred_boxes" in names):
-        return "detection"
-    # (boxes (N, K, 4), scores ...)
-    is_boxes = isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4
-    if is_sequence and len(returned) > 1 and is_boxes:
+    if _looks_like_boxes(returned):
         return "detection"
     if isinstance(returned, Mapping) and any(
         word in str(key) for key in returned for word in ("depth", "disparity")
     ):
         return "depth"
+    # an encoder of transformers
     if hasattr(returned, "last_hidden_state") and not hasattr(returned, "logits"):
         return "similarity"
-    if is_sequence:
+    if isinstance(returned, (tuple, list)):
         maps = [x for x in returned if isinstance(x, Tensor) and x.ndim == 4]
         if len({feature_map.shape[2:] for feature_map in maps}) > 1:
             return None  # feature maps of several sizes
-    tensor = _find_scores(returned)
-    if not isinstance(tensor, Tensor):
+    scores = _find_scores(returned)
+    if not isinstance(scores, Tensor):
         return None
-    return {2: "classification", 4: "segmentation"}.get(tensor.dim())
+    task_of_dimensions = {2: "classification", 4: "segmentation"}
+    return task_of_dimensions.get(scores.dim())
+
+
+def _looks_like_boxes(returned: Any) -> bool:
+    """Return whether an output has boxes: a field with their name, in it or in its
+    first element, or boxes (N, K, 4) before other elements.
+    """
+    is_sequence = isinstance(returned, (tuple, list))
+    first = returned[0] if is_sequence and returned else returned
+    if isinstance(first, Tensor):
+        is_boxes = first.dim() == 3 and first.shape[2] == 4
+        return is_sequence and len(returned) > 1 and is_boxes
+    names = first if isinstance(first, Mapping) else dir(first)
+    return "boxes" in names or "pred_boxes" in names
 
 
 def _advise_other_task(name: str) -> str:

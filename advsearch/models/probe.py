@@ -9,7 +9,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -47,6 +47,8 @@ of the network's dtype: bfloat16 distinguishes 0.50 from 0.51 and no less.
 
 # Change of each value of an image, in [0, 1], along the gradient that is checked.
 STEP = 1e-3
+# Likewise, for outputs that jump over the longer step only.
+SMALL_STEP = STEP / 8.0
 
 MAX_GRADIENT_ERROR = 0.9
 """Maximum relative error of what the gradient predicts: a wrong sign is an error of 2,
@@ -149,10 +151,8 @@ def _check_batch_size(model: Model) -> None:
     if count * height * width > scale_limit(MAX_PIXELS):
         raise ModelError(
             f"model {model.name}: takes {count:,} images of {height:,} x {width:,} "
-            "pixels at once, expected at most "
-            f"{scale_limit(MAX_PIXELS):,} pixels; if you trust it, {FACTOR}=10 in the "
-            "environment allows ten times "
-            "as many"
+            f"pixels at once, expected at most {scale_limit(MAX_PIXELS):,} pixels; if "
+            f"you trust it, {FACTOR}=10 in the environment allows ten times as many"
         )
 
 
@@ -176,10 +176,9 @@ def _find_probabilities(model: Model, rows: Tensor) -> bool:
         return False
     kind = "percentages that sum to 100" if are_percentages else "probabilities"
     warn(
-        f"model {model.name} returns {kind}. Their logarithm is used, so that "
-        "margins are log-odds, "
-        "but gradients vanish where a probability rounds to 0 or 1: remove the "
-        "final softmax if you can"
+        f"model {model.name} returns {kind}. Their logarithm is used, so that margins "
+        "are log-odds, but gradients vanish where a probability rounds to 0 or 1: "
+        "remove the final softmax if you can"
     )
     return True
 
@@ -193,9 +192,8 @@ def _warn_of_pixel_probabilities(model: Model, images: Tensor) -> None:
     if is_map and _are_probabilities(output.movedim(1, -1).flatten(0, 2)):
         warn(
             f"model {model.name} returns probabilities for each pixel: margins are "
-            "differences of these and no "
-            "log-odds, and gradients vanish where one rounds to 0 or 1: remove the "
-            "final softmax if you can"
+            "differences of these and no log-odds, and gradients vanish where one "
+            "rounds to 0 or 1: remove the final softmax if you can"
         )
 
 
@@ -207,9 +205,8 @@ def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
     if kind:
         warn(
             f"model {model.name} returns {kind}. They are taken for logits: the "
-            "probabilities that are shown are none, "
-            "and margins are differences of such scores. Return what stands before the "
-            "last function"
+            "probabilities that are shown are none, and margins are differences of "
+            "such scores. Return what stands before the last function"
         )
 
 
@@ -234,13 +231,13 @@ def _run(model: Model, images: Tensor) -> Tensor:
 
 
 def _run_and_read(model: Model, images: Tensor) -> Any:
-    """Run a network that does not return logits on images (N, H, W, 3), and read its
-    output.
+    """Run a network that does not return logits on images (N, H, W, 3), and return the
+    output for each as the task reads it.
     """
     assert model.read is not None
-    return read_output(model.read, *_run_network(model, images), model.name)[
-        : len(images)
-    ]
+    returned, batch_size = _run_network(model, images)
+    output = read_output(model.read, returned, batch_size, model.name)
+    return output[: len(images)]  # without images that fill a batch up
 
 
 def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
@@ -286,24 +283,22 @@ def _explain_failed_call(
     Returns:
         The reason, to follow the model's name; and advice, a further sentence or "".
     """
-    reason = _describe_other_inputs(network, str(error))
     if isinstance(model.module, WithState) and model.module.state:
         sizes = ", ".join(
             f"{name} (N, {len(numbers)})"
             for name, numbers in model.module.state.items()
         )
-        wrong_options = "`state`"
         reason = f"cannot be called with pictures and a state of {sizes[:200]}"
-    elif reason:
+        return reason, ". Give the `state` that it was made for"
+    reason = _describe_other_inputs(network, str(error))
+    if reason:
         return reason, ""
-    else:
-        height, width = model.input_size
-        wrong_options = "`input_size` and `layout`"
-        reason = (
-            f"cannot be run on a {model.preprocessing.channels} image of "
-            f"{height} x {width} pixels in layout {model.preprocessing.layout}"
-        )
-    return reason, f". Give the {wrong_options} that it was made for"
+    height, width = model.input_size
+    reason = (
+        f"cannot be run on a {model.preprocessing.channels} image of "
+        f"{height} x {width} pixels in layout {model.preprocessing.layout}"
+    )
+    return reason, ". Give the `input_size` and `layout` that it was made for"
 
 
 def _unwrap(network: Any) -> Any:
@@ -330,24 +325,7 @@ def _describe_other_inputs(network: object, error: str) -> str:
     """
     if not isinstance(network, nn.Module):
         return ""
-    parameters: list[inspect.Parameter] = []
-    with suppress(TypeError, ValueError):  # it is not written in Python
-        # the first one is the images
-        parameters = list(inspect.signature(network.forward).parameters.values())[1:]
-    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    required = {
-        parameter.name
-        for parameter in parameters
-        if parameter.kind not in variadic
-        and parameter.default is inspect.Parameter.empty
-    }
-    # Labels of training have a default, and yet a network may need them.
-    named_in_error = LABEL_ARGUMENTS & set(re.findall(r"\w+", error))
-    missing = [
-        parameter.name
-        for parameter in parameters
-        if parameter.name in required | named_in_error
-    ]
+    missing = _list_missing_inputs(network, error)
     if missing:
         return (
             f"wants {' and '.join(missing)} beside pictures; wrap it in an nn.Module "
@@ -360,6 +338,32 @@ def _describe_other_inputs(network: object, error: str) -> str:
             "in an nn.Module that makes one of each picture"
         )
     return ""
+
+
+def _list_missing_inputs(network: nn.Module, error: str) -> list[str]:
+    """Return the names of the inputs that a network lacks if it is called with images.
+
+    They are required; or labels of training that its error names: they have a default,
+    and yet a network may need them.
+    """
+    try:
+        # the first one is the images
+        parameters = list(inspect.signature(network.forward).parameters.values())[1:]
+    except (TypeError, ValueError):  # it is not written in Python
+        return []
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    required = {
+        parameter.name
+        for parameter in parameters
+        if parameter.kind not in variadic
+        and parameter.default is inspect.Parameter.empty
+    }
+    named_in_error = LABEL_ARGUMENTS & set(re.findall(r"\w+", error))
+    return [
+        parameter.name
+        for parameter in parameters
+        if parameter.name in required | named_in_error
+    ]
 
 
 def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bool:
@@ -408,44 +412,52 @@ def _check_range(model: Model, images: Tensor) -> None:
     noise, but do so, at the same size, with these colors. A network in Python that
     returns no logits is not checked: if it is untrained, it looks the same.
     """
-    preprocessing = model.preprocessing
-    # Whoever sets one of these knows which colors the network takes.
-    is_declared = preprocessing.processor is not None or any(
-        getattr(preprocessing, name) != default
-        for name, default in (
-            ("mean", (0.0, 0.0, 0.0)),
-            ("std", (1.0, 1.0, 1.0)),
-            ("value_range", (0.0, 1.0)),
-        )
-    )
-    is_program = isinstance(_unwrap(model.module), PROGRAMS) or hasattr(
-        _unwrap(model.module), "stop"
-    )
-    if is_declared or (model.read is not None and not is_program):
+    network = _unwrap(model.module)
+    is_program = isinstance(network, PROGRAMS) or hasattr(network, "stop")
+    returns_logits = model.read is None
+    if _is_range_declared(model) or not (returns_logits or is_program):
         return
-    narrow = _collect_numbers(model, images)
-    if narrow is None or _compute_relative_change(narrow) >= MIN_RELATIVE_CHANGE:
+    outputs = _collect_numbers(model, images)
+    if outputs is None or _follows_images(outputs):
         return
-    wide_model = dataclasses.replace(
-        model, preprocessing=dataclasses.replace(preprocessing, value_range=EIGHT_BIT)
-    )
-    wide = _collect_numbers(wide_model, images)
+    wide_preprocessing = dataclasses.replace(model.preprocessing, value_range=EIGHT_BIT)
+    wide_model = dataclasses.replace(model, preprocessing=wide_preprocessing)
+    wide_outputs = _collect_numbers(wide_model, images)
     if (
-        wide is None
-        or wide.shape != narrow.shape
-        or _compute_relative_change(wide) < MIN_RELATIVE_CHANGE
+        wide_outputs is None
+        or wide_outputs.shape != outputs.shape
+        or not _follows_images(wide_outputs)
     ):
         return
-    growth = float(wide.abs().amax(dim=0).mean() / narrow.abs().amax(dim=0).mean())
+    size = outputs.abs().amax(dim=0).mean()
+    growth = float(wide_outputs.abs().amax(dim=0).mean() / size)
     # Outputs that grow with the colors, as of untrained networks, are no sign.
     if 1.0 / MAX_GROWTH < growth < MAX_GROWTH:
         warn(
             f"outputs of model {model.name} hardly follow the picture: they differ by "
-            f"{_compute_relative_change(narrow):.1%} "
+            f"{_compute_relative_change(outputs):.1%} "
             "between a black, a white and a random one, and by "
-            f"{_compute_relative_change(wide):.0%} if colors go from 0 to "
+            f"{_compute_relative_change(wide_outputs):.0%} if colors go from 0 to "
             "255. If it is made for these, give `value_range=0,255`"
         )
+
+
+def _is_range_declared(model: Model) -> bool:
+    """Return whether the user or a library has set what depends on the range of colors:
+    then the range is known, too.
+    """
+    preprocessing = model.preprocessing
+    return (
+        preprocessing.processor is not None
+        or preprocessing.mean != (0.0, 0.0, 0.0)
+        or preprocessing.std != (1.0, 1.0, 1.0)
+        or preprocessing.value_range != (0.0, 1.0)
+    )
+
+
+def _follows_images(outputs: Tensor) -> bool:
+    """Return whether outputs (K, n) differ between K unlike images."""
+    return _compute_relative_change(outputs) >= MIN_RELATIVE_CHANGE
 
 
 @torch.no_grad()
@@ -522,8 +534,7 @@ def _find_batch_limits(
     if rows is not None and not _are_equal(model, rows, batch_rows):
         warn(
             f"model {model.name} sees an image differently in a batch: was it exported "
-            "in training mode? "
-            "Call .eval() before exporting"
+            "in training mode? Call .eval() before exporting"
         )
     return min_batch, max_batch
 
@@ -540,25 +551,18 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     """
     reason = "it is zero everywhere"
     try:
-        with DetachMode() as detaching:
-            try:
-                rows, gradient = _compute_gradient(model, images)
-            except RuntimeError as error:
-                # What the network detaches may be all that has a gradient.
-                if not (repeatable and detaching.has_detached):
-                    raise
-                reason = get_first_line(error)
-                with torch.no_grad():
-                    rows = _run(model, images)
-                gradient = torch.zeros_like(images)
-        if model.read is not None and not bool(rows[:, 0].any()):
+        probed = _compute_first_gradient(model, images, repeatable)
+        if probed.reason is not None:
+            reason = probed.reason
+        if _has_no_output(model, probed.rows):
             # It detects nothing in noise: rendered images will show its gradient.
             return dataclasses.replace(model, differentiable=True)
-        if repeatable and detaching.has_detached:
+        gradient = probed.gradient
+        if repeatable and probed.has_detached:
             model, gradient = _try_attached(model, images, gradient)
         has_gradient = bool((gradient != 0).any())
         if has_gradient and repeatable:
-            is_detached = detaching.has_detached and not model.attached
+            is_detached = probed.has_detached and not model.attached
             _check_gradient(model, images, gradient, is_detached)
     except (RuntimeError, ModelError) as error:
         has_gradient = False
@@ -577,6 +581,43 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     return dataclasses.replace(model, differentiable=has_gradient)
 
 
+class _FirstGradient(NamedTuple):
+    """The gradient of a network as it is.
+
+    Attributes:
+        rows: rows of `_run` for the images.
+        gradient: gradient by the images.
+        has_detached: whether the network detaches what has a gradient.
+        reason: why there is no gradient, if it is known.
+    """
+
+    rows: Tensor
+    gradient: Tensor
+    has_detached: bool
+    reason: str | None = None
+
+
+def _compute_first_gradient(
+    model: Model, images: Tensor, repeatable: bool
+) -> _FirstGradient:
+    """Compute the gradient of a network by images (N, H, W, 3).
+
+    It is zero where the network detaches all that has one, and its outputs are
+    repeatable, so that this can be mended; otherwise a RuntimeError is raised.
+    """
+    with DetachMode() as detaching:
+        try:
+            rows, gradient = _compute_gradient(model, images)
+        except RuntimeError as error:
+            if not (repeatable and detaching.has_detached):
+                raise
+            with torch.no_grad():
+                rows = _run(model, images)
+            reason = get_first_line(error)
+            return _FirstGradient(rows, torch.zeros_like(images), True, reason)
+    return _FirstGradient(rows, gradient, detaching.has_detached)
+
+
 def _try_attached(
     model: Model, images: Tensor, gradient: Tensor
 ) -> tuple[Model, Tensor]:
@@ -590,16 +631,15 @@ def _try_attached(
     # raises if that is ignored: it keeps its own.
     with suppress(RuntimeError, ModelError):
         attached_gradient = _compute_gradient(attached, images)[1]
-        for step_size in (STEP, STEP / 8.0):
-            step_size = max(step_size, ROUNDING_STEPS * torch.finfo(model.dtype).eps)
-            step = step_size * (attached_gradient - gradient).sign()
-            change, (attached_change, detached_change), *_ = _measure_change(
-                model, images, step, attached_gradient, gradient
-            )
-            detached_error = abs(change - detached_change)
+        min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
+        for step_size in (STEP, SMALL_STEP):
+            step = max(step_size, min_step) * (attached_gradient - gradient).sign()
+            change = _measure_change(model, images, step, attached_gradient, gradient)
+            attached_change, detached_change = change.predicted
+            detached_error = abs(change.actual - detached_change)
             # better than the network's own gradient, and good by itself
             max_error = min(detached_error, MAX_ATTACHED_ERROR * abs(attached_change))
-            if abs(change - attached_change) < max_error:
+            if abs(change.actual - attached_change) < max_error:
                 return attached, attached_gradient
     return model, gradient
 
@@ -613,9 +653,17 @@ def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
     leaf = images.clone().requires_grad_()
     with torch.enable_grad():
         rows = _run(model, leaf)
-        if model.read is not None and not bool(rows[:, 0].any()):
+        if _has_no_output(model, rows):
             return rows, torch.zeros_like(images)
         return rows, torch.autograd.grad(_compute_checked_value(rows), leaf)[0]
+
+
+def _has_no_output(model: Model, rows: Tensor) -> bool:
+    """Return whether a model, such as a detector, finds nothing, by rows of `_run`."""
+    if model.read is None:
+        return False
+    n_numbers = rows[:, 0]
+    return not bool(n_numbers.any())
 
 
 def _compute_checked_value(rows: Tensor) -> Tensor:
@@ -627,10 +675,26 @@ def _compute_checked_value(rows: Tensor) -> Tensor:
     return (rows * torch.linspace(-1.0, 1.0, rows.shape[1])).sum()
 
 
+class _Change(NamedTuple):
+    """How the number of `_compute_checked_value` changes between two images.
+
+    Attributes:
+        actual: the change.
+        predicted: what each of some gradients predicts of it.
+        ends: the images.
+        total: sum of the absolute values of the outputs at the first of them.
+    """
+
+    actual: float
+    predicted: list[float]
+    ends: list[Tensor]
+    total: float
+
+
 @torch.no_grad()
 def _measure_change(
     model: Model, images: Tensor, step: Tensor, *gradients: Tensor
-) -> tuple[float, list[float], list[Tensor], float]:
+) -> _Change:
     """Measure how the number of `_compute_checked_value` changes around images.
 
     Args:
@@ -638,18 +702,14 @@ def _measure_change(
         images: (N, H, W, 3).
         step: (N, H, W, 3), taken to both sides; the images are clipped to [0, 1] there.
         *gradients: (N, H, W, 3) that predict the change.
-
-    Returns:
-        The change from one end to the other; what each gradient predicts of it; the
-        images at both ends; and the sum of the outputs' absolute values at one of them.
     """
     ends = [(images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)]
     outputs = [_run(model, end) for end in ends]
-    change = float(_compute_checked_value(outputs[0] - outputs[1]))
+    actual = float(_compute_checked_value(outputs[0] - outputs[1]))
     predicted = [
         float(((ends[0] - ends[1]) * gradient).sum()) for gradient in gradients
     ]
-    return change, predicted, ends, float(outputs[0].abs().sum())
+    return _Change(actual, predicted, ends, float(outputs[0].abs().sum()))
 
 
 def _check_gradient(
@@ -659,7 +719,7 @@ def _check_gradient(
 
     Its gradient may be masked, cut off, or not that of this network. The change over a
     small step along the sign of the gradient is compared with what the gradient
-    predicts.
+    predicts; it is right if it holds for one of the steps.
 
     Args:
         model: model that is probed.
@@ -667,26 +727,20 @@ def _check_gradient(
         gradient: (N, H, W, 3) of `_compute_checked_value`.
         detached: whether the network detaches tensors, for the message.
     """
-    # A gradient that holds for one of two steps is right. Suppression of boxes may make
-    # outputs jump in the larger one only.
-    step_sizes = (STEP,) if model.read is None else (STEP, STEP / 8.0)
-    min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
-    if min_step > STEP:
-        # A network in half precision is nonlinear in the first, and rounds the second.
-        step_sizes = (min_step, min_step / 8.0)
-    for step_size in step_sizes:
-        change, (predicted,), ends, total = _measure_change(
-            model, images, step_size * gradient.sign(), gradient
-        )
+    for step_size in _choose_step_sizes(model):
+        step = step_size * gradient.sign()
+        change = _measure_change(model, images, step, gradient)
         if model.read is not None:
-            choices = {
-                _collect_discrete_values(model, image) for image in (images, *ends)
+            discrete_values = {
+                _collect_discrete_values(model, image)
+                for image in (images, *change.ends)
             }
-            if len(choices) > 1:
+            if len(discrete_values) > 1:
                 return  # outputs that jump cannot be compared with a gradient
-        size = max(abs(change), abs(predicted))
-        is_too_small_to_tell = size <= MIN_CHANGE * total
-        is_predicted = abs(change - predicted) <= MAX_GRADIENT_ERROR * size
+        (predicted,) = change.predicted
+        size = max(abs(change.actual), abs(predicted))
+        is_too_small_to_tell = size <= MIN_CHANGE * change.total
+        is_predicted = abs(change.actual - predicted) <= MAX_GRADIENT_ERROR * size
         if is_too_small_to_tell or is_predicted:
             return
     reason = "Steps that round, or a defence that masks gradients?"
@@ -697,29 +751,40 @@ def _check_gradient(
         )
     warn(
         f"the gradient of model {model.name} does not say how its outputs change: "
-        f"{predicted:.3g} expected, "
-        f"{change:.3g} seen for a small step along it. {reason} A search "
-        "that follows them may find nothing: try a policy without gradients beside it"
+        f"{predicted:.3g} expected, {change.actual:.3g} seen for a small step along "
+        f"it. {reason} A search that follows them may find nothing: try a policy "
+        "without gradients beside it"
     )
+
+
+def _choose_step_sizes(model: Model) -> tuple[float, ...]:
+    """Return the steps over which the gradient of a model is checked, in turn."""
+    min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
+    if min_step > STEP:
+        # A network in half precision is nonlinear in the first, and rounds the second.
+        return (min_step, min_step / 8.0)
+    # Suppression of boxes may make outputs jump in the larger step only.
+    return (STEP,) if model.read is None else (STEP, SMALL_STEP)
 
 
 @torch.no_grad()
 def _collect_discrete_values(model: Model, images: Tensor) -> str:
     """Return the part of an output that no gradient changes, as a string to compare.
 
-    That is its shapes, its columns of integers, and its texts. A detector with
-    suppression finds other boxes after a small step, and a text continues differently
-    after another word.
+    That is its shapes, its columns of integers, and its texts; "" of a single tensor. A
+    detector with suppression finds other boxes after a small step, and a text continues
+    differently after another word.
     """
     outputs = _run_and_read(model, images)
     if isinstance(outputs, Tensor):
         return ""
-    choices = list[Any]()
+    discrete_values = list[Any]()
     for tensor in list_tensors(outputs):
         columns = tensor.flatten(1).T if tensor.ndim > 1 else tensor[None]
         is_integer = (columns == columns.round()).all(dim=1)
-        choices.append((tensor.shape, columns[is_integer].tolist()))
+        discrete_values.append((tensor.shape, columns[is_integer].tolist()))
     for output in outputs:
         if isinstance(output, Mapping):
-            choices += [value for value in output.values() if type(value) is str]
-    return str(choices)
+            texts = [value for value in output.values() if type(value) is str]
+            discrete_values += texts
+    return str(discrete_values)

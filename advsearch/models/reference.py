@@ -166,12 +166,15 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
     """
     net, labels = load_network(folder, weights)
     name = "reference" if weights is None else f"reference@{weights}"
-    bare = Model(
-        freeze_network(fold_batch_norms(net), name), name, (), Preprocessing(INPUT_SIZE),
-        # `fold_batch_norms` has merged its normalisation
+    model = Model(
+        freeze_network(fold_batch_norms(net), name),
+        name,
+        labels=(),  # set by `probe`
+        preprocessing=Preprocessing(INPUT_SIZE),
+        # The folded network has no batch norms: to be trained it is loaded once more.
         make_trainable=lambda: load_network(folder, weights)[0],
-    )  # fmt: skip
-    return probe(bare, labels, LabelsOrigin("labels of the reference model"))
+    )
+    return probe(model, labels, LabelsOrigin("labels of the reference model"))
 
 
 def load_network(

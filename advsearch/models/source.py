@@ -77,17 +77,18 @@ class Purpose:
     ask: Mapping[str, float] = field(default_factory=dict)
 
     def check(self, model: str, what: str, *tasks: str) -> None:
-        """Check that a network can do the task.
+        """Check that a network can do the task; any network may do a user's own task.
 
         Args:
-            model: its name.
-            what: the network does, such as "compares a picture with texts".
-            *tasks: tasks that this is good for. A user's own task may read any output.
+            model: name of the model.
+            what: what the network does, such as "compares a picture with texts".
+            *tasks: the tasks of the package that it can do.
 
         Raises:
-            ModelError: it cannot.
+            ModelError: it cannot do the task.
         """
-        if self.task in (*OUTPUTS_BY_TASK, "answer") and self.task not in tasks:
+        is_user_task = self.task not in (*OUTPUTS_BY_TASK, "answer")
+        if not is_user_task and self.task not in tasks:
             instead = " or ".join(f"`task={task}`" for task in tasks)
             raise ModelError(
                 f"model {model} {what} and cannot do task {self.task}; use {instead}"
@@ -126,8 +127,7 @@ class Purpose:
         if self.names is None:
             raise InputError(
                 f"model {model} {what} and has no classes of its own: name them, two "
-                "at least, such as "
-                "`labels=mug,cup,bowl` or `labels=imagenet`"
+                "at least, such as `labels=mug,cup,bowl` or `labels=imagenet`"
             )
         return self.names
 
@@ -224,8 +224,7 @@ def freeze_network(module: nn.Module, name: str) -> nn.Module:
         ) as error:  # it holds a lock or an open file, for example
             warn(
                 f"model {name} cannot be copied ({get_first_line(error)}): the module "
-                "itself is set to evaluation mode and "
-                "its parameters are frozen"
+                "itself is set to evaluation mode and its parameters are frozen"
             )
     with suppress(NotImplementedError):  # programs of torch.export have no modes
         module.eval()
@@ -336,7 +335,7 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     module_name, _, attribute = target.partition(":")
     module = _import_module(module_name, spec, libraries)
     value = _get_attribute(module, attribute, module_name)
-    if not isinstance(value, (nn.Module, Model)):
+    if not isinstance(value, (nn.Module, Model)):  # a function or a class makes it
         value = _call_factory(value, spec)
     if isinstance(value, Model):
         if weights is not None:
@@ -412,27 +411,32 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
         try:
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
-            message = f"module {name!r} needs {error.name!r}, which is not installed"
-            # the module itself is missing, or a package that it is in, and not one that
-            # it imports
-            if error.name is not None and (
-                name == error.name or name.startswith(error.name + ".")
-            ):
-                near = find_similar_names(name, libraries)
-                meant = (
-                    f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?"
-                    if near
-                    else ""
-                )
+            missing = error.name
+            # the module itself or a package that it is in, and not one that it imports
+            is_module_itself = missing is not None and f"{name}.".startswith(
+                f"{missing}."
+            )
+            message = f"module {name!r} needs {missing!r}, which is not installed"
+            if is_module_itself:
                 message = (
-                    f"no module named {error.name!r} on the Python path or in "
-                    f"{os.getcwd()}{meant}"
+                    f"no module named {missing!r} on the Python path or in "
+                    f"{os.getcwd()}{_suggest_library(name, spec, libraries)}"
                 )
             raise ModelError(f"model {spec}: {message}") from error
         except Exception as error:  # the user's code may raise anything
             raise ModelError(
                 f"model {spec}: importing {name!r} failed ({_where(error)})"
             ) from error
+
+
+def _suggest_library(name: str, spec: str, libraries: Iterable[str]) -> str:
+    """Return the question whether a library is meant by the name of a module, "" if
+    none is similar.
+    """
+    similar = find_similar_names(name, libraries)
+    if not similar:
+        return ""
+    return f"; did you mean '{similar[0]}:{spec.partition(':')[2]}'?"
 
 
 def _where(error: BaseException) -> str:
@@ -461,9 +465,8 @@ def import_library(name: str, spec: str, extra: str) -> Any:
     """
     try:
         return importlib.import_module(name)
-    except (
-        Exception
-    ) as error:  # a build for another torch raises RuntimeError, among others
+    # a build for another torch raises RuntimeError, among others
+    except Exception as error:
         command = f"pip install 'advsearch[{extra}]'"
         if isinstance(error, ModuleNotFoundError) and error.name == name:
             raise ModelError(
@@ -471,8 +474,7 @@ def import_library(name: str, spec: str, extra: str) -> Any:
             ) from error
         raise ModelError(
             f"model {spec}: needs {name}, which cannot be imported here "
-            f"({get_first_line(error)}). Install builds that fit "
-            f"each other: {command}, torch's own index where that has them; or export "
-            "the network with torch.export "
-            f"where {name} works, and give the .pt2 file"
+            f"({get_first_line(error)}). Install builds that fit each other: "
+            f"{command}, torch's own index where that has them; or export the network "
+            f"with torch.export where {name} works, and give the .pt2 file"
         ) from error

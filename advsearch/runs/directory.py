@@ -116,43 +116,57 @@ class RunDirectory:
             run: a name (kept in ``runs/``) or a path; None takes ``runs/<default>-NNN``
                 with the next free number.
             config: what the run does; a run without it can't be repeated or resumed.
+            overwrite: whether the new run may replace another one.
+            default: name of a run without a name.
 
         Raises:
             RunExistsError: there is something already.
         """
         path = _make_numbered_directory(default) if run is None else locate_run(run)
-        # else the missing folder of a moved study would be made again
+        # before the directory is made: else that of a study that was moved away would
+        # be made again
         check_not_moved(path)
-        check_free(path, overwrite=overwrite)  # early, before anything is made
+        check_free(path, overwrite=overwrite)
         with storage_errors(path):
             path.mkdir(parents=True, exist_ok=True)
         try:
-            # releases the lock and closes the store if anything below fails
-            with ExitStack() as undo:
-                lock = RunLock(path)
-                undo.callback(lock.release)
-                # again: another process may have made a run before the lock was held
-                check_free(path, overwrite=overwrite)
-                with storage_errors(path):
-                    _clear(path)
-                try:
-                    if config is not None:
-                        write_text(path / CONFIG, config.make_repeatable().to_yaml())
-                    run_directory = cls(path, lock)
-                    undo.callback(run_directory.store.close)
-                    if config is not None:
-                        run_directory._note_start(config)
-                except BaseException:
-                    with suppress(OSError):
-                        _clear(path)
-                    raise
-                undo.pop_all()  # nothing failed: the caller closes it
-                return run_directory
-        except InputError:  # the folder belongs to another run, and stays
+            return cls._create_in(path, config, overwrite=overwrite)
+        except InputError:  # the directory belongs to another run, and stays
             raise
         except BaseException:
             _remove_if_bare(path)
             raise
+
+    @classmethod
+    def _create_in(
+        cls, path: Path, config: Config | None, *, overwrite: bool
+    ) -> RunDirectory:
+        """Begin a run in a directory that exists; after an error nothing of it is left.
+
+        Raises:
+            RunExistsError: another process has begun a run there.
+        """
+        # releases the lock and closes the store if anything below fails
+        with ExitStack() as undo:
+            lock = RunLock(path)
+            undo.callback(lock.release)
+            # once more: a run may have begun there before the lock was held
+            check_free(path, overwrite=overwrite)
+            with storage_errors(path):
+                _clear(path)
+            try:
+                if config is not None:
+                    write_text(path / CONFIG, config.make_repeatable().to_yaml())
+                run_directory = cls(path, lock)
+                undo.callback(run_directory.store.close)
+                if config is not None:
+                    run_directory._note_start(config)
+            except BaseException:
+                with suppress(OSError):
+                    _clear(path)
+                raise
+            undo.pop_all()  # nothing failed: the caller closes it
+            return run_directory
 
     @classmethod
     def open(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
@@ -195,17 +209,17 @@ class RunDirectory:
         check_not_moved(locate_run(run))
         path = find_run(run)
         check_links(path)
+        # releases the lock and closes the directory if the settings do not fit
         with ExitStack() as undo:
             lock = RunLock(path)
             undo.callback(lock.release)
-            # closed and unlocked if the settings do not fit
-            opened = cls(path, lock)
-            undo.callback(opened.close)
-            opened._is_new = False
+            run_directory = cls(path, lock)
+            undo.callback(run_directory.close)
+            run_directory._is_new = False
             if config is not None:
-                opened._check_settings_unchanged(config)
-            undo.pop_all()
-        return opened
+                run_directory._check_settings_unchanged(config)
+            undo.pop_all()  # nothing failed: the caller closes it
+        return run_directory
 
     @property
     def restart_advice(self) -> str:
@@ -256,10 +270,11 @@ class RunDirectory:
         )
 
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
-        """Store facts that decide the numbers of the run, or check that those stored
-        are the same.
+        """Check that what decides the numbers of a run is as it was when the run began.
 
-        A fact that is not stored yet is added to the others.
+        Facts are settings, or versions and digests of files. They are stored by the
+        first call, and later ones are compared with them. One that is new is stored as
+        well.
 
         Args:
             note: the name under which they are stored.
@@ -283,8 +298,7 @@ class RunDirectory:
             )
             raise InputError(
                 f"{self.path}: cannot resume with something else than the run began "
-                f"with: {changes}; restore it, or "
-                f"{self.restart_advice}"
+                f"with: {changes}; restore it, or {self.restart_advice}"
             )
         has_new_facts = not facts.keys() <= before.keys()
         if has_new_facts:
@@ -431,21 +445,24 @@ class RunDirectory:
 
 @contextmanager
 def create_before_work(config: Config) -> Iterator[Path | None]:
-    """Make the folder of a new run before its work begins, so that the run can be
+    """Make the directory of a new run before its work begins, so that the run can be
     resumed however the block ends.
 
-    Yields its path; the directory is closed, and the block resumes it. Where the block
-    raises before anything was evaluated, the folder is removed again, with the folders
-    that were made for it. With `overwrite` over an existing run nothing is made, and
-    the path is None: the old run stays until the new one takes its place.
+    If the block raises before anything was evaluated, the directory is removed again,
+    with the folders that were made for it.
+
+    Yields:
+        The path of the directory. It is closed, and the block resumes it. None with
+        `overwrite` over an existing run, for which nothing is made: the old run stays
+        until the new one has something to store.
     """
     location, overwrite = config.run_location
-    # an old run is not cleared before its successor has something to store
     if overwrite and location is not None and is_run(locate_run(location)):
         yield None
         return
     home = HOME if location is None else locate_run(location).parent
-    missing_folders = [
+    # from the innermost out
+    new_folders = [
         parent for parent in (home, *home.parents) if not os.path.exists(parent)
     ]
     with RunDirectory.create_for(config) as run:
@@ -456,9 +473,9 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
         with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
             if run.is_empty:
                 run.discard()
-        # from the innermost out; one that is not empty ends it by an error
+        # `rmdir` raises for a folder that is not empty, and so ends the loop
         with suppress(OSError):
-            for folder in missing_folders:
+            for folder in new_folders:
                 folder.rmdir()
         raise
 

@@ -264,18 +264,7 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
         FileFormatError: the classes or a line are not as 3DB writes them; it names the
             line.
     """
-    try:
-        classes = parse_json(
-            read_text(folder / CLASSES, "the classes of 3DB", MAX_CLASSES_BYTES)
-        )
-        if not isinstance(classes, list):
-            raise ValueError(type(classes).__name__)
-    except FileNotFoundError:
-        classes = []
-    except (OSError, ValueError) as error:
-        raise FileFormatError(
-            f"{folder / CLASSES}: expected a list of names, got {error}"
-        ) from None
+    class_names = _read_classes(folder / CLASSES)
     try:
         file = open_regular(folder / DETAILS, "the log of 3DB", MAX_LOG_BYTES)
     except OSError as error:
@@ -283,8 +272,7 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
             f"{folder / DETAILS}: expected the log of 3DB, got {error.strerror}"
         ) from None
     with file:
-        # without end; `range` gives the number of the line
-        for number in range(1 << 62):
+        for number in itertools.count():
             # one byte more than allowed shows that a line is too long
             line = file.readline(MAX_LINE_BYTES + 1)
             if not line:  # the end of the file; an empty line has its line break
@@ -294,7 +282,26 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
                     folder, number, f"more than {MAX_LINE_BYTES} bytes"
                 )
             if line.strip():
-                yield _parse_line(folder, number, line, list(map(str, classes)))
+                yield _parse_line(folder, number, line, class_names)
+
+
+def _read_classes(path: Path) -> list[str]:
+    """Return the names of classes in a file of 3DB; empty if there is no such file.
+
+    Raises:
+        FileFormatError: it has something else.
+    """
+    try:
+        classes = parse_json(read_text(path, "the classes of 3DB", MAX_CLASSES_BYTES))
+        if not isinstance(classes, list):
+            raise ValueError(type(classes).__name__)
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError) as error:
+        raise FileFormatError(
+            f"{path}: expected a list of names, got {error}"
+        ) from None
+    return list(map(str, classes))
 
 
 def _parse_line(

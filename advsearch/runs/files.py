@@ -293,7 +293,7 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
     `ANIMATION_BYTES` at most, or cannot get smaller.
     """
     count = min(len(frames), ANIMATION_FRAMES)
-    shrink = 1  # factor by which sides are divided beyond ANIMATION_SIDE
+    shrink = 1  # factor by which sides are smaller than ANIMATION_SIDE
     while True:
         # evenly spaced, with the first and the last frame
         indices = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
@@ -301,16 +301,7 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
             Image.fromarray(_check_image_shape(to_8bit(frames[index])))
             for index in indices
         ]
-        # Blocks of so many pixels a side become one pixel. -(-a // b) is rounded up, so
-        # that the longest side fits into ANIMATION_SIDE.
-        block = max(shrink, -(-max(pictures[0].size) * shrink // ANIMATION_SIDE))
-        # cut to a multiple of the block
-        width, height = (
-            side - side % block if side > block else side for side in pictures[0].size
-        )
-        pictures = [
-            picture.reduce(block, (0, 0, width, height)) for picture in pictures
-        ]
+        pictures = _shrink_images(pictures, shrink)
         data = _encode_gif(pictures)
         is_minimal = min(pictures[0].size) < MIN_ANIMATION_SIDE
         if len(data) <= ANIMATION_BYTES or is_minimal:
@@ -320,6 +311,20 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
             count = min(count * 9 // 10, count * ANIMATION_BYTES // len(data))
         else:
             shrink *= 2
+
+
+def _shrink_images(images: Sequence[Image.Image], shrink: int) -> list[Image.Image]:
+    """Return images (one size) whose longest side is at most ANIMATION_SIDE / `shrink`.
+
+    Blocks of pixels become one pixel; what is left of a block at an edge is cut off.
+    """
+    longest_side = max(images[0].size)
+    # -(-a // b) is a / b, rounded up
+    block = max(shrink, -(-longest_side * shrink // ANIMATION_SIDE))
+    width, height = (
+        side - side % block if side > block else side for side in images[0].size
+    )
+    return [image.reduce(block, (0, 0, width, height)) for image in images]
 
 
 def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:

@@ -103,11 +103,26 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
                 if isinstance(error, AdvsearchError)
                 else f"{FAULT}: {type(error).__name__}"
             )
-            listed = ListedRun(
-                path.name, str(path), "?", "?", (), 0, "damaged", "", {}, False, None
-            )
+            listed = _make_damaged_run(path)
         _LISTED[key] = state, replace(listed, fault=faults[0] if faults else "")
     return _LISTED[key][1]
+
+
+def _make_damaged_run(path: Path) -> ListedRun:
+    """Return what the list says of a run of which nothing can be read."""
+    return ListedRun(
+        path.name,
+        str(path),
+        command="?",
+        object="?",
+        controls=(),
+        rows=0,
+        state="damaged",
+        answer="",
+        kinds={},
+        begun=False,
+        when=None,
+    )
 
 
 def _state(path: Path) -> object:
@@ -152,14 +167,6 @@ def _make_listed_run(
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
     if not isinstance(controls, (list, tuple, dict)):
         controls = ("?",)
-
-    if running:
-        state = "running"
-    elif result is None or result.is_unfinished:
-        state = "stopped"
-    else:
-        state = str(getattr(result, "ending", "done"))
-
     return ListedRun(
         path.name,
         str(path),
@@ -167,12 +174,21 @@ def _make_listed_run(
         object=str(object_name),
         controls=tuple(map(str, controls)),
         rows=sum(kinds.values()),
-        state=state,
+        state=_find_state(result, running),
         answer=result.brief if result else "",
         kinds=kinds,
         begun=bool(config),
         when=_find_start_time(path),
     )
+
+
+def _find_state(result: Result | None, running: bool) -> str:
+    """Return the state of a run, see `ListedRun`."""
+    if running:
+        return "running"
+    if result is None or result.is_unfinished:
+        return "stopped"
+    return str(getattr(result, "ending", "done"))
 
 
 def _get_object_names(result: Result | None) -> str:

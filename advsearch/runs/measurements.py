@@ -27,11 +27,11 @@ class Measurements:
     """What a run has measured, in its store; measures what is not there, until the time
     is up.
 
-    One measurement is always made, so that a run gets on. What is stored is read back
-    before the first one.
+    One measurement is always made, so that a run that is resumed again and again gets
+    on. What is stored is read back before the first one.
 
     Attributes:
-        n_new: how many were made in this sitting.
+        n_new: how many were made since the run was started or resumed.
 
     Args:
         context: `experiment.RunContext` of the run that stores them.
@@ -50,15 +50,14 @@ class Measurements:
 
         Raises:
             OutOfTime: it would have to be measured, the time is up, and something was
-                measured in this sitting.
+                measured since the run was started or resumed.
         """
         stored = self.read(key)
         if stored is None:
-            # one measurement in each sitting, so that every one gets further
             if self.n_new and time.monotonic() >= self._end:
                 raise OutOfTime
             self.n_new += 1
-            # so that it is the same as when it is read back
+            # encoded and decoded, so that it is equal to what is read back later
             stored = json.loads(json.dumps(measure()))
             self.put(key, stored)
         return stored
@@ -98,9 +97,8 @@ class Measurements:
         the result of the rows taken.
 
         The summary is written after each new row, so that a kill leaves it. It never
-        has fewer rows than an earlier sitting left in it: stored rows are taken first,
-        and where an interrupt comes before they were all read, the earlier result is
-        returned.
+        has fewer rows than before the run was resumed: stored rows are taken first, and
+        if an interrupt comes before they were all read, the earlier result is returned.
 
         Args:
             rows: measures each row when it is taken.

@@ -365,8 +365,7 @@ class CountedPredictions(Fields):
     correct: int = Field(description="right predictions")
     accuracy: float | None = Field(
         description="their share; where some share a [draw](drives.md), the mean over "
-        "draws of the share of each; null "
-        "where there is no configuration"
+        "draws of the share of each; null where there is no configuration"
     )
     interval: Interval | None = Field(
         description="of that share, 95 %; null where all are of one draw"
@@ -390,8 +389,7 @@ class ConditionRow(Fields):
     options: list[str] = Field(description="the names it is about; empty for numbers")
     turn: float | None = optional_field(
         "degrees after which values count as the same, 180 or 360; `over` may then be "
-        "over `at_most`: the "
-        "part goes through 0. Null for other parts"
+        "over `at_most`: the part goes through 0. Null for other parts"
     )
     text: str
 
@@ -425,9 +423,10 @@ class Extent(Fields):
             count: number of cases in which it happened.
             total: number of all cases.
             interval: interval of the share; None is the whole of [0, 1].
-            share: an estimate of the share, if it is not count over total.
+            share: an estimate of the share; it is left out if it is count over total.
         """
-        stated_share = share if total and share != count / total else None
+        is_known_from_counts = not total or share == count / total
+        stated_share = None if is_known_from_counts else share
         return cls(
             what=what,
             count=count,
@@ -580,8 +579,7 @@ class VisibleThing(Fields):
     pixels: int = Field(description="in which it is what is seen first")
     share: float | None = Field(
         description="of all that there would be of it if nothing stood before it and "
-        "the picture went on, 0 to 1; null "
-        "where it is not known"
+        "the picture went on, 0 to 1; null where it is not known"
     )
     truncated: bool | None = Field(
         description="whether it goes on beyond the picture; null where it is not known"
@@ -680,8 +678,7 @@ class VerifiedRate(Fields):
     )
     stopped: str | None = optional_field(
         "why there are no more: `asked for` (as many as were) or `decided` (the "
-        "verdict stands); absent of "
-        "trials that are no verdict"
+        "verdict stands); absent of trials that are no verdict"
     )
 
 

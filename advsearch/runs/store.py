@@ -82,17 +82,17 @@ class Row:
 
 @dataclass(frozen=True)
 class CachedEvaluation:
-    """What an evaluation told its search beside its row: the digest of the
-    configuration, how many numbers of the gradient were not finite, the cost in
-    evaluations, and, where it is kept, a gradient (d,) float32 and a picture (H, W, 3)
-    uint8. A policy's state follows from what it has been told, so a search goes on by
-    being told all of that again.
+    """What a search was told of an evaluation that its row does not have.
+
+    A policy's state follows from the evaluations that it was told of, so a search that
+    is resumed is told of all of them again.
     """
 
-    number: int
-    u: bytes
-    non_finite: int
-    cost: int
+    number: int  # index of the evaluation in the search
+    u: bytes  # digest of the configuration
+    non_finite: int  # numbers of the gradient that were not finite
+    cost: int  # in evaluations
+    # (d,) and (H, W, 3), if they are stored
     gradient: NDArray[np.float32] | None = None
     picture: NDArray[np.uint8] | None = None
 
@@ -109,9 +109,8 @@ _INSERT = (
 )
 
 _INSERT_CACHED = (
-    "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations "
-    "WHERE "
-    "kind = ? AND step = ?"
+    "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations WHERE kind = ? "
+    "AND step = ?"
 )
 
 
@@ -164,7 +163,7 @@ class Store:
 
         Args:
             rows: rows of evaluations.
-            cached: what the last of them told its search, beside the row.
+            cached: what the search was told of the last of them that no row has.
         """
         check_not_moved(self.path)
         start_time = time.monotonic()
@@ -183,11 +182,11 @@ class Store:
                     )
         if must_sync:
             end_time = time.monotonic()
-            # the wait before the next one, so that syncing takes SYNC_SHARE of the time
-            # at most
-            self._next_sync = end_time + max(
-                SYNC_INTERVAL, (end_time - start_time) / SYNC_SHARE
-            )
+            sync_seconds = end_time - start_time
+            # the next one only after so long that all take at most `SYNC_SHARE` of the
+            # time
+            wait_seconds = max(SYNC_INTERVAL, sync_seconds / SYNC_SHARE)
+            self._next_sync = end_time + wait_seconds
 
     def _select(self, query: str, *parameters: Any) -> Iterator[Any]:
         """Yield the rows of a query; an error of SQLite becomes one of ours.
@@ -231,8 +230,9 @@ class Store:
         )
 
     def read_cached(self, kind: str, step: int) -> tuple[Row, CachedEvaluation] | None:
-        """Return a row of a search with what it told the search beside it; None where
-        there is no such row, or the run is done and that was deleted.
+        """Return a row of a search with what the search was told of it that no row has.
+
+        None if there is no such row, or the run is done, when the rest is deleted.
         """
         row = self.read_row(kind, step)
         if row is None:
@@ -296,10 +296,9 @@ class Store:
         """Yield the steps from 0 to below `count` that have no row of a kind,
         neighbours as one range.
         """
-        expected = 0
-        for (step,) in self._select(
-            "step FROM evaluations WHERE kind = ? ORDER BY step", kind
-        ):
+        expected = 0  # the step after the row before
+        steps = self._select("step FROM evaluations WHERE kind = ? ORDER BY step", kind)
+        for (step,) in steps:
             if step > expected:
                 yield range(expected, min(step, count))
             expected = step + 1
@@ -395,20 +394,26 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     values = []
     for name in _ENCODED_FIELDS:
         value = getattr(row, name)
-        if name in _AS_JSON and value is not None:
-            is_empty_metrics = name == "metrics" and not value
-            try:
-                value = None if is_empty_metrics else _JSON.encode(value)
-            # numbers of numpy and NaN: they are turned into Python's and None first,
-            # which is slow, so only where it is needed
-            except (TypeError, ValueError):
-                value = _JSON.encode(to_json_value(value))
+        if name == "metrics" and not value:
+            value = None
+        elif name in _AS_JSON and value is not None:
+            value = _encode_json(value)
         else:
             is_finite_float = type(value) is float and math.isfinite(value)
             if type(value) not in _SIMPLE and not is_finite_float:
                 value = to_json_value(value)
         values.append(value)
     return (*values, stamp, row.id)
+
+
+def _encode_json(value: Any) -> str:
+    """Return a value as JSON."""
+    try:
+        return _JSON.encode(value)
+    # numbers of numpy and NaN: they are turned into Python's and None first, which is
+    # slow, so only where it is needed
+    except (TypeError, ValueError):
+        return _JSON.encode(to_json_value(value))
 
 
 _PYTHON_TYPES: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}
@@ -437,38 +442,47 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
         FileFormatError: a column has another type, or a number that no row has.
     """
     by_name = dict(zip(_FIELDS, values, strict=True))
-    wrong_columns = [
-        name
-        for name, value in by_name.items()
-        if not isinstance(value, _TYPES[name]) or value in _INFINITE
-    ]
-    if not wrong_columns and not 0 <= by_name["step"] <= MAX_STEP:
-        # an integer, but outside of what a step may be
-        wrong_columns = ["step"]
-    if not wrong_columns:
-        by_name["values"] = _parse_named(by_name["values"], _is_value)
-        by_name["metrics"] = (
-            {}
-            if by_name["metrics"] is None
-            else _parse_named(by_name["metrics"], _is_metric)
-        )
-        wrong_columns = [
-            f"{name}_json" for name in ("values", "metrics") if by_name[name] is None
-        ]
-    if not wrong_columns and by_name["payload"] is not None:
-        try:
-            by_name["payload"] = parse_json(by_name["payload"], finite=True)
-        except ValueError:
-            wrong_columns = ["payload_json"]
-    if wrong_columns:
+    wrong_column = _find_wrong_column(by_name) or _decode_json_columns(by_name)
+    if wrong_column is not None:
         raise FileFormatError(
             f"{path}: row {by_name['id']!r}: expected another type of "
-            f"{wrong_columns[0]}; {DAMAGED}"
+            f"{wrong_column}; {DAMAGED}"
         )
     # SQLite has no bool: it is 0 or 1
     for name in ("success", "correct"):
         by_name[name] = None if by_name[name] is None else bool(by_name[name])
     return Row(**by_name)
+
+
+def _find_wrong_column(by_name: Mapping[str, Any]) -> str | None:
+    """Return the first column whose value no row has, JSON apart; None if all fit."""
+    for name, value in by_name.items():
+        if not isinstance(value, _TYPES[name]) or value in _INFINITE:
+            return name
+    return None if 0 <= by_name["step"] <= MAX_STEP else "step"
+
+
+def _decode_json_columns(by_name: dict[str, Any]) -> str | None:
+    """Replace JSON texts by what they stand for.
+
+    Returns:
+        The first column whose JSON is not that of a row; None if all fit.
+    """
+    by_name["values"] = _parse_named(by_name["values"], _is_value)
+    if by_name["values"] is None:
+        return "values_json"
+    if by_name["metrics"] is None:
+        by_name["metrics"] = {}
+    else:
+        by_name["metrics"] = _parse_named(by_name["metrics"], _is_metric)
+    if by_name["metrics"] is None:
+        return "metrics_json"
+    if by_name["payload"] is not None:
+        try:
+            by_name["payload"] = parse_json(by_name["payload"], finite=True)
+        except ValueError:
+            return "payload_json"
+    return None
 
 
 def _decode_cached(values: tuple[Any, ...], path: Path) -> CachedEvaluation:

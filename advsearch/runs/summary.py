@@ -12,7 +12,7 @@ import json
 import os
 import platform
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from importlib import metadata
 from itertools import islice
@@ -146,18 +146,28 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
         raise FileFormatError(f"{expected} {str(error)[:120]}") from None
     if not data.startswith(MAGIC) or b"\n" not in data[: len(MAGIC) + MAX_HEADER_BYTES]:
         raise FileFormatError(f"{expected} something else, or the beginning of one")
-    # the header states the count d
+    u = _parse_array(data)
+    if u is None or not bool(((u >= 0.0) & (u <= 1.0)).all()):
+        raise FileFormatError(
+            f"{path}: expected numbers (d,) float32 in [0, 1], got something else"
+        )
+    return u
+
+
+def _parse_array(data: bytes) -> NDArray[np.float32] | None:
+    """Return the numbers (d,) in a file of numpy; None unless it is `HEADER` with
+    their count d, and four bytes for each.
+    """
     header = HEADER.match(data)
-    # four bytes for each float32 behind the header, and nothing more
-    if header is not None and len(data) == header.end() + 4 * int(header[1]):
-        u: NDArray[np.float32] = np.frombuffer(
-            data, np.float32, count=int(header[1]), offset=header.end()
-        ).copy()  # frombuffer is read-only
-        if bool(((u >= 0.0) & (u <= 1.0)).all()):
-            return u
-    raise FileFormatError(
-        f"{path}: expected numbers (d,) float32 in [0, 1], got something else"
-    )
+    if header is None:
+        return None
+    count = int(header[1])
+    if len(data) != header.end() + 4 * count:
+        return None
+    numbers: NDArray[np.float32] = np.frombuffer(
+        data, np.float32, count=count, offset=header.end()
+    ).copy()  # frombuffer is read-only
+    return numbers
 
 
 VERSIONS_NOTE = "made with"  # the note of versions and of digests of files
@@ -193,17 +203,15 @@ def collect_versions(settings: Mapping[str, object]) -> dict[str, str]:
 BUNDLED = {"objects": "object", "environments": "environment"}
 """Folders of `advsearch.bundled`, and what stands in them."""
 NAMES_BUNDLED = (
-    *(
-        "object",
-        "environment",
-        "things",
-        "held_out",
-        "held_out_environment",
-        "grid",
-        "controls",
-        "over",
-        "set",
-    ),
+    "object",
+    "environment",
+    "things",
+    "held_out",
+    "held_out_environment",
+    "grid",
+    "controls",
+    "over",
+    "set",
 )
 """Settings that name objects and environments."""
 
@@ -215,35 +223,39 @@ def compute_bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     The digest of a folder is that of a list of its files with their digests.
     """
     package = Path(__file__).parent.parent
-    names = {
-        name
-        for setting in NAMES_BUNDLED
-        for name in _find_bundled_names(settings.get(setting))
-    }
-    # a scene whose environment is not stated has the default one
-    if (
-        settings.get("object")
-        and "environment" in settings
-        and not settings["environment"]
-    ):
-        names.add(DEFAULT_ENVIRONMENT)
+    names = _list_bundled_names(settings)
     digests = dict[str, str]()
     for folder, kind in BUNDLED.items():
         for entry in sorted((package / "bundled" / "data" / folder).iterdir()):
             if entry.stem in names:
                 files = sorted(entry.iterdir()) if entry.is_dir() else [entry]
-                listing = "".join(
-                    f"{file.name} {_digest_file(file)}\n"
-                    for file in files
-                    if file.is_file()
-                )
-                digests[f"bundled {kind} {entry.stem}"] = hashlib.sha256(
-                    listing.encode()
-                ).hexdigest()
+                digests[f"bundled {kind} {entry.stem}"] = _digest_listing(files)
     weights = package / "models" / "data" / "reference.safetensors"
     if "reference" in _find_bundled_names(settings.get("model")) and weights.is_file():
         digests["bundled model reference"] = _digest_file(weights)
     return digests
+
+
+def _list_bundled_names(settings: Mapping[str, object]) -> set[str]:
+    """Return what may be names of bundled objects and environments in settings."""
+    names = {
+        name
+        for setting in NAMES_BUNDLED
+        for name in _find_bundled_names(settings.get(setting))
+    }
+    has_no_environment = "environment" in settings and not settings["environment"]
+    # a scene whose environment is not stated has the default one
+    if settings.get("object") and has_no_environment:
+        names.add(DEFAULT_ENVIRONMENT)
+    return names
+
+
+def _digest_listing(paths: Iterable[Path]) -> str:
+    """Return the SHA-256 of a list of the files among paths, with their digests."""
+    listing = "".join(
+        f"{path.name} {_digest_file(path)}\n" for path in paths if path.is_file()
+    )
+    return hashlib.sha256(listing.encode()).hexdigest()
 
 
 def _find_bundled_names(value: object) -> set[str]:
@@ -270,14 +282,15 @@ def find_changed_facts(
     of its path, since it may have been moved; where several had that name, one with the
     same value is enough.
     """
-    known: dict[str, list[object]] = {}
-    for name, value in before.items():
-        known.setdefault(Path(name).name, []).append(value)
-    return [
-        Path(name).name
-        for name, value in now.items()
-        if value not in known.get(Path(name).name, [value])
-    ]
+    values_before: dict[str, list[object]] = {}
+    for path, value in before.items():
+        values_before.setdefault(Path(path).name, []).append(value)
+    changed = []
+    for path, value in now.items():
+        name = Path(path).name
+        if name in values_before and value not in values_before[name]:
+            changed.append(name)
+    return changed
 
 
 def find_changed_file(
@@ -330,6 +343,7 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
         ValueError: it is no possible path.
     """
     absolute_path = os.path.abspath(path)
+    # the file itself and others, if this process has read it
     opened_files = list_opened_files(absolute_path)
     folder = ""
     if os.path.isabs(path):
@@ -364,9 +378,10 @@ def _digest_folder(folder: Path, pattern: str) -> str:
 def _find_paths(value: object) -> Iterator[str]:
     """Yield what may be the path of a file in a setting.
 
-    In ``a.pt2,reference@weights.safetensors``, ``scene.glb#NODE`` and
-    ``camera.csv+object.csv`` these are the parts, and each whole, since a path may have
-    these signs in it. Lists and mappings are searched for texts.
+    Names are separated by commas. Of ``reference@weights.safetensors``,
+    ``scene.glb#NODE`` and ``camera.csv+object.csv`` the parts are yielded that may be
+    paths, and the full text too, since a path may have these signs in it. Lists and
+    mappings are searched for texts.
     """
     if isinstance(value, (Mapping, list, tuple)):
         for inner in value.values() if isinstance(value, Mapping) else value:

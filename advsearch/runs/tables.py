@@ -5,7 +5,7 @@ thing that is known of it.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import islice
@@ -83,11 +83,13 @@ class Units:
         return self.find_cluster(step // self.models)
 
     def find_cluster(self, image_index: Number) -> Number:
-        """Return the number of the unit of a picture: its photograph, or its draw.
+        """Return the number of the unit of a picture: that of its photograph, or of its
+        draw where there is no folder of photographs.
 
         Args:
             image_index: number of the picture in the whole sweep, or an array of them.
         """
+        # the scenes, of `scene` pictures each, are in the photographs in turn
         if self.photographs > 1:
             return image_index // self.scene % self.photographs
         return self.find_draw(image_index)
@@ -227,14 +229,20 @@ def read_sweep(
     frame.attrs["unit name"] = PICTURE if units is None else units.name
     if units is not None:
         frame["unit"] = units.find_unit(frame["step"].to_numpy())
-    for name, ends in noted.items() if isinstance(noted, dict) else ():
-        if (
-            isinstance(ends, list)
-            and len(ends) > 1
-            and all(isinstance(end, (int, float)) for end in ends)
-        ):
-            frame.attrs["edges"][name] = list(map(float, ends))
+    frame.attrs["edges"] |= _parse_edges(noted)
     return frame
+
+
+def _parse_edges(noted: Any) -> dict[str, list[float]]:
+    """Return where the range of each parameter is cut, as a run has noted it; what has
+    another form is left out.
+    """
+    edges_by_name = {}
+    for name, edges in noted.items() if isinstance(noted, dict) else ():
+        is_list = isinstance(edges, list) and len(edges) > 1
+        if is_list and all(isinstance(edge, (int, float)) for edge in edges):
+            edges_by_name[name] = list(map(float, edges))
+    return edges_by_name
 
 
 def make_sweep_frame(
@@ -251,7 +259,6 @@ def make_sweep_frame(
     each, such as ``camera.target[0]``; ``attrs["units"]`` has the units.
     """
     units = dict[str, str]()
-    frames = list[pd.DataFrame]()
     cells = (
         {
             **_make_cells(row, number, units),
@@ -259,24 +266,14 @@ def make_sweep_frame(
         }
         for number, row in enumerate(rows, 1)
     )
+    frames = list[pd.DataFrame]()
     # in chunks, since a list of all cells would take far more memory than the frame
     while chunk := list(islice(cells, CHUNK_ROWS)):
-        chunk_frame = pd.DataFrame(chunk, dtype=object)
-        frames.append(
-            chunk_frame.astype(
-                {
-                    name: float
-                    for name in chunk_frame
-                    # columns with a text stay objects until all chunks are joined
-                    if not chunk_frame[name].map(type).eq(str).any()
-                }
-            )
-        )
-    frame = (
-        pd.concat(frames, ignore_index=True)
-        if frames
-        else pd.DataFrame(dict.fromkeys(FIXED_COLUMNS, np.zeros(0)))
-    )
+        frames.append(_make_chunk_frame(chunk))
+    if frames:
+        frame = pd.concat(frames, ignore_index=True)
+    else:
+        frame = pd.DataFrame(dict.fromkeys(FIXED_COLUMNS, np.zeros(0)))
     for name in frame.select_dtypes("object"):
         frame[name] = _to_categories(frame[name])
     frame = frame.astype({"id": np.int64, "step": np.int64})
@@ -285,12 +282,26 @@ def make_sweep_frame(
     return frame
 
 
+def _make_chunk_frame(cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return rows of cells as a frame whose columns without texts are float64.
+
+    Columns with a text stay objects: they become categories when all rows are joined.
+    """
+    frame = pd.DataFrame(cells, dtype=object)
+    number_columns = [name for name in frame if not frame[name].map(type).eq(str).any()]
+    return frame.astype(dict.fromkeys(number_columns, float))
+
+
 def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     """Return what is known of a row by column, and add the units of its parameters to
     `units`.
 
     `number` is the row's place from 1, which is its id where it has none.
     """
+    # a row that was judged without a label is one whose output is not a number
+    label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
+    outcome = get_outcome(row.payload)
+    # in the order of `FIXED_COLUMNS`
     fixed_values = (
         row.id or number,
         row.step,
@@ -298,16 +309,10 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
         row.margin,
         row.probability,
         row.seconds,
+        label,
+        "" if outcome is None else outcome.value,
     )
-    label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
-    outcome = get_outcome(row.payload)
-    cells: dict[str, Any] = dict(
-        zip(
-            FIXED_COLUMNS,
-            (*fixed_values, label, "" if outcome is None else outcome.value),
-            strict=True,
-        )
-    )
+    cells: dict[str, Any] = dict(zip(FIXED_COLUMNS, fixed_values, strict=True))
     for name, described in row.values.items():
         parameter_name = f"parameter {name}" if name in RESERVED_NAMES else name
         for column, value, unit in iterate_values({parameter_name: described}):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import logging
 import threading
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Full, Queue
@@ -55,12 +55,13 @@ class Tracker:
     nothing more after an error.
 
     Attributes:
-        _accuracy_counts: correct rows and all judged rows so far, by kind of row.
+        _n_correct: number of correct rows so far, by kind of row.
+        _n_judged: number of rows so far that are correct or not, by kind of row.
         _queue: metrics and step of each message; None ends the thread.
     """
 
     def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
-        """Start the thread that sends.
+        """Start the thread that sends rows to the tracker.
 
         Args:
             name: name of the tracker.
@@ -68,7 +69,8 @@ class Tracker:
             settings: settings of the run; each is cut to `MAX_TEXT_LENGTH` characters.
         """
         self._name = name
-        self._accuracy_counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
+        self._n_correct = Counter[str]()
+        self._n_judged = Counter[str]()
         self._queue: Queue[tuple[MetricValues, int] | None] = Queue(MAX_QUEUED)
         setting_texts = {
             key: str(value)[:MAX_TEXT_LENGTH]
@@ -86,6 +88,7 @@ class Tracker:
         for row in rows:
             kinds[row.kind].append(row)
         for kind, group in kinds.items():
+            self._count_correct(kind, group)
             self._put((self._compute_metrics(kind, group), group[-1].step))
 
     def close(self) -> None:
@@ -95,11 +98,15 @@ class Tracker:
         self._put(None)
         self._thread.join(MAX_CLOSE_SECONDS)
 
+    def _count_correct(self, kind: str, rows: Sequence[Row]) -> None:
+        """Add rows of a kind to the counts for the accuracy."""
+        is_correct = [row.correct for row in rows if row.correct is not None]
+        self._n_correct[kind] += sum(is_correct)
+        self._n_judged[kind] += len(is_correct)
+
     def _compute_metrics(self, kind: str, rows: Sequence[Row]) -> MetricValues:
         """Return the means over some rows of a kind, and the accuracy over all rows of
-        the kind so far.
-
-        Names begin with the kind. The counts for the accuracy are brought up to date.
+        the kind so far; names begin with the kind.
         """
         metrics = {}
         for name in METRICS:
@@ -107,13 +114,9 @@ class Tracker:
             values = [float(value) for value in stored_values if value is not None]
             if values:
                 metrics[f"{kind}/{name}"] = sum(values) / len(values)
-        is_right = [row.correct for row in rows if row.correct is not None]
-        # [right rows, judged rows] of the kind so far
-        counts = self._accuracy_counts[kind]
-        counts[0] += sum(is_right)
-        counts[1] += len(is_right)
-        if counts[1]:
-            metrics[f"{kind}/accuracy"] = counts[0] / counts[1]
+        if self._n_judged[kind]:
+            accuracy = self._n_correct[kind] / self._n_judged[kind]
+            metrics[f"{kind}/accuracy"] = accuracy
         return metrics
 
     def _put(self, message: tuple[MetricValues, int] | None) -> None:

@@ -356,17 +356,18 @@ class MapElites(Policy[ArchiveState]):
             )
         seed = policies.draw_seed(generator)
         measure_indices = self._find_measure_indices(domain)
-        # number of cells along each axis
-        dims = [
-            n_options or self.cells  # 0 options: a number, whose range is divided
+        # the range of a number, which has 0 options, is divided into `cells`
+        cells_of_axes = [
+            n_options or self.cells
             for n_options in domain.options[measure_indices].tolist()
         ]
-        if math.prod(dims) > MAX_CELLS:
+        n_cells = math.prod(cells_of_axes)
+        if n_cells > MAX_CELLS:
             raise InputError(
                 f"cells: expected at most {MAX_CELLS} in all, got "
-                f"{math.prod(dims)}; set `cells` lower"
+                f"{n_cells}; set `cells` lower"
             )
-        archive = _make_archive(domain, measure_indices, dims, seed)
+        archive = _make_archive(domain, measure_indices, cells_of_axes, seed)
         first_points = [
             domain.initial_point[None],
             domain.sample(policies.seeded(seed, 0), self.population - 1),
@@ -411,35 +412,35 @@ class MapElites(Policy[ArchiveState]):
     def failures(self, state: ArchiveState) -> policies.Failures:
         """Return the cells whose configuration is a failure of the model.
 
-        A generation that is not complete yet counts. Of the cells a diverse selection
-        is returned as examples, and how many there are of how many that are filled.
+        They are counted, and so are the cells that are filled; a diverse selection is
+        returned as examples. A generation that is not complete yet counts.
         """
         archive = state.add_generation().archive
         measure_indices = tuple(state.measure_indices.tolist())
         elites = archive.data()
-        wrong = np.flatnonzero(elites["wrong"])
-        grid_indices = archive.int_to_grid_index(elites["index"][wrong])
-        objectives = elites["objective"][wrong].tolist()
+        failed_rows = np.flatnonzero(elites["wrong"])
+        grid_indices = archive.int_to_grid_index(elites["index"][failed_rows])
+        objectives = elites["objective"][failed_rows].tolist()
         is_periodic = policies.find_periodic(state.domain)[state.measure_indices]
-        is_discrete = state.domain.options[state.measure_indices] > 0
+        is_choice = state.domain.options[state.measure_indices] > 0
         diverse_indices = policies.select_diverse(
             # position of each cell in the grid, in fractions of each axis
             torch.from_numpy(grid_indices / archive.dims),
             objectives,
             is_periodic,
-            is_discrete,
+            is_choice,
         )
         examples = []
         for index in diverse_indices:
             ranges = _find_cell_ranges(
                 measure_indices, archive.boundaries, grid_indices[index]
             )
-            u = torch.from_numpy(elites["solution"][wrong[index]].copy())
+            u = torch.from_numpy(elites["solution"][failed_rows[index]].copy())
             examples.append(policies.FoundFailure(u, objectives[index], ranges))
         return policies.Failures(
             tuple(examples),
             over=measure_indices,
-            n_failures=len(wrong),
+            n_failures=len(failed_rows),
             n_visited=len(elites["objective"]),
             n_cells=int(archive.cells),
         )
@@ -455,8 +456,9 @@ class MapElites(Policy[ArchiveState]):
         rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:  # nothing could be evaluated so far
             return replace(state, points=domain.sample(rng, self.population))
-        is_resampled = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
-        n_new = int(is_resampled.sum())
+        # each configuration is sampled with this probability; only their number counts
+        is_sampled = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
+        n_new = int(is_sampled.sum())
         samples = domain.sample(rng, self.population)
         observations = state.observations
         if observations is None:

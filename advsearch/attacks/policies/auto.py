@@ -109,7 +109,8 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
     """
     if box.count == 0:
         return BudgetPlan(steps, screen=0, ascent_start=0, gradient=True)
-    if box.count < domain.dim:
+    has_norm_balls = box.count < domain.dim
+    if has_norm_balls:
         has_free_part = domain.gradient_cost and domain.partial_gradients
         return BudgetPlan(
             steps,
@@ -117,25 +118,36 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
             ascent_start=math.ceil(ASCENT_START_MIXED * steps),
             gradient="free" if has_free_part else True,
         )
-    n_continuous = int((box.options == 0).sum())  # choices have no derivative
-    # of many numbers a screen sees little: it is shorter, and the ascent follows at once
-    shortening = min(1.0, LOW_DIM / max(n_continuous, 1))
+    plan = _plan_box_ascent(box, steps)
+    n_numbers = _count_numbers(box)
+    cost = domain.gradient_cost
+    is_worth_renders = MIN_DERIVATIVES_PER_RENDER * cost <= n_numbers
+    renders_left = steps - plan.ascent_start
+    fits = MIN_DERIVATIVES_PER_RENDER * (1 + cost) <= renders_left
+    if n_numbers and is_worth_renders and fits:
+        return plan
+    # the ascent never begins, and the screen needn't be short
+    screen = math.ceil(SCREEN_FRACTION * steps)
+    return replace(plan, screen=screen, ascent_start=steps)
+
+
+def _count_numbers(box: BoxCoordinates) -> int:
+    """Return the number of box coordinates that have a derivative: no choices."""
+    return int((box.options == 0).sum())
+
+
+def _plan_box_ascent(box: BoxCoordinates, steps: int) -> BudgetPlan:
+    """Divide renders in a domain of box coordinates alone, with an ascent.
+
+    Of many numbers a screen sees little: it is shorter, and the ascent follows at once.
+    """
+    n_numbers = _count_numbers(box)
+    shortening = min(1.0, LOW_DIM / max(n_numbers, 1))
     screen = math.ceil(SCREEN_FRACTION * steps * shortening)
     ascent_start = screen
-    if n_continuous <= LOW_DIM:
+    if n_numbers <= LOW_DIM:
         ascent_start = math.ceil(ASCENT_START * steps)
-    cost = domain.gradient_cost
-    is_worth_renders = MIN_DERIVATIVES_PER_RENDER * cost <= n_continuous
-    fits = MIN_DERIVATIVES_PER_RENDER * (1 + cost) <= steps - ascent_start
-    if n_continuous and is_worth_renders and fits:
-        return BudgetPlan(steps, screen, ascent_start, gradient=True)
-    # no ascent, so that the screen needn't be short
-    return BudgetPlan(
-        steps,
-        screen=math.ceil(SCREEN_FRACTION * steps),
-        ascent_start=steps,
-        gradient=True,
-    )
+    return BudgetPlan(steps, screen, ascent_start, gradient=True)
 
 
 def _make_pgd(domain: Domain) -> PGD:
@@ -238,7 +250,7 @@ class Auto(Policy[AutoState]):
             )
         seed = draw_seed(generator)
         with limit_to_single_thread():
-            # the initial point comes first
+            # one render less: that of the initial point, which comes first
             screen = box.sample_screen(seed, max(0, plan.screen - 1))
         return AutoState(domain, observations, plan, seed, screen)
 
@@ -311,23 +323,31 @@ class Auto(Policy[AutoState]):
         return (replace(proposal, u=u),), replace(state, box_before_trial=x)
 
     def update(self, state: AutoState, evaluated: Evaluated) -> AutoState:
-        """Pass evaluations to the ascent, or add them to the observations.
-
-        A random move of the box coordinates is taken back if the objective fell.
-        """
+        """Pass evaluations to the ascent, or add them to the observations."""
         cost = sum(evaluation.cost for _, evaluation in evaluated)
         state = replace(state, renders_spent=state.renders_spent + cost)
         if state.is_climbing and state.ascent is not None:
-            ((_, evaluation),) = evaluated  # an ascent proposes one at a time
-            ascent = _make_pgd(state.domain).update(state.ascent, evaluated)
-            has_fallen = evaluation.objective < state.latest_objective
-            if state.box_before_trial is not None and has_fallen:
-                u = state.domain.project(
-                    state.box.to_configuration(ascent.u, state.box_before_trial)
-                )
-                ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
-            return replace(state, ascent=ascent, latest_objective=evaluation.objective)
+            return self._update_ascent(state, state.ascent, evaluated)
         return replace(state, observations=state.observations.extend(evaluated))
+
+    @staticmethod
+    def _update_ascent(
+        state: AutoState, ascent: Ascent, evaluated: Evaluated
+    ) -> AutoState:
+        """Pass the evaluation of a step to the ascent.
+
+        If the step also moved the box coordinates at random, and the objective fell,
+        that move is taken back.
+        """
+        ((_, evaluation),) = evaluated  # an ascent proposes one at a time
+        ascent = _make_pgd(state.domain).update(ascent, evaluated)
+        has_fallen = evaluation.objective < state.latest_objective
+        if state.box_before_trial is not None and has_fallen:
+            u = state.domain.project(
+                state.box.to_configuration(ascent.u, state.box_before_trial)
+            )
+            ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
+        return replace(state, ascent=ascent, latest_objective=evaluation.objective)
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
         """See `Policy.takes_differences`: only an ascent with full gradients does."""
@@ -362,6 +382,7 @@ class Auto(Policy[AutoState]):
         objective is finite. Norm balls begin at their start. In box coordinates steps
         are smaller than usual (`ASCENT_REACH`), as the screen has been everywhere else.
         """
+        # (k,) box coordinates of the best point
         x = state.box.from_configuration(state.domain.initial_point)
         if state.observations.has_finite:
             surrogate, observations = state.observations.fit_surrogate()
@@ -375,7 +396,7 @@ class Auto(Policy[AutoState]):
         domain = replace(state.domain, blocks=tuple(ascent_blocks))
         renders_left = max(1, state.plan.steps - state.renders_spent)
         ascent = _make_pgd(domain).start(domain, seeded(state.seed, 0), renders_left)
-        # PGD starts at the initial point of the domain; it is put to the best one
+        # PGD starts at the initial point of the domain: it is moved to the best one
         return replace(state, ascent=replace(ascent, u=state.to_configuration(x)))
 
 
@@ -389,7 +410,7 @@ def _sample_candidates(surrogate: Surrogate, generator: torch.Generator) -> Tens
     known_mean, _ = surrogate.predict(surrogate.x)
     ranked_points = surrogate.x[known_mean.argsort(descending=True, stable=True)]
     n_centers = min(N_CENTERS, len(ranked_points))
-    # half of the moves start at the best point, half at any of the centers
+    # for each move, the rank of the point that is moved: 0, the best, in the first half
     center_rank = torch.randint(0, n_centers, (N_NEAR_CANDIDATES,), generator=generator)
     center_rank[: N_NEAR_CANDIDATES // 2] = 0
     near_candidates = box.sample_moves(ranked_points[center_rank], generator)

@@ -39,7 +39,7 @@ class Runner:
         policy: policy that searches.
         domain: domain that it searches.
         state: state of the policy.
-        renders_left: renders left that it may still use in this round.
+        renders_left: renders that it may still use in this round.
         best_objective: the largest so far.
         is_over: whether it has nothing more to propose.
     """
@@ -50,6 +50,11 @@ class Runner:
     renders_left: int = 0
     best_objective: float = -math.inf
     is_over: bool = False
+
+    def charge(self, proposal: Proposal) -> Runner:
+        """Return the search after it has paid for one of its proposals."""
+        cost = proposal.max_cost(self.domain)
+        return replace(self, renders_left=self.renders_left - cost)
 
 
 Racing = TypeVar("Racing", bound="Race")
@@ -111,13 +116,12 @@ class Race:
         There are none if the round is over. The search with the most renders left comes
         first, of equals the first. Each is asked once for proposals, its part of n. The
         batch ends with the first search whose proposals are used up, since what comes
-        after depends on their evaluations. A search of which not all proposals were
-        used is asked again for just those, so that its state counts on no others.
+        after depends on their evaluations.
         """
         runners = list(self.runners)
         waiting = self._find_waiting(runners)
-        proposals_each = math.ceil(n / max(1, len(waiting)))
-        proposals = dict[int, tuple[Proposal, ...]]()  # by index of their runner
+        max_proposals = math.ceil(n / max(1, len(waiting)))  # of each search
+        proposals = dict[int, tuple[Proposal, ...]]()  # by index of the search
         n_used = Counter[int]()  # likewise
         batch = list[Proposal]()
         runner_of_proposal = list[int]()
@@ -126,7 +130,7 @@ class Race:
             proposer = runners[k]
             if k not in proposals:
                 proposals[k], state = proposer.policy.propose(
-                    proposer.state, min(proposals_each, proposer.renders_left)
+                    proposer.state, min(max_proposals, proposer.renders_left)
                 )
                 # put into `runners` only if one of its proposals is used
                 proposer = replace(proposer, state=state)
@@ -139,11 +143,10 @@ class Race:
                 batch.append(proposal)
                 runner_of_proposal.append(k)
                 n_used[k] += 1
-                cost = proposal.max_cost(proposer.domain)
-                runners[k] = replace(
-                    proposer, renders_left=proposer.renders_left - cost
-                )
+                runners[k] = proposer.charge(proposal)
             waiting = self._find_waiting(runners)
+        # a search whose proposals were not all used is asked again for just those that
+        # were, so that its state counts on no others
         for k, count in n_used.items():
             if count < len(proposals[k]):
                 state = self._propose_again(k, count)
@@ -181,9 +184,9 @@ class Race:
         proposal = replace(proposal, samples=min(runner.renders_left, proposal.samples))
         renders_left = runner.renders_left
         has_later_round = self.round + 1 < self.n_rounds
+        # `limit_cost` drops the gradient of the last evaluation, as no step follows it.
+        # With a later round a step follows: its first render counts as left.
         if has_later_round:
-            # Without a render that follows, `limit_cost` drops the gradient. There is
-            # one: the first of the later round.
             renders_left += 1
         return proposal.limit_cost(runner.domain, renders_left)
 
@@ -330,6 +333,7 @@ class RacingPolicy(Policy[Racing]):
 # configurations together, of which each search stores several; two always may
 MAX_COMBINATIONS = 256
 MAX_NUMBERS = 2**24
+MIN_LISTED_COMBINATIONS = 1024  # so many are always listed, and not sampled
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -393,9 +397,9 @@ class Choices(RacingPolicy[ChoicesState]):
         that is dropped afterwards (`ChoicesState.join_choices`).
         """
         seed = draw_seed(generator)
-        options = domain.options
-        numbers = (options == 0).nonzero().flatten()
-        choices = options.nonzero().flatten()
+        is_choice = domain.options > 0  # a number has 0 options
+        numbers = (~is_choice).nonzero().flatten()
+        choices = is_choice.nonzero().flatten()
         policy: Policy[Any]
         if len(numbers):
             policy = self.policy
@@ -404,14 +408,14 @@ class Choices(RacingPolicy[ChoicesState]):
             policy = Random()
             inner_domain = Domain(torch.zeros(1), (Block(1),))
         combinations = _select_combinations(
-            options[choices].tolist(),
+            domain.options[choices].tolist(),
             domain.initial_point[choices],
             _count_runners(domain, policy, steps),
             seeded(seed, 0),
         )
         race = start_race([(policy, inner_domain)] * len(combinations), steps, seed)
         return ChoicesState(
-            **vars(race),
+            **vars(race),  # the fields of the race itself
             domain=domain,
             numbers=numbers,
             choices=choices,
@@ -432,7 +436,9 @@ class Choices(RacingPolicy[ChoicesState]):
         return joined, state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
-        """Update each search with its evaluations, without their discrete choices."""
+        """Update each search with its evaluations, whose configurations and gradients
+        are reduced to the numbers: the inner searches know no choices.
+        """
         inner_evaluated = []
         numbers = state.numbers
         for u, evaluation in evaluated:
@@ -510,7 +516,9 @@ def _select_combinations(
     sizes = torch.tensor(n_options)
     # index of the option of each choice; u = 1 belongs to the last
     initial = torch.floor(initial_point * sizes).long().clamp(max=sizes - 1)
-    if math.prod(n_options) <= max(1024, 4 * max_combinations):
+    # far more combinations are sampled until enough of them are different
+    max_listed = max(MIN_LISTED_COMBINATIONS, 4 * max_combinations)
+    if math.prod(n_options) <= max_listed:
         combinations = _shuffle_combinations(n_options, generator)
         is_initial = (combinations == initial).all(dim=1)
         selected = combinations[~is_initial][: max_combinations - 1]

@@ -69,7 +69,7 @@ def utilities(values: Sequence[float]) -> list[float]:
     descending = sorted(values, reverse=True)
     weight_of_value = {}
     for value in set(values):
-        first = descending.index(value)  # the first of its ranks, from 0
+        first = descending.index(value)  # index of the first of its ranks
         count = descending.count(value)
         mean_weight = math.fsum(rank_weights[first : first + count]) / count
         weight_of_value[value] = mean_weight / total - 1.0 / n
@@ -177,15 +177,16 @@ class NES(Policy[NESState]):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> NESState:
         """Start at the domain's initial point, with `sigma` of each half range."""
-        default = 4 + int(3 * math.log(domain.dim))
-        default += default % 2  # even, for pairs
+        # the default of CMA-ES (Hansen 2016), made even for pairs
+        default_population = 4 + int(3 * math.log(domain.dim))
+        default_population += default_population % 2
         return NESState(
             domain,
             draw_seed(generator),
             compute_half_widths(domain),
             mean=domain.initial_point,
             deviation=torch.full_like(domain.start, self.sigma),
-            population=self.population or default,
+            population=self.population or default_population,
         )
 
     def propose(self, state: NESState, n: int) -> tuple[tuple[Proposal, ...], NESState]:
@@ -329,9 +330,9 @@ class CMAESState:
         """Return the state with a copy of the strategy that has learnt the objectives
         of a complete generation.
 
-        What could not be evaluated counts as worse than the worst, by the distance of
-        the quartiles. Points outside the domain, whose projections were evaluated, are
-        penalised by their distance from it.
+        A point that could not be evaluated counts as worse than the worst, by the
+        distance between the quartiles. Points outside the domain, whose projections
+        were evaluated, are penalised by their distance from it.
         """
         values = np.array(self.values)
         spread = 0.0
@@ -343,8 +344,9 @@ class CMAESState:
         else:  # all equal: nothing is learnt
             values[:] = 0.0
         strategy = copy.deepcopy(self.strategy)
-        # in units of the step size, and worth as much as the objectives differ
-        penalty = spread * np.array(self.violations) / max(strategy.sigma, 1e-30) ** 2
+        # at a distance of one step, a penalty is worth as much as objectives differ
+        step_size = max(strategy.sigma, 1e-30)  # not 0
+        penalty = spread * np.array(self.violations) / step_size**2
         with _isolate_numpy_random(self.seed, self.generation):
             # pycma minimises
             strategy.tell(list(self.points), list(penalty - values))
@@ -459,6 +461,7 @@ class CMAES(Policy[CMAESState]):
         has_converged = float(state.stds.max()) <= MIN_STEP_SIZE
         if not has_converged:
             return state.ask()
+        # of the best run so far: its best objective and its distribution
         best_run = state.best_run
         if best_run is None or state.best > best_run[0]:
             best_run = (state.best, state.distribution)

@@ -11,10 +11,9 @@ from torch import Tensor
 
 from advsearch.extend import InputError, Policy, policies
 
-MAX_DIM = (
-    50  # more numbers are refused: there would never be enough draws to learn from
-)
-WINDOW = 1000
+# more numbers are rejected: there would never be enough samples to learn from
+MAX_DIM = 50
+WINDOW = 1000  # latest samples that a mixture is fitted to
 ELITE_FRACTION = 0.1
 MIN_ELITE = 10
 """A mixture is fitted to the samples that failed. If fewer than `MIN_ELITE` did, the
@@ -30,6 +29,9 @@ it counts as much as `PRIOR_COUNT` samples of a component, so that an element th
 not matter stays wide.
 """
 
+UNIFORM_WEIGHT = 0.25  # part of the weights of components that is uniform
+# standard deviation of a component before the first round of its fit
+INITIAL_STD = 0.5 * UNIFORM_STD
 # limits of the standard deviation of a number, as fractions of its range
 MIN_STD = 0.02
 MAX_STD = 10.0
@@ -160,7 +162,8 @@ class Components:
         cdf = torch.lerp(lower_cdf, upper_cdf, uniform)
         x = mean + std * torch.special.ndtri(cdf)
         wrapped = torch.remainder(x, 1.0)
-        # The inverse is infinite at 0 and 1, and NaN where rounding goes beyond them.
+        # The inverse is infinite at 0 and 1, and NaN where rounding goes beyond them:
+        # then the center of the range is taken.
         clipped = x.nan_to_num(0.5).clamp(0.0, 1.0)
         x = torch.where(ranges.is_periodic, wrapped, clipped)
         option = torch.multinomial(self.option_probs[k], 1, generator=generator)[:, 0]
@@ -172,8 +175,8 @@ class Components:
     ) -> Components:
         """Return the components after one step of expectation and maximisation.
 
-        A quarter of the new weights of the components is uniform, so that none dies
-        out.
+        A part of the new weights of the components, `UNIFORM_WEIGHT`, is uniform, so
+        that none dies out.
 
         Args:
             x: (n, d) samples, in fractions of each range.
@@ -199,7 +202,8 @@ class Components:
             sample_weights, option, counts, uniform_probs
         )
         fraction = counts / counts.sum()
-        new_weights = 0.75 * fraction + 0.25 / len(fraction)
+        new_weights = (1.0 - UNIFORM_WEIGHT) * fraction
+        new_weights += UNIFORM_WEIGHT / len(fraction)
         return Components(new_weights, means, stds, option_probs)
 
     def _divide_out_prior(
@@ -440,7 +444,7 @@ class Mixture(Policy[MixtureState]):
         mixture = state.mixtures[-1]
         with policies.limit_to_single_thread():
             weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
-        # The density of a generation is `even` at least.
+        # The density is `even` at least, by the uniform samples of the generation.
         max_weight = 1.0 if mixture is None else 1.0 / self.even
         # in the order of the columns of `log`
         rows = [
@@ -459,7 +463,8 @@ class Mixture(Policy[MixtureState]):
             evaluated_points=torch.cat([state.evaluated_points, points]),
             n_evaluated=state.n_evaluated + len(evaluated),
         )
-        if state.n_evaluated < self.population:
+        is_complete = state.n_evaluated >= self.population
+        if not is_complete:
             return state
         return self._begin_generation(state, self._fit(state))
 
@@ -490,10 +495,11 @@ class Mixture(Policy[MixtureState]):
         )
 
     def _list_examples(self, state: MixtureState) -> tuple[policies.FoundFailure, ...]:
-        """Return the worst failure in the window (the latest samples) of each component
-        of the mixture that has some, the components of most weight first.
+        """Return the worst failure of each component of the mixture, the components of
+        most weight first; a component without a failure has none.
 
-        Before the first mixture, it is the worst failure of all.
+        Only the latest samples count, those in the window. Before the first mixture,
+        all samples belong to one component.
         """
         log = state.log[-len(state.evaluated_points) :]
         mixture = state.mixtures[-1]
@@ -503,17 +509,11 @@ class Mixture(Policy[MixtureState]):
         if not len(points):
             return ()
         component_of_point = torch.zeros(len(points))
-        components = [0]
         if mixture is not None:
-            weights = mixture.weights
-            component_of_point = mixture.compute_log_densities(
-                points, state.ranges
-            ).argmax(dim=1)
-            components = sorted(
-                set(component_of_point.tolist()), key=lambda k: -float(weights[k])
-            )
+            log_densities = mixture.compute_log_densities(points, state.ranges)
+            component_of_point = log_densities.argmax(dim=1)
         examples = []
-        for k in components:
+        for k in self._rank_components(mixture, component_of_point):
             members = (component_of_point == k).nonzero().flatten()
             worst = int(members[objectives[members].argmax()])
             u = state.to_configuration(points[worst])
@@ -523,6 +523,18 @@ class Mixture(Policy[MixtureState]):
             examples.append(policies.FoundFailure(u, float(objectives[worst]), ranges))
         return tuple(examples)
 
+    @staticmethod
+    def _rank_components(
+        mixture: Components | None, component_of_point: Tensor
+    ) -> list[int]:
+        """Return the components that have points, those of most weight first."""
+        if mixture is None:
+            return [0]
+        weights = mixture.weights
+        return sorted(
+            set(component_of_point.tolist()), key=lambda k: -float(weights[k])
+        )
+
     def _begin_generation(
         self, state: MixtureState, mixture: Components | None
     ) -> MixtureState:
@@ -531,21 +543,21 @@ class Mixture(Policy[MixtureState]):
         Each is uniform with probability `even`; without a mixture all are. Mixtures and
         points that leave the window, the latest `WINDOW` samples, are dropped.
         """
-        number = state.generation + 1
-        rng = policies.seeded(state.seed, number)
+        generation = state.generation + 1
+        rng = policies.seeded(state.seed, generation)
         points = self._sample_uniform(state.ranges, rng)
         if mixture is not None:
             for row in range(self.population):
                 stays_uniform = float(torch.rand(1, generator=rng)) < self.even
                 if not stays_uniform:
                     points[row] = mixture.sample(rng, state.ranges)
-        # whole generations, at least one; and the one that begins here
+        # The window has whole generations: at least one, and the one that begins here.
         n_past_generations = max(1, WINDOW // self.population)
         window = n_past_generations * self.population
         n_generations = n_past_generations + 1
         return replace(
             state,
-            generation=number,
+            generation=generation,
             points=points,
             mixtures=(*state.mixtures, mixture)[-n_generations:],
             evaluated_points=state.evaluated_points[-window:],
@@ -594,7 +606,8 @@ class Mixture(Policy[MixtureState]):
                 self._density(mixture, points, ranges) for mixture in state.mixtures
             ]
             weights = 1.0 / torch.stack(densities).mean(dim=0)
-            # Their sum becomes the effective sample size, which the prior is set against.
+            # Their sum becomes the effective sample size (sum w)^2 / sum w^2, which the
+            # prior, of `PRIOR_COUNT` samples, is set against.
             weights *= weights.sum() / weights.square().sum()
             center_index = policies.select_diverse(
                 points,
@@ -603,19 +616,23 @@ class Mixture(Policy[MixtureState]):
                 ranges.n_options > 0,
                 limit=self.components,
             )
-            means = points[center_index]
-            uniform_probs = self._make_uniform_option_probs(len(means), ranges)
-            mixture = Components(
-                weights=torch.full(
-                    (len(means),), 1.0 / len(means), dtype=torch.float64
-                ),
-                means=means,
-                stds=torch.full_like(means, 0.5 * UNIFORM_STD),
-                option_probs=uniform_probs,
-            )
+            mixture = self._make_initial_components(points[center_index], ranges)
+            uniform_probs = mixture.option_probs
             for _ in range(N_FIT_ROUNDS):
                 mixture = mixture.maximize(points, weights, ranges, uniform_probs)
         return mixture
+
+    def _make_initial_components(self, centers: Tensor, ranges: Ranges) -> Components:
+        """Return wide components of equal weight around centers (k, d)."""
+        n_components = len(centers)
+        return Components(
+            weights=torch.full(
+                (n_components,), 1.0 / n_components, dtype=torch.float64
+            ),
+            means=centers,
+            stds=torch.full_like(centers, INITIAL_STD),
+            option_probs=self._make_uniform_option_probs(n_components, ranges),
+        )
 
     @staticmethod
     def _find_elite(log: Tensor) -> Tensor:

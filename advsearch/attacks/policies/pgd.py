@@ -58,6 +58,7 @@ def clip_gradient(
         The clipped gradient; the lengths with this one's, before it was scaled down;
         and the counts of outliers.
     """
+    # Without noise of the renders, what is large is so for a reason.
     if domain.exact or domain.draws_conditions:
         return gradient, lengths, NO_COUNTS
     clipped_gradient = gradient.clone()
@@ -69,7 +70,7 @@ def clip_gradient(
             clipped_gradient[part] = clipped_gradient[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(clipped_gradient))
     lengths = (*lengths, length)[-MEMORY:]
-    # the upper one of an even number
+    # of an even number, the larger of the two in the middle
     median_length = sorted(lengths)[len(lengths) // 2]
     max_length = CLIP * median_length
     is_too_long = length > max_length > 0.0
@@ -449,10 +450,11 @@ class PGD(AscentPolicy):
         return replace(state, direction=direction)
 
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
-        """Take a step from u; at the end of a window the step size may be halved
-        before.
+        """Take a step from u, whose objective was evaluated.
 
-        Where each evaluation has other conditions, there are no windows.
+        Steps come in windows, after each of which the step size may be halved; where
+        each evaluation has other conditions, objectives can't be compared, and there
+        are no windows.
         """
         if math.isnan(state.start_objective):
             state = replace(state, start_objective=objective)

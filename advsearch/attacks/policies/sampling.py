@@ -120,14 +120,14 @@ class Sobol(NonAdaptivePolicy):
         if size > MAX_SOBOL_DIM:
             raise InputError(
                 f"policy 'sobol': expected at most {MAX_SOBOL_DIM} dimensions, got "
-                f"{size}; use "
-                "policy random, nes, pgd or auto"
+                f"{size}; use policy random, nes, pgd or auto"
             )
         seed = draw_seed(generator)
-        max_points = max(1, MAX_CHUNK_NUMBERS // size)  # of a chunk
+        max_points = max(1, MAX_CHUNK_NUMBERS // size)
+        n_points = min(steps, max_points)
         # rounded up to a power of two, as Sobol points are balanced in such numbers
-        count = 2 ** max(0, min(steps - 1, max_points - 1).bit_length())
-        points = sample_sobol_points(size, seed, begin=0, count=count)
+        chunk_size = 2 ** max(0, (n_points - 1).bit_length())
+        points = sample_sobol_points(size, seed, begin=0, count=chunk_size)
         return PointsState(domain, seed, points)
 
     def propose(
@@ -250,7 +250,8 @@ def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
     for block, count, low, high in zip(
         _list_blocks(domain), counts, lower.tolist(), upper.tolist(), strict=True
     ):
-        if block.options:
+        is_choice = block.options > 0
+        if is_choice:  # the center of each option's part of [0, 1]
             axes.append((torch.arange(count) + 0.5) / count)
         elif block.periodic:  # the upper bound is the lower one, and comes once
             axes.append(low + (high - low) * torch.arange(count) / count)
@@ -296,7 +297,7 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
     Raises:
         InputError: the grid does not fit into the renders.
     """
-    options = domain.options.tolist()
+    options = domain.options.tolist()  # 0 for a number
     n_numbers = options.count(0)
     n_combinations = math.prod(count for count in options if count)
     min_values = points or 2
@@ -311,12 +312,11 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
             renders_text = "billions of"
         raise InputError(
             f"policy 'grid': {min_values} values for each of {n_numbers} "
-            f"numbers{combinations_text} are {renders_text} renders, and "
-            f"there are {steps}; use policy sobol, cmaes, nes, pgd or auto, or give "
-            "more `steps`"
+            f"numbers{combinations_text} are {renders_text} renders, and there are "
+            f"{steps}; use policy sobol, cmaes, nes, pgd or auto, or give more `steps`"
         )
     if points:
-        return [count or points for count in options]
+        return [n_options or points for n_options in options]
     return _fill_budget(options, steps)
 
 

@@ -219,8 +219,8 @@ class Surrogate:
         # (m, n) correlations of the new points with the known ones
         cross = kernel(self.box.embed(x, lengths), self.box.embed(self.x, lengths))
         solved = torch.linalg.solve_triangular(self.factor, cross.mT, upper=False)
-        # not below 0 by rounding, where a point is known
-        # fraction of the signal's variance that the known points leave
+        # fraction of the signal's variance that the known points leave; over 0, also at
+        # a known point
         unexplained = (1.0 - solved.square().sum(dim=0)).clamp_(min=1e-12)
         return self.mean + cross @ self.weights, (self.variance * unexplained).sqrt_()
 
@@ -267,17 +267,18 @@ class Observations:
         many points the best and the latest are used. The scales are fitted again only
         after `REFIT_INTERVAL` new points, or a tenth of all if that is more.
         """
-        n = len(self.values)
+        n_points = len(self.values)
         values = torch.tensor(self.values, dtype=torch.float64)
         is_finite = torch.isfinite(values)
         values = torch.where(is_finite, values, values[is_finite].min())
         scales = self.scales
         n_fitted = self.n_fitted
         refit_interval = max(REFIT_INTERVAL, n_fitted // 10)
-        if scales is None or n - n_fitted >= refit_interval:
-            used = _select_best_and_latest(values, MEMORY)
-            scales = _find_best_scales(self.box, self.points[used], values[used])
-            n_fitted = n
+        if scales is None or n_points - n_fitted >= refit_interval:
+            # from `MEMORY` points of each kind, however many the process uses
+            fitted = _select_best_and_latest(values, MEMORY)
+            scales = _find_best_scales(self.box, self.points[fitted], values[fitted])
+            n_fitted = n_points
         used = _select_best_and_latest(values, self.memory)
         surrogate = fit(self.box, self.points[used], values[used], scales)
         return surrogate, replace(self, scales=scales, n_fitted=n_fitted)

@@ -35,6 +35,9 @@ MAX_NOISE = (
 # seeds
 MAX_REFERENCE_ERROR = 0.02
 N_STANDARD_ERRORS = 2.5  # standard errors within which two means agree
+# coordinates of a group up to which its planned step is also one along all of them at
+# once
+MAX_COMMON_STEP_SIZE = 64
 # waves of a smooth loss, and how many of them fit into the image at most
 N_WAVES = 6
 MAX_FREQUENCY = 1.2
@@ -143,6 +146,7 @@ def _rate_estimate(
         doubt: difference of both values that may be due to their noise.
     """
     difference = abs(estimate.value - reference.value)
+    # only where the reference's noise may be the reason of the difference
     if difference <= doubt and reference.noise > MAX_NOISE * size:
         return "reference unusable"
     if difference > MAX_BIAS * size + doubt:
@@ -178,14 +182,6 @@ def compare_with_reference(
     difference = abs(estimate.value - reference.value)
     estimate_error = estimate.noise / math.sqrt(max(1, estimate.repeats))
     doubt = N_STANDARD_ERRORS * math.hypot(estimate_error, reference.noise)
-    status = _rate_estimate(estimate, reference, size, doubt)
-
-    def relative(value: float) -> float:
-        """Return a value in units of the size; of size 0, any value is infinite."""
-        if size > 0.0:
-            return value / size
-        return math.inf if value else 0.0
-
     return Measured(
         quantity="derivative",
         control=probe.group.control if probe else "",
@@ -195,15 +191,23 @@ def compare_with_reference(
         spp=spp,
         repeats=estimate.repeats,
         seconds=estimate.seconds,
-        status=status,
-        error=relative(math.hypot(difference, estimate.noise)),
-        bias=relative(difference),
-        doubt=relative(doubt) if size > 0.0 else 0.0,
-        noise=relative(estimate.noise) if size > 0.0 else math.inf,
+        status=_rate_estimate(estimate, reference, size, doubt),
+        error=_divide_by_size(math.hypot(difference, estimate.noise), size),
+        bias=_divide_by_size(difference, size),
+        # with nothing to measure, all is noise and nothing is in doubt
+        doubt=_divide_by_size(doubt, size) if size > 0.0 else 0.0,
+        noise=_divide_by_size(estimate.noise, size) if size > 0.0 else math.inf,
         value=estimate.value,
         reference=reference.value,
-        reference_error=relative(reference.noise),
+        reference_error=_divide_by_size(reference.noise, size),
     )
+
+
+def _divide_by_size(value: float, size: float) -> float:
+    """Return a value in units of a size; of size 0, any value but 0 is infinite."""
+    if size > 0.0:
+        return value / size
+    return math.inf if value else 0.0
 
 
 def list_planned(group: Group) -> list[tuple[str, float]]:
@@ -250,16 +254,14 @@ def find_probes(bench: Bench) -> list[Probe]:
         if group.estimator == "none":
             continue
         if group.size > MAX_SINGLE_PROBES:
-            # the planned step of a large group is not one along all coordinates at once
-            step = group.step if group.size <= 64 else MIXED_STEP
-            probes.append(
-                Probe(group, group.name, _make_mixed_direction(bench, group), step)
-            )
+            step = group.step if group.size <= MAX_COMMON_STEP_SIZE else MIXED_STEP
+            direction = _make_mixed_direction(bench, group)
+            probes.append(Probe(group, group.name, direction, step))
             continue
-        for number in range(group.size):
+        for position in range(group.size):
             direction = torch.zeros_like(bench.u)
-            direction[group.begin + number] = 1.0
-            name = group.name if group.size == 1 else f"{group.name}.{number}"
+            direction[group.begin + position] = 1.0
+            name = group.name if group.size == 1 else f"{group.name}.{position}"
             probes.append(Probe(group, name, direction, group.step))
     return probes
 
@@ -271,16 +273,13 @@ def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
     It is the signs of the estimator's own gradient, along which the derivative is
     large, plus half of random signs, so that what the estimator leaves out counts too.
     """
+    # differentiates by this group alone
     plan = restrict_plan(bench.renderer.plan, [group.name])
-    gradient = bench.compute_gradient(plan, seeds.stream(bench.seed, "probe"))[
-        group.coordinates
-    ]
+    full_gradient = bench.compute_gradient(plan, seeds.stream(bench.seed, "probe"))
+    gradient = full_gradient[group.coordinates]
     generator = torch.Generator().manual_seed(seeds.stream(bench.seed, "probe signs"))
-    random_signs = (
-        torch.randint(0, 2, gradient.shape, generator=generator).to(gradient.dtype)
-        * 2.0
-        - 1.0
-    )
+    random_bits = torch.randint(0, 2, gradient.shape, generator=generator)
+    random_signs = random_bits.to(gradient.dtype) * 2.0 - 1.0
     # where the gradient is 0, the random sign is left
     mixed = gradient.sign() + 0.5 * random_signs
     direction = torch.zeros_like(bench.u)
@@ -310,54 +309,83 @@ def measure_reference(
             the least noise.
     """
     min_repeats, max_repeats = repeats
-    # for each factor, differences at its step and at half of it, a pair for each seed
-    pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
-
-    def measure(factor: float, count: int) -> tuple[Reference, float]:
-        """Measure the pairs that are missing of `count`.
-
-        Returns:
-            The reference of all of them, and the standard error of its value.
-        """
-        step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
-        for number in range(len(pairs[factor]), count):
-            noise = seeds.stream(bench.seed, "reference", number)
-            pairs[factor].append(
-                (
-                    _compute_difference(bench, probe, step, noise),
-                    _compute_difference(bench, probe, 0.5 * step, noise),
-                )
-            )
-        # Richardson: the error of a central difference falls with the squared step
-        extrapolated = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairs[factor]]
-        coarse_mean = statistics.fmean(coarse for coarse, _ in pairs[factor])
-        fine_mean = statistics.fmean(fine for _, fine in pairs[factor])
-        error = math.inf
-        if len(extrapolated) > 1:
-            error = statistics.stdev(extrapolated) / math.sqrt(len(extrapolated))
-        # the standard error, and a part of what the step changes
-        noise_of_both = math.hypot(error, 0.25 * (coarse_mean - fine_mean))
-        return Reference(
-            statistics.fmean(extrapolated),
-            noise_of_both,
-            (coarse_mean, fine_mean),
-            factor,
-        ), error
-
-    measured = dict[float, tuple[Reference, float]]()
+    pairs_of_factor: dict[float, list[DifferencePair]] = {}
+    references: dict[float, Reference] = {}
     for factor in factors:
-        reference, error = measured[factor] = measure(factor, min_repeats)
-        is_sure = error <= MAX_REFERENCE_ERROR * abs(reference.value)
-        if is_sure:
+        pairs = [
+            _measure_pair(bench, probe, factor, number) for number in range(min_repeats)
+        ]
+        reference = _extrapolate(pairs, factor)
+        max_error = MAX_REFERENCE_ERROR * abs(reference.value)
+        if _compute_standard_error(pairs) <= max_error:
             return reference
-    best = min(measured, key=lambda factor: measured[factor][0].noise)
-    reference, error = measured[best]
+        pairs_of_factor[factor] = pairs
+        references[factor] = reference
+    best = min(references, key=lambda factor: references[factor].noise)
+    reference = references[best]
+    pairs = pairs_of_factor[best]
     while (
-        error > MAX_REFERENCE_ERROR * abs(reference.value)
-        and len(pairs[best]) < max_repeats
+        _compute_standard_error(pairs) > MAX_REFERENCE_ERROR * abs(reference.value)
+        and len(pairs) < max_repeats
     ):
-        reference, error = measure(best, len(pairs[best]) + 1)
+        pairs.append(_measure_pair(bench, probe, best, len(pairs)))
+        reference = _extrapolate(pairs, best)
     return reference
+
+
+class DifferencePair(NamedTuple):
+    """Central differences along a probe with one seed, at a step and at half of it."""
+
+    coarse: float
+    fine: float
+
+    @property
+    def extrapolated(self) -> float:
+        """The value at a step of 0 (Richardson): the error of a central difference
+        falls with the squared step.
+        """
+        return (4.0 * self.fine - self.coarse) / 3.0
+
+
+def _measure_pair(
+    bench: Bench, probe: Probe, factor: float, number: int
+) -> DifferencePair:
+    """Measure a pair of differences with a factor on the probe's step.
+
+    `number` is the index of the pair, from which its seed follows.
+    """
+    step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
+    noise_seed = seeds.stream(bench.seed, "reference", number)
+    return DifferencePair(
+        coarse=_compute_difference(bench, probe, step, noise_seed),
+        fine=_compute_difference(bench, probe, 0.5 * step, noise_seed),
+    )
+
+
+def _compute_standard_error(pairs: Sequence[DifferencePair]) -> float:
+    """Return the standard error of the mean extrapolated value; infinite for one
+    pair.
+    """
+    if len(pairs) < 2:
+        return math.inf
+    values = [pair.extrapolated for pair in pairs]
+    return statistics.stdev(values) / math.sqrt(len(values))
+
+
+def _extrapolate(pairs: Sequence[DifferencePair], factor: float) -> Reference:
+    """Return the reference that is the mean of pairs with a factor on the step.
+
+    Its noise is the standard error, and a quarter of what the step changes.
+    """
+    coarse_mean = statistics.fmean(pair.coarse for pair in pairs)
+    fine_mean = statistics.fmean(pair.fine for pair in pairs)
+    step_noise = 0.25 * (coarse_mean - fine_mean)
+    return Reference(
+        statistics.fmean(pair.extrapolated for pair in pairs),
+        math.hypot(_compute_standard_error(pairs), step_noise),
+        (coarse_mean, fine_mean),
+        factor,
+    )
 
 
 def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> float:
@@ -440,34 +468,18 @@ def measure_derivatives(
             another one, which has to be surer.
         stage: called with the name of what begins and its number of steps.
     """
-
-    def load_reference(probe: Probe) -> Reference:
-        """Return the reference along a probe, measured if it is not stored yet."""
-        # What acts on the finished image clips values, so that the mean depends on the
-        # noise: estimate and reference need the same sample count there.
-        acts_on_image = probe.group.estimator == "image"
-        spp = bench.spp if acts_on_image else max(bench.spp, reference_spp)
-        reference_bench = replace(bench, spp=spp)
-
-        def measure() -> dict[str, Any]:
-            """Measure the reference, and return it as JSON."""
-            return measure_reference(
-                reference_bench,
-                probe,
-                repeats=reference_repeats,
-                factors=reference_factors,
-            )._asdict()
-
-        reference = Reference(**bench.store(f"reference {probe.name}", measure))
-        bench.tick(bench.spp)
-        return reference
-
+    measure = partial(
+        measure_reference, repeats=reference_repeats, factors=reference_factors
+    )
     for control, control_probes in groupby(
         find_probes(bench), lambda probe: probe.group.control
     ):
         probes = list(control_probes)
         stage(f"references for {control}", len(probes))
-        references = {probe.name: load_reference(probe) for probe in probes}
+        references = {
+            probe.name: _load_reference(bench, probe, reference_spp, measure)
+            for probe in probes
+        }
         # One gradient gives the derivatives along all probes with equal estimators.
         probe_sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
         for probe in probes:
@@ -483,6 +495,29 @@ def measure_derivatives(
             )
 
 
+def _load_reference(
+    bench: Bench, probe: Probe, spp: int, measure: Callable[[Bench, Probe], Reference]
+) -> Reference:
+    """Return the reference along a probe, measured if it is not stored yet.
+
+    Args:
+        bench: bench of the renderer.
+        probe: direction along which the derivative is taken.
+        spp: samples per pixel, if more than the bench's.
+        measure: measures a reference.
+    """
+    # What acts on the finished image clips values, so that the mean depends on the
+    # noise: estimate and reference need the same sample count there.
+    acts_on_image = probe.group.estimator == "image"
+    reference_spp = bench.spp if acts_on_image else max(bench.spp, spp)
+    reference_bench = replace(bench, spp=reference_spp)
+    fields = bench.store(
+        f"reference {probe.name}", lambda: measure(reference_bench, probe)._asdict()
+    )
+    bench.tick(bench.spp)  # for the progress
+    return Reference(**fields)
+
+
 def _try_estimators(
     bench: Bench,
     probes: Sequence[Probe],
@@ -496,19 +531,20 @@ def _try_estimators(
         bench: bench of the renderer.
         probes: probes of one control, which share their estimators.
         references: references by the names of all the control's probes.
-        tries: estimators with factors on the step; one with a factor other than 1 is
-            tried along probes along which none was `ok` before.
+        tries: estimators, each with a factor on the planned step. Those with the factor
+            1 come first, for all probes; others are for probes that were not `ok`.
         repeats: number of gradients with the factor 1, and with another one.
     """
     ok_names: set[str] = set()
     all_references = list(references.values())
+    planned_repeats, other_repeats = repeats
     for estimator, factor in tries:
         if factor == 1.0:
             tried_probes = list(probes)
-            count = repeats[0]
+            count = planned_repeats
         else:
             tried_probes = [probe for probe in probes if probe.name not in ok_names]
-            count = repeats[1]
+            count = other_repeats
         if not tried_probes:
             break
         probe_names = ",".join(probe.name for probe in tried_probes)
@@ -527,7 +563,7 @@ def _try_estimators(
             if row.status == "ok":
                 ok_names.add(probe.name)
             yield row
-        bench.tick(bench.spp)
+        bench.tick(bench.spp)  # for the progress
 
 
 def _estimates_as_json(

@@ -94,10 +94,11 @@ def list_contested(
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
     """Return sets of groups for which several estimators are to be compared.
 
-    The groups of a set belong to one control. None of them has a forced estimator. With
-    `with_all` these are all such groups. Otherwise they are only those for which the
-    interior adjoint is preferred so far: over poses, the model's loss is so rough that
-    no estimator has won, and over shapes the material form is the quietest.
+    The groups of a set belong to one control. None of them has an estimator that the
+    user has forced. Without `with_all` only groups count whose preferred estimator is
+    the interior adjoint: of the others the winner is known, or there is none (over
+    poses no estimator has won, as the model's loss is too rough; over shapes the
+    material form is the quietest).
 
     Returns:
         The sets, each with its estimators.
@@ -106,7 +107,8 @@ def list_contested(
     for group in plan.groups:
         if group.is_forced or not group.valid:
             continue
-        if with_all or group.valid[0] == "adjoint":
+        preferred = group.valid[0]
+        if with_all or preferred == "adjoint":
             open_groups.append(group)
     return [
         (groups, estimators)
@@ -150,7 +152,7 @@ def choose_estimators(
     plan = bench.renderer.plan
     for groups, estimators in list_contested(plan, with_all=with_all):
         scores = _score_estimators(
-            bench, plan, groups, estimators, repeats, counted=count_renders
+            bench, plan, groups, estimators, repeats, counts_renders=count_renders
         )
         best = min(scores, key=lambda name: scores[name])
         reason = _explain_scores(scores, best, bench.spp, count_renders)
@@ -172,13 +174,13 @@ def _score_estimators(
     estimators: Sequence[str],
     repeats: int,
     *,
-    counted: bool,
+    counts_renders: bool,
 ) -> dict[str, float]:
     """Return squared error times seconds of each estimator, on groups of one control.
 
     Errors are differences from the mean gradient of the estimator that takes finite
-    differences, whose own noise is subtracted. If `counted`, the number of renders
-    stands for the seconds.
+    differences, whose own noise is subtracted. If `counts_renders`, the number of
+    renders stands for the seconds.
     """
     group_names = {group.name for group in groups}
     gradients_of = dict[str, Tensor]()
@@ -189,11 +191,12 @@ def _score_estimators(
         gradients, seconds = bench.compute_gradients(
             single_plan, "plan", repeats, f"{groups[0].name} by {estimator}"
         )
-        if counted:
+        if counts_renders:
             adjoint_renders = (
                 ADJOINT_RENDERS if estimator in ADJOINT_ESTIMATORS else 0.0
             )
-            # the image itself, the renders of the differences, and the adjoint
+            # in place of seconds: the image itself, the renders of the differences, and
+            # the adjoint
             seconds = 1.0 + single_plan.renders + adjoint_renders
         residual = gradients - gradients.mean(dim=0)  # (repeats, d)
         gradients_of[estimator] = gradients
@@ -233,13 +236,21 @@ def _compute_squared_errors(
 
 
 def _explain_scores(
-    scores: Mapping[str, float], best: str, spp: int, counted: bool
+    scores: Mapping[str, float], best: str, spp: int, counts_renders: bool
 ) -> str:
-    """Return why an estimator was chosen, for the plan."""
+    """Return why an estimator was chosen, for the plan.
+
+    Args:
+        scores: squared error times cost of each estimator.
+        best: the chosen estimator.
+        spp: samples per pixel of the gradients.
+        counts_renders: whether the cost is a number of renders, and not seconds.
+    """
     # A loss may be flat here, as that of a detector that detects nothing.
-    if not any(scores.values()):
+    is_flat = not any(scores.values())
+    if is_flat:
         return f"as preferred: none of them has an error, measured at {spp} samples"
-    cost = "renders" if counted else "time"
+    cost = "renders" if counts_renders else "time"
     reason = f"least squared error x {cost}, measured at {spp} samples"
     if scores[best] > 0.0:
         others = ", ".join(

@@ -16,6 +16,7 @@ from itertools import permutations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -49,7 +50,9 @@ def generates_text(architecture: str, network: Any) -> bool:
 
 
 def make_language_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a classifier of the given names, or of free answers.
+    """Return the source of a network that reads an image and goes on in words.
+
+    It chooses one of the names that the user gave, or answers freely.
 
     Raises:
         ModelError: the network is an encoder-decoder, its processor cannot be loaded,
@@ -63,26 +66,22 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
     name = loaded.name
     is_free, question = purpose.parse_question(name, "goes on in words")
     names = purpose.names
-    if not is_free and (names is None or len(names) < 2):
-        raise InputError(
-            "labels: expected two names at least, such as mug,cup,bowl, of which "
-            f"model {name} chooses one, got "
-            f"{'none' if names is None else repr(names[0])}; with `task=answer` it "
-            "answers freely"
-        )
+    if not is_free:
+        _check_has_choice(names, name)
     kind = type(loaded.network).__name__
     with models.translate_errors(
         f"model {loaded.spec}: is a {kind}, which can't be asked about "
         "a picture as LLaVA can"
     ):
         reader = _LanguageModel(loaded, processor, question or models.QUESTION)
+        # Likelihoods are checked by any text if there are no names.
         tokens = reader.tokenize_names(names or (CHECK_TEXT,))
         max_new_tokens = max(purpose.tokens if is_free else 0, *map(len, tokens))
         _check_length(loaded, reader, max_new_tokens)
-        named = _NameClassifier(reader, tokens)
-        module = _FreeAnswerer(reader, purpose.tokens) if is_free else named
+        classifier = _NameClassifier(reader, tokens)
+        module = _FreeAnswerer(reader, purpose.tokens) if is_free else classifier
         with torch.no_grad():
-            _check_likelihood(loaded, named)
+            _check_likelihood(loaded, classifier)
             start_time = time.perf_counter()
             module(torch.zeros((1, 3, *reader.image_size)))
             seconds = time.perf_counter() - start_time
@@ -93,10 +92,21 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
         module,
         name,
         labels=names,
-        batch_limits=(1, 1),
+        batch_limits=(1, 1),  # the reader takes one image at a time
         reads_text=True,
         **reader.preprocessing,
     )
+
+
+def _check_has_choice(names: Sequence[str] | None, model_name: str) -> None:
+    """Raise InputError for fewer than two names, of which none could be chosen."""
+    if names is None or len(names) < 2:
+        raise InputError(
+            "labels: expected two names at least, such as mug,cup,bowl, of which "
+            f"model {model_name} chooses one, got "
+            f"{'none' if names is None else repr(names[0])}; with `task=answer` it "
+            "answers freely"
+        )
 
 
 def _load_processor(loaded: LoadedNetwork) -> Any:
@@ -123,7 +133,7 @@ def _check_length(
     Args:
         loaded: the network.
         reader: reader of images and prompt.
-        max_new_tokens: max new tokens of the answer.
+        max_new_tokens: maximum number of tokens of the answer.
 
     Raises:
         InputError: they have too many tokens.
@@ -136,8 +146,7 @@ def _check_length(
     if isinstance(max_tokens, int) and n_tokens > max_tokens:
         raise InputError(
             f"prompt: expected picture, prompt and name to have at most {max_tokens} "
-            f"tokens for model {loaded.name}, "
-            f"got {n_tokens}"
+            f"tokens for model {loaded.name}, got {n_tokens}"
         )
 
 
@@ -180,12 +189,12 @@ class _LanguageModel(nn.Module):
     """
 
     def __init__(self, loaded: LoadedNetwork, processor: Any, question: str) -> None:
-        """Prepare question and preprocessing for a network.
+        """Prepare prompt and preprocessing for a network.
 
         Args:
             loaded: the network, with what belongs to it.
             processor: processor of images and texts.
-            question: about each image.
+            question: question about each image.
 
         Raises:
             ModelError: its processor cannot be used.
@@ -196,35 +205,17 @@ class _LanguageModel(nn.Module):
         parameters = inspect.signature(loaded.network.forward).parameters
         # `past_key_values` is the older name.
         self.cache = "cache" if "cache" in parameters else "past_key_values"
+        # by image size, see `get_prompt`
         self._prompts: dict[tuple[int, int], dict[str, Tensor]] = {}
-        # The question with a placeholder for the image, as the network was trained on
-        # it.
-        self.text = f"{getattr(processor, 'image_token', None) or ''}{question}"
-        if getattr(processor, "chat_template", None):
-            content = [{"type": "image"}, {"type": "text", "text": question}]
-            turns = [{"role": "user", "content": content}]
-            self.text = processor.apply_chat_template(turns, add_generation_prompt=True)
-        vision_config = getattr(loaded.network.config, "vision_config", None)
-        size = getattr(vision_config, "image_size", None) or models.DEFAULT_SIZE
-        height, width = size if isinstance(size, (list, tuple)) else (size, size)
-        self.image_size = (int(height), int(width))
-        processing = Processing()
-        with suppress(errors.ModelError):  # it is called then
-            processing = measure_processor(
-                lambda **options: processor(text=[self.text], **options), loaded.spec
-            )
-        self.is_affine = "mean" in processing
-        if self.is_affine:
-            self.image_size = processing.get("input_size", self.image_size)
-        elif importlib.util.find_spec("torchvision") is None:
-            raise errors.ModelError(
-                f"model {loaded.spec}: its processor cuts pictures into patches or "
-                "tiles, and lets gradients through "
-                "with torchvision only, which is not installed: pip install "
-                "'advsearch[torchvision]'"
-            )
-        else:
+        self.text = _make_prompt_text(processor, question)
+        processing = _measure_affine_processor(processor, self.text, loaded.spec)
+        self.is_affine = processing is not None
+        if processing is None:
+            _check_torchvision_installed(loaded.spec)
             processing = Processing()
+        self.image_size = processing.get(
+            "input_size", _read_image_size(loaded.network.config)
+        )
         self.preprocessing = Processing(**{**processing, "input_size": self.image_size})
         self._check_pixels(loaded.spec)
 
@@ -236,16 +227,11 @@ class _LanguageModel(nn.Module):
             ModelError: the processor treats them differently.
         """
         height, width = self.image_size
-        vertical = torch.linspace(0, 200, height)[:, None]
-        horizontal = torch.linspace(0, 200, width)
-        # A different gradient in each channel.
-        levels = torch.stack(
-            [
-                vertical + 0 * horizontal,
-                horizontal + 0 * vertical,
-                (vertical + horizontal) / 4 + 100,
-            ]
-        ).round()
+        vertical = torch.linspace(0, 200, height)[:, None].expand(height, width)
+        horizontal = torch.linspace(0, 200, width).expand(height, width)
+        # A different gradient in each channel, (3, H, W).
+        diagonal = (vertical + horizontal) / 4 + 100
+        levels = torch.stack([vertical, horizontal, diagonal]).round()
         image_8bit = np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy())
         expected = self._process(image_8bit)["pixel_values"]
         image = levels / 255.0
@@ -262,9 +248,8 @@ class _LanguageModel(nn.Module):
         if not max_error <= LEVELS * float(expected.abs().max()):
             raise errors.ModelError(
                 f"model {spec}: its processor {type(self.processor).__name__} does "
-                "something else to numbers than to "
-                "8-bit pictures. Wrap network and processing in an nn.Module of yours, "
-                "and give that from Python"
+                "something else to numbers than to 8-bit pictures. Wrap network and "
+                "processing in an nn.Module of yours, and give that from Python"
             )
 
     def _process(self, image: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
@@ -293,8 +278,7 @@ class _LanguageModel(nn.Module):
         return self._process(image.float(), do_rescale=False)["pixel_values"]
 
     def tokenize_names(self, names: Sequence[str]) -> list[list[int]]:
-        """Return the tokens of each name after the prompt, with a space between them
-        unless there is one.
+        """Return the tokens of each name as they follow the prompt.
 
         They are the tokens of prompt and name minus those of the prompt. If the text
         does not begin with the prompt's tokens, as a processor may end a text with a
@@ -303,27 +287,16 @@ class _LanguageModel(nn.Module):
         Raises:
             InputError: the network has no token for a name.
         """
-        tokenizer = self.processor.tokenizer
-        prompt = self.get_prompt(self.image_size)["input_ids"][0].tolist()
-        gap = " "
-        if self.text[-1:].isspace() or prompt[-1] in tokenizer.all_special_ids:
-            gap = ""
-        text_tokens = tokenizer(self.text, verbose=False)["input_ids"]
         words = get_spoken_names(names)
-        # Whether the processor adds tokens before the text only, and none behind it.
-        gray_image = np.full((*self.image_size, 3), 128, np.uint8)
-        inputs = self._process(gray_image, f"{self.text}{gap}{words[0]}")
-        starts_with_prompt = inputs["input_ids"][0].tolist()[: len(prompt)] == prompt
+        gap = self._find_gap()
+        can_extend_prompt = self._keeps_prompt(f"{gap}{words[0]}")
         tokens_of_names: list[list[int]] = []
         for word in words:
-            all_tokens = tokenizer(f"{self.text}{gap}{word}", verbose=False)[
-                "input_ids"
-            ]
-            starts_with_text = all_tokens[: len(text_tokens)] == text_tokens
-            if starts_with_prompt and starts_with_text:
-                tokens = all_tokens[len(text_tokens) :]
-            else:
-                tokens = tokenizer(word, add_special_tokens=False)["input_ids"]
+            tokens = self._tokenize_after_prompt(f"{gap}{word}")
+            if tokens is None or not can_extend_prompt:
+                tokens = self.processor.tokenizer(word, add_special_tokens=False)[
+                    "input_ids"
+                ]
             if not tokens:
                 raise InputError(
                     "labels: expected names that the network has tokens "
@@ -332,14 +305,49 @@ class _LanguageModel(nn.Module):
             tokens_of_names.append(tokens)
         return tokens_of_names
 
+    def _find_gap(self) -> str:
+        """Return what separates the prompt from a name: a space, or nothing if the
+        prompt ends with white space or with a special token.
+        """
+        prompt_tokens = self._get_prompt_tokens()
+        ends_with_special = (
+            prompt_tokens[-1] in self.processor.tokenizer.all_special_ids
+        )
+        return "" if self.text[-1:].isspace() or ends_with_special else " "
+
+    def _keeps_prompt(self, text: str) -> bool:
+        """Return whether the processor's tokens for prompt and text begin with those
+        for the prompt: it may add tokens at the end.
+        """
+        prompt_tokens = self._get_prompt_tokens()
+        inputs = self._process(_make_gray_image(self.image_size), f"{self.text}{text}")
+        return inputs["input_ids"][0].tolist()[: len(prompt_tokens)] == prompt_tokens
+
+    def _get_prompt_tokens(self) -> list[int]:
+        """Return the tokens of the prompt, those of an image included."""
+        tokens: list[int] = self.get_prompt(self.image_size)["input_ids"][0].tolist()
+        return tokens
+
+    def _tokenize_after_prompt(self, text: str) -> list[int] | None:
+        """Return the tokens that a text adds to those of the prompt.
+
+        None if the tokens of both do not begin with those of the prompt.
+        """
+        tokenizer = self.processor.tokenizer
+        prompt_tokens = tokenizer(self.text, verbose=False)["input_ids"]
+        all_tokens: list[int] = tokenizer(f"{self.text}{text}", verbose=False)[
+            "input_ids"
+        ]
+        if all_tokens[: len(prompt_tokens)] != prompt_tokens:
+            return None
+        return all_tokens[len(prompt_tokens) :]
+
     def get_prompt(self, image_size: tuple[int, int]) -> dict[str, Tensor]:
         """Return the network's inputs for a gray image of (height, width) pixels and
         the question.
         """
         if image_size not in self._prompts:
-            self._prompts[image_size] = self._process(
-                np.full((*image_size, 3), 128, np.uint8)
-            )
+            self._prompts[image_size] = self._process(_make_gray_image(image_size))
         return self._prompts[image_size]
 
     def make_inputs(self, image: Tensor) -> dict[str, Tensor]:
@@ -413,28 +421,29 @@ class _NameClassifier(nn.Module):
         self.tokens = [list(name_tokens) for name_tokens in tokens]
         stems = _find_stems(self.tokens)
         stem_length = max(map(len, stems), default=0)
-        # All (names, longest name). For each token of a name: the row of the table of
-        # likelihoods that follows the tokens before it, the token, which is the column,
-        # and whether there is one (1 or 0). See `forward` for the table.
+        # `forward` makes a table of log-likelihoods: a column for each token of the
+        # vocabulary; row 0 is after the prompt, and each token of each stem has a row.
+        # For each token of each name, (names, longest name): its row and column there,
+        # and 1, or 0 where a name is shorter.
         rows = torch.zeros((len(tokens), max(map(len, tokens))), dtype=torch.long)
         columns = torch.zeros_like(rows)
-        counts = torch.zeros_like(rows)
+        is_token = torch.zeros_like(rows)
         for index, name_tokens in enumerate(self.tokens):
-            # Row 0 is after the prompt, the others are after each token of a stem.
-            stem_row = 1 + _find_stem(stems, name_tokens[:-1]) * stem_length
+            first_stem_row = 1 + _find_stem(stems, name_tokens[:-1]) * stem_length
             for position, token in enumerate(name_tokens):
+                # the first token follows the prompt, any other the token before it
                 if position > 0:
-                    rows[index, position] = stem_row + position - 1
+                    rows[index, position] = first_stem_row + position - 1
                 columns[index, position] = token
-                counts[index, position] = 1
+                is_token[index, position] = 1
         padded_stems = torch.tensor(
             [[*stem, *[0] * (stem_length - len(stem))] for stem in stems]
         ).long()
-        self._token_tables = padded_stems, rows, columns, counts
+        self._token_tables = padded_stems, rows, columns, is_token
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the log-likelihoods (N, names) for images (N, 3, H, W)."""
-        stems, rows, columns, counts = (
+        stems, rows, columns, is_token = (
             tensor.to(images.device) for tensor in self._token_tables
         )
         scores = []
@@ -447,8 +456,61 @@ class _NameClassifier(nn.Module):
                 stem_logits = self.reader.continue_with(stems, past)
                 stem_likelihoods = stem_logits.log_softmax(dim=-1).flatten(0, 1)
                 likelihoods = torch.cat([likelihoods, stem_likelihoods])
-            scores.append((likelihoods[rows, columns] * counts).sum(dim=1))
+            scores.append((likelihoods[rows, columns] * is_token).sum(dim=1))
         return torch.stack(scores)
+
+
+def _make_prompt_text(processor: Any, question: str) -> str:
+    """Return the question with a placeholder for the image, in the form of a chat if
+    the network was trained on chats.
+    """
+    if getattr(processor, "chat_template", None):
+        content = [{"type": "image"}, {"type": "text", "text": question}]
+        turns = [{"role": "user", "content": content}]
+        text: str = processor.apply_chat_template(turns, add_generation_prompt=True)
+        return text
+    return f"{getattr(processor, 'image_token', None) or ''}{question}"
+
+
+def _read_image_size(config: Any) -> tuple[int, int]:
+    """Return (height, width) of images, of a network's ``config`` or the default."""
+    vision_config = getattr(config, "vision_config", None)
+    size = getattr(vision_config, "image_size", None) or models.DEFAULT_SIZE
+    height, width = size if isinstance(size, (list, tuple)) else (size, size)
+    return int(height), int(width)
+
+
+def _measure_affine_processor(
+    processor: Any, prompt: str, spec: str
+) -> Processing | None:
+    """Return size, mean and standard deviation of a processor of images and texts.
+
+    None if it does more to an image than a gain and an offset.
+    """
+    with suppress(errors.ModelError):
+        processing = measure_processor(
+            lambda **options: processor(text=[prompt], **options), spec
+        )
+        if "mean" in processing:
+            return processing
+    return None
+
+
+def _check_torchvision_installed(spec: str) -> None:
+    """Raise ModelError if the processor of a network needs torchvision, which is not
+    installed.
+    """
+    if importlib.util.find_spec("torchvision") is None:
+        raise errors.ModelError(
+            f"model {spec}: its processor cuts pictures into patches or tiles, and "
+            "lets gradients through with torchvision only, which is not installed: "
+            "pip install 'advsearch[torchvision]'"
+        )
+
+
+def _make_gray_image(size: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    """Return a gray image (height, width, 3), for which any image may be put in."""
+    return np.full((*size, 3), 128, np.uint8)
 
 
 def _find_stem(stems: Sequence[Sequence[int]], prefix: Sequence[int]) -> int:
@@ -475,7 +537,7 @@ def _find_stems(tokens: Sequence[Sequence[int]]) -> list[tuple[int, ...]]:
 
 
 class _FreeAnswerer(nn.Module):
-    """Answer freely about each image, by greedy decoding.
+    """Answer freely about each image, by greedy decoding: always the likeliest token.
 
     The outputs are `advsearch.tasks.answers.AnswerWithLogits`.
     """
@@ -500,22 +562,25 @@ class _FreeAnswerer(nn.Module):
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
         """Return the answer about each of images (N, 3, H, W).
 
-        It ends after an end token, or after `max_tokens`.
+        Each has its text; the logits (n, tokens) that its n tokens were chosen by; and
+        a function from a word to the tokens that it may begin with. It ends after an
+        end token, or after `max_tokens`.
         """
         answers = []
         for image in images:
-            logits, past = self.reader.read_prompt(image)
-            steps = [logits]
-            tokens = [int(logits.argmax())]
+            next_logits, past = self.reader.read_prompt(image)
+            logits_of_steps = [next_logits]
+            tokens = [int(next_logits.argmax())]
             while tokens[-1] not in self.end_tokens and len(tokens) < self.max_tokens:
-                last_token = logits.new_tensor([tokens[-1:]], dtype=torch.long)
-                steps.append(self.reader.continue_with(last_token, past)[0, -1])
-                tokens.append(int(steps[-1].argmax()))
+                last_token = next_logits.new_tensor([tokens[-1:]], dtype=torch.long)
+                next_logits = self.reader.continue_with(last_token, past)[0, -1]
+                logits_of_steps.append(next_logits)
+                tokens.append(int(next_logits.argmax()))
             text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
             answers.append(
                 {
                     "text": text,
-                    "logits": torch.stack(steps),
+                    "logits": torch.stack(logits_of_steps),
                     "begins": self.find_first_tokens,
                 }
             )
@@ -528,15 +593,20 @@ class _FreeAnswerer(nn.Module):
         first_tokens: set[int] = set()
         for form in {word, word.capitalize(), f" {word}", f" {word.capitalize()}"}:
             tokens = self.tokenizer(form, add_special_tokens=False)["input_ids"]
-            visible = [
+            # A space before the word may be a token of its own, which is skipped.
+            visible_tokens = [
                 token for token in tokens if self.tokenizer.decode([token]).strip()
             ]
-            first_tokens.update(visible[:1])
+            first_tokens.update(visible_tokens[:1])
+        # The token for unknown words may begin any of them.
         return sorted(first_tokens - {self.tokenizer.unk_token_id})
 
 
 def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Tensor]:
-    """Return the inputs of a network for a prompt that tokens (n,) follow."""
+    """Return the inputs of a network for a prompt that tokens (n,) follow.
+
+    Masks and types, which the prompt has for each of its tokens, are extended.
+    """
     inputs = dict(prompt)
     inputs["input_ids"] = torch.cat([prompt["input_ids"], tokens[None]], dim=1)
     for key in ("attention_mask", "mm_token_type_ids", "token_type_ids"):
@@ -544,7 +614,8 @@ def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Te
             # In most networks type 1 is the image, but in PaliGemma, which marks
             # nothing before, it is the answer.
             is_answer = key == "token_type_ids" and not prompt[key].any()
-            value = 1 if key == "attention_mask" or is_answer else 0
+            is_attended = key == "attention_mask"
+            value = 1 if is_attended or is_answer else 0
             extension = torch.full_like(tokens, value)[None]
             inputs[key] = torch.cat([prompt[key], extension], dim=1)
     return inputs
@@ -588,7 +659,6 @@ def _make_unsupported_error(loaded: LoadedNetwork, what: str) -> errors.ModelErr
     """Return the error for a network that is none of those read here."""
     return errors.ModelError(
         f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; "
-        "expected one that goes on with the "
-        "text it is given, such as LlavaForConditionalGeneration or "
-        "Qwen2_5_VLForConditionalGeneration"
+        "expected one that goes on with the text it is given, such as "
+        "LlavaForConditionalGeneration or Qwen2_5_VLForConditionalGeneration"
     )

@@ -32,28 +32,29 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
     Its message has `advice` on what else the user may give. Nothing is unpickled, and
     nothing is fetched for a model that only a file names.
     """
-    disabled = logging.root.manager.disable
-    # of single tries to connect: an error is raised in the end
+    disabled_before = logging.root.manager.disable
+    # Failed tries to connect are logged: an error is raised in the end anyway.
     logging.disable(logging.WARNING)
-    tries: list[object] = []
+    # connections that were not allowed, and made none
+    rejected_connections: list[object] = []
     try:
         with (
             models.without_unpickling(),
             warnings.catch_warnings(),
-            models.restrict_connections(models.is_fetch_allowed(spec), tries),
+            models.restrict_connections(
+                models.is_fetch_allowed(spec), rejected_connections
+            ),
         ):
             warnings.simplefilter("ignore")
             yield
     except errors.ModelError:
         raise
-    except (
-        Exception
-    ) as error:  # a library raises nearly anything for what is not there or damaged
-        if tries:
+    # a library raises nearly anything for what is not there or damaged
+    except Exception as error:
+        if rejected_connections:
             raise models.CodeNotAllowedError(
                 f"a file names the model {spec}, which is not on this machine and "
-                "would be fetched; "
-                f"{models.explain_how_to_allow(spec)}"
+                f"would be fetched; {models.explain_how_to_allow(spec)}"
             ) from error
         raise errors.ModelError(
             f"model {spec}: cannot be fetched or read ({models.get_first_line(error)}). "
@@ -62,17 +63,19 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
             f"unpickled. {advice}"
         ) from error
     finally:
-        logging.disable(disabled)
+        logging.disable(disabled_before)
 
 
 Array = npt.NDArray[np.float64]
+Color = tuple[int, int, int]  # red, green, blue, from 0 to 255
 
 PROBE_SIZES = (96, 160)  # in pixels, of the square pictures that a processor is shown
 # of the range of a processor's outputs: what it may be off from an affine map
 TOLERANCE = 1e-3
-# what scores that are worked out of a network's parts may be off from its own, as a
-# share
+# maximum difference of a network's scores and those computed from its parts, relative
 ROUNDING = 1e-4
+# likewise, in units of the network's rounding (eps), for less than single precision
+ROUNDING_UNITS = 8.0
 # where a repository keeps its processor
 FILES = ("preprocessor_config.json", "processor_config.json")
 
@@ -87,20 +90,22 @@ class Processing(TypedDict, total=False):
     processor: Callable[[Tensor], Tensor]
 
 
-def load_processor(transformers: Any, name: str, where: Mapping[str, Any]) -> Any:
+def load_processor(transformers: Any, name: str, hub_options: Mapping[str, Any]) -> Any:
     """Return the image processor of a repository or a directory; None if it has none.
 
-    Its own code is never run.
+    Code in the repository is never run.
     """
-    if not any(find_cached_file(transformers, name, file, where) for file in FILES):
+    if not any(
+        find_cached_file(transformers, name, file, hub_options) for file in FILES
+    ):
         return None
     return transformers.AutoImageProcessor.from_pretrained(
-        name, trust_remote_code=False, **where
+        name, trust_remote_code=False, **hub_options
     )
 
 
 def find_cached_file(
-    transformers: Any, name: str, file: str, where: Mapping[str, Any]
+    transformers: Any, name: str, file: str, hub_options: Mapping[str, Any]
 ) -> str | None:
     """Return the path of a file of a repository or a directory; None if it has none.
 
@@ -110,10 +115,10 @@ def find_cached_file(
         transformers: the package.
         name: name of the repository or directory.
         file: its name there.
-        where: arguments of `cached_file`, such as a revision.
+        hub_options: arguments of `cached_file`, such as a revision.
     """
     path: str | None = transformers.utils.cached_file(
-        name, file, _raise_exceptions_for_missing_entries=False, **where
+        name, file, _raise_exceptions_for_missing_entries=False, **hub_options
     )
     return path
 
@@ -132,7 +137,7 @@ def measure_processor(processor: Any, spec: str) -> Processing:
             patches.
     """
 
-    def process_color(color: tuple[int, int, int], size: int = PROBE_SIZES[0]) -> Array:
+    def process_color(color: Color, size: int = PROBE_SIZES[0]) -> Array:
         """Return the output (3, h, w) for a square image of one color."""
         return _run_processor(
             processor, np.full((size, size, 3), color, np.uint8), spec
@@ -140,7 +145,7 @@ def measure_processor(processor: Any, spec: str) -> Processing:
 
     black = process_color((0, 0, 0))
     processing = Processing()
-    # Unless the output is just as large as the input.
+    # An output that is always as large as the input has no size of its own.
     if black.shape == process_color((0, 0, 0), PROBE_SIZES[1]).shape:
         processing["input_size"] = (black.shape[1], black.shape[2])
     offset = black.mean(axis=(1, 2))
@@ -150,38 +155,59 @@ def measure_processor(processor: Any, spec: str) -> Processing:
         [process_color(color).mean(axis=(1, 2)) - offset for color in primaries],
         axis=1,
     )
+    # 1e-12: a processor that returns a constant has no gain
     tolerance = TOLERANCE * max(float(np.abs(gains).max()), 1e-12)
-    # grays have to be what gain and offset predict, everywhere in the image
+    if not _predicts_grays(process_color, gains, offset, tolerance):
+        problem = "changes pixels by something else than a gain and an offset"
+        return _wrap_processor(processor, spec, processing, problem)
+    normalization = _find_normalization(gains, offset, tolerance)
+    if normalization is None:
+        problem = "mixes the channels of a picture, or turns it into its negative"
+        return _wrap_processor(processor, spec, processing, problem)
+    return Processing(**{**normalization, **processing})
+
+
+def _predicts_grays(
+    process_color: Callable[[Color], Array],
+    gains: Array,
+    offset: Array,
+    tolerance: float,
+) -> bool:
+    """Return whether gains (3, 3) and offset (3,) predict the output for gray images,
+    everywhere in the image.
+    """
     for level in (51, 128, 255):
         expected = offset + gains.sum(axis=1) * (level / 255.0)
         difference = process_color((level, level, level)) - expected[:, None, None]
         if np.abs(difference).max() > tolerance:
-            return _make_called_processing(
-                processor,
-                spec,
-                processing,
-                "changes pixels by something else than a gain and an offset",
-            )
-    # Each output channel may depend on one input channel only, in one of two orders.
-    diagonal_gains = {
+            return False
+    return True
+
+
+def _find_normalization(
+    gains: Array, offset: Array, tolerance: float
+) -> Processing | None:
+    """Return mean, standard deviation and channel order for gains (3, 3) of input
+    channels in output channels, and offsets (3,).
+
+    None unless each output channel depends on one input channel only, in the order RGB
+    or BGR, and grows with it.
+    """
+    gain_of_order = {
         channels: np.diag(matrix)
         for channels, matrix in (("RGB", gains), ("BGR", gains[:, ::-1]))
         if np.abs(matrix - np.diag(np.diag(matrix))).max() <= tolerance
     }
-    if len(diagonal_gains) == 1:
-        ((channels, gain),) = diagonal_gains.items()
-        if gain.min() > 0.0:
-            return Processing(
-                mean=_round_triple(-offset / gain),
-                std=_round_triple(1.0 / gain),
-                channels=channels,
-                **processing,
-            )
-    return _make_called_processing(
-        processor,
-        spec,
-        processing,
-        "mixes the channels of a picture, or turns it into its negative",
+    # Both orders fit only if all gains are about zero.
+    if len(gain_of_order) != 1:
+        return None
+    ((channels, gain),) = gain_of_order.items()
+    if gain.min() <= 0.0:
+        return None
+    return Processing(
+        mean=_round_triple(-offset / gain),
+        std=_round_triple(1.0 / gain),
+        channels=channels,
     )
 
 
@@ -196,8 +222,8 @@ def _run_processor(processor: Any, picture: Any, spec: str) -> Array:
             processor,
             f"returns an array of shape {values.shape} in place of (1, 3, H, W)",
         )
-    picked: Array = values[0]
-    return picked
+    output: Array = values[0]
+    return output
 
 
 def _disable_resizing(processor: Any) -> Callable[..., Any]:
@@ -209,27 +235,22 @@ def _disable_resizing(processor: Any) -> Callable[..., Any]:
     return partial(processor, **disabled)
 
 
-def _make_called_processing(
+def _wrap_processor(
     processor: Any, spec: str, processing: Processing, what: str
 ) -> Processing:
-    """Return the measured size, with the processor to be called on images of it.
+    """Return the processing that calls a processor on images of its size.
 
     Args:
-        processor: processor that is no gain and offset.
+        processor: processor that is more than a gain and an offset.
         spec: specification of the model, for messages.
         processing: processing with the size, if it is fixed.
-        what: the processor does, for messages.
+        what: what the processor does, for messages.
 
     Raises:
         ModelError: it ignores pixels, or no gradient goes through it.
     """
-    height, width = processing.get("input_size", (PROBE_SIZES[0], PROBE_SIZES[0]))
     _check_reads_all_pixels(processor, spec)
-    levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     process = _disable_resizing(processor)
-    expected = _run_processor(process, levels, spec)
-    image = torch.from_numpy(levels).float() / 255.0
-    images = image.movedim(2, 0)[None].requires_grad_()
 
     def call(images: Tensor) -> Tensor:
         """Process images (N, 3, H, W) in [0, 1]; values up to 255 stay unrounded."""
@@ -239,11 +260,12 @@ def _make_called_processing(
         ]
         return torch.cat(outputs).to(images)
 
+    height, width = processing.get("input_size", (PROBE_SIZES[0], PROBE_SIZES[0]))
+    levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    expected = _run_processor(process, levels, spec)
+    image = torch.from_numpy(levels).float() / 255.0
     try:
-        with torch.enable_grad():
-            output = call(images)
-            gradient = torch.autograd.grad(output.square().sum(), images)[0]
-            has_gradient = bool(gradient.any())
+        output, has_gradient = _call_with_gradient(call, image.movedim(2, 0)[None])
     except Exception as error:  # a processor with numpy raises nearly anything
         advice = ""
         if getattr(processor, "backend", None) == "pil":
@@ -254,16 +276,28 @@ def _make_called_processing(
             f"{what}, and lets no gradient through "
             f"({models.get_first_line(error)}){advice}",
         ) from error
-    error_size = np.inf
+    max_error = np.inf
     if output.shape == (1, *expected.shape):
-        error_size = np.abs(output.detach().double().numpy() - expected).max()
-    if not has_gradient or not error_size <= TOLERANCE * np.ptp(expected):
+        max_error = np.abs(output.detach().double().numpy() - expected).max()
+    is_accurate = max_error <= TOLERANCE * np.ptp(expected)  # not if it is NaN
+    if not has_gradient or not is_accurate:
         raise _make_processor_error(
             spec,
             processor,
             f"{what}, and rounds or does otherwise where a gradient goes through it",
         )
     return Processing(processor=call, **processing)
+
+
+def _call_with_gradient(
+    call: Callable[[Tensor], Tensor], images: Tensor
+) -> tuple[Tensor, bool]:
+    """Return the output for images, and whether it has a gradient that is not zero."""
+    variable_images = images.requires_grad_()
+    with torch.enable_grad():
+        output = call(variable_images)
+        gradient = torch.autograd.grad(output.square().sum(), variable_images)[0]
+        return output, bool(gradient.any())
 
 
 def _check_reads_all_pixels(processor: Any, spec: str) -> None:
@@ -292,15 +326,13 @@ def _make_processor_error(spec: str, processor: Any, what: str) -> errors.ModelE
     """Return the error for a processor that cannot be used, with what it does."""
     return errors.ModelError(
         f"model {spec}: its processor {type(processor).__name__} {what}, which no "
-        "size, mean and std stand for. Wrap "
-        "network and processing in an nn.Module of yours, and give that from Python or "
-        "as package.module:callable"
+        "size, mean and std stand for. Wrap network and processing in an nn.Module of "
+        "yours, and give that from Python or as package.module:callable"
     )
 
 
-RunNetwork = Callable[
-    [Any, Tensor], Any
-]  # what asks a network about pictures (N, 3, H, W)
+RunNetwork = Callable[[Any, Tensor], Any]
+"""Calls a network on images (N, 3, H, W), and returns its output."""
 
 
 class AdaptedNetwork(nn.Module):
@@ -308,20 +340,20 @@ class AdaptedNetwork(nn.Module):
 
     Args:
         network: network of the library.
-        ask: calls it on images (N, 3, H, W).
+        run_network: calls it on images (N, 3, H, W).
         boxes: whether what it returns are boxes as corners in pixels.
     """
 
     def __init__(
-        self, network: nn.Module, ask: RunNetwork, *, boxes: bool = False
+        self, network: nn.Module, run_network: RunNetwork, *, boxes: bool = False
     ) -> None:
         super().__init__()
         self.network = network
-        self.ask = ask
+        self.run_network = run_network
         self.boxes_are_corners_in_pixels = boxes
 
     def forward(self, images: Tensor) -> Any:
-        return self.ask(self.network, images)
+        return self.run_network(self.network, images)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,9 +385,8 @@ class LoadedNetwork:
         if self.processor is None:
             models.warn(
                 f"model {self.spec} comes without an image processor: pictures are "
-                "given as they are, RGB in [0, 1]. "
-                "Say `mean`, `std` and `input_size` of load_model if it wants them "
-                "otherwise"
+                "given as they are, RGB in [0, 1]. Say `mean`, `std` and `input_size` "
+                "of load_model if it wants them otherwise"
             )
             return Processing()
         return measure_processor(self.processor, self.spec)
@@ -381,17 +412,17 @@ class LoadedNetwork:
         return Processing(**{**processing, **self.preprocessing})
 
     def make_source(
-        self, ask: RunNetwork, *, boxes: bool = False, **fields: Any
+        self, run_network: RunNetwork, *, boxes: bool = False, **fields: Any
     ) -> models.Source:
-        """Return the source of the network as `AdaptedNetwork` calls it.
+        """Return the source of the network, with the measured preprocessing.
 
         Args:
-            ask: see `AdaptedNetwork`.
-            boxes: see `AdaptedNetwork`.
+            run_network: calls the network on images (N, 3, H, W).
+            boxes: whether what it returns are boxes as corners in pixels.
             **fields: fields of `Source`; they overrule the measured preprocessing.
         """
         return models.make_source(
-            AdaptedNetwork(self.network, ask, boxes=boxes),
+            AdaptedNetwork(self.network, run_network, boxes=boxes),
             self.name,
             **{**self.preprocessing, **fields},
         )
@@ -425,7 +456,7 @@ def are_nearly_equal(
     """
     return bool(
         (expected - computed).abs().max()
-        <= max(ROUNDING, 8.0 * torch.finfo(dtype).eps) * size
+        <= max(ROUNDING, ROUNDING_UNITS * torch.finfo(dtype).eps) * size
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,11 +34,12 @@ CLASS_TOKEN_NAMES = ("cls_token", "class_embedding", "class_token")
 
 
 def gives_features(architecture: str, network: Any) -> bool:
-    """Whether a network of transformers, or its class, has features of an image and no
+    """Return whether a network of transformers gives features of an image, and has no
     head.
 
-    Its architecture is a name such as Dinov2Model or CLIPVisionModelWithProjection.
-    None stands for one that transformers does not have.
+    Args:
+        architecture: its name, such as Dinov2Model or CLIPVisionModelWithProjection.
+        network: the network or its class; None for one that transformers does not have.
     """
     if (
         network is None
@@ -46,11 +47,13 @@ def gives_features(architecture: str, network: Any) -> bool:
         or zero_shot.encodes_images_and_texts(network)
     ):
         return False
-    finds = (
+    # Its decoder, which finds objects, may be given the output of its encoder.
+    is_detector = (
         "encoder_outputs" in inspect.signature(network.forward).parameters
         or "Detr" in architecture
     )
-    return getattr(network, "main_input_name", None) == "pixel_values" and not finds
+    takes_images = getattr(network, "main_input_name", None) == "pixel_values"
+    return takes_images and not is_detector
 
 
 def make_no_classes_error(name: str, what: str) -> errors.ModelError:
@@ -67,7 +70,7 @@ def make_no_classes_error(name: str, what: str) -> errors.ModelError:
 def make_feature_source(
     loaded: LoadedNetwork, plain: Callable[[LoadedNetwork], models.Source] | None = None
 ) -> models.Source:
-    """Return the source of a network that has features.
+    """Return the source of a network whose features are compared.
 
     Args:
         loaded: the network.
@@ -76,30 +79,24 @@ def make_feature_source(
     Raises:
         ModelError: it has no classes, or no features.
     """
-    network = loaded.network
     if loaded.purpose.task != TASK:
         if plain is None:
-            raise make_no_classes_error(loaded.name, f"is a {type(network).__name__}")
+            kind = type(loaded.network).__name__
+            raise make_no_classes_error(loaded.name, f"is a {kind}")
         return plain(loaded)
     if loaded.purpose.prompts is not None:
         raise InputError(
             f"prompt: task {TASK} compares pictures and reads no text; "
             "leave `prompt` out"
         )
-    backbone = network
+    network = loaded.network
     config = network.config
+    backbone = network
     if zero_shot.encodes_images_and_texts(network):
         zero_shot.check_takes_pictures(network, loaded.spec)
         config = getattr(config, "vision_config", config)
     elif "ForImageClassification" in type(network).__name__:
-        backbone = network.base_model
-        if backbone is network:
-            backbone = getattr(network, "vision_model", None)
-        if backbone is None:
-            raise errors.ModelError(
-                f"model {loaded.spec}: has no part before its "
-                "head; give its network without one"
-            )
+        backbone = _find_backbone(network, loaded.spec)
     has_class_token = any(
         word in name
         for name, _ in backbone.named_parameters()
@@ -110,8 +107,8 @@ def make_feature_source(
         """Return the features (N, D) of images (N, 3, H, W), or else what the network
         returns.
         """
-        compares = zero_shot.encodes_images_and_texts(network)
-        encode = network.get_image_features if compares else network
+        reads_texts = zero_shot.encodes_images_and_texts(network)
+        encode = network.get_image_features if reads_texts else network
         returned = encode(pixel_values=images)
         features = models.pooled(returned, token=has_class_token)
         return returned if features is None else features
@@ -120,6 +117,22 @@ def make_feature_source(
     return loaded.make_source(
         compute_features, **loaded.get_sized_preprocessing(config)
     )
+
+
+def _find_backbone(network: Any, spec: str) -> Any:
+    """Return the part of a classifier before its head.
+
+    Raises ModelError if it has none.
+    """
+    backbone = network.base_model
+    # `base_model` is the network itself where transformers states no part.
+    if backbone is network:
+        backbone = getattr(network, "vision_model", None)
+    if backbone is None:
+        raise errors.ModelError(
+            f"model {spec}: has no part before its head; give its network without one"
+        )
+    return backbone
 
 
 DISPARITY = "relative disparity"
@@ -149,7 +162,7 @@ def make_depth_source(loaded: LoadedNetwork) -> models.Source:
     is_zoedepth = config.model_type == "zoedepth"
     is_padded = is_zoedepth and bool(getattr(loaded.processor, "do_pad", False))
 
-    def ask(network: Any, images: Tensor) -> dict[str, Tensor]:
+    def run_network(network: Any, images: Tensor) -> dict[str, Tensor]:
         """Return the values (N, h, w) under their kind for images (N, 3, H, W)."""
         if not is_padded:
             return {kind: network(pixel_values=images).predicted_depth}
@@ -166,7 +179,7 @@ def make_depth_source(loaded: LoadedNetwork) -> models.Source:
         depth = functional.interpolate(depth, size=padded.shape[2:], mode="bicubic")
         return {kind: depth[:, 0, top : top + height, left : left + width]}
 
-    return loaded.make_source(ask)
+    return loaded.make_source(run_network)
 
 
 MASKS = (
@@ -199,21 +212,10 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
         "masks, which is no logit: its "
         "logarithm is used, so that margins are logarithms of a ratio of scores"
     )
-    sentence = None
-    config = loaded.network.config
-    family = str(config.model_type)
-    if family == "oneformer":  # numbers of tokens (1, L), filled up with 0
-        fill = {
-            "padding": "max_length",
-            "max_length": config.task_seq_len,
-            "truncation": True,
-        }
-        tokens = loaded.load_part("AutoTokenizer")(
-            [SENTENCE], return_tensors="pt", **fill
-        )
-        sentence = torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
+    family = str(loaded.network.config.model_type)
+    sentence = _tokenize_sentence(loaded) if family == "oneformer" else None
 
-    def ask(network: Any, images: Tensor) -> Tensor:
+    def run_network(network: Any, images: Tensor) -> Tensor:
         """Return the logarithms of scores (N, classes, H, W) for images (N, 3, H,
         W).
         """
@@ -234,7 +236,19 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
         scores = functional.interpolate(scores, size=size, mode="bilinear")
         return scores.float().clamp_min(models.MIN_PROBABILITY).log()
 
-    return loaded.make_source(ask, labels=loaded.class_names or None)
+    return loaded.make_source(run_network, labels=loaded.class_names or None)
+
+
+def _tokenize_sentence(loaded: LoadedNetwork) -> Tensor:
+    """Return the tokens (1, L) of the text that OneFormer reads, filled up with 0."""
+    tokens = loaded.load_part("AutoTokenizer")(
+        [SENTENCE],
+        return_tensors="pt",
+        padding="max_length",
+        max_length=loaded.network.config.task_seq_len,
+        truncation=True,
+    )
+    return torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
 
 
 # ---- ``timm:NAME`` and ``torchvision:NAME`` ----
@@ -297,21 +311,20 @@ def find_timm_source(
 
 def make_wrapped_timm_source(loaded: LoadedNetwork) -> models.Source:
     """Return the source of a network of timm inside a
-    `TimmWrapperForImageClassification` of transformers, whose ``config`` may have more
-    than timm.
+    `TimmWrapperForImageClassification` of transformers.
 
-    There are no labels if transformers only numbers them.
+    Preprocessing and names of classes are those in the ``config`` of transformers: they
+    may differ from timm's own. There are no labels if transformers only numbers them.
     """
     timm = models.import_library("timm", loaded.spec, "timm")
     network: Any = loaded.network
-    described = getattr(network.config, "pretrained_cfg", None)
     return _make_timm_source(
         timm,
         network.timm_model,
         loaded.name,
         loaded.purpose,
-        described,
-        loaded.class_names,
+        pretrained_config=getattr(network.config, "pretrained_cfg", None),
+        labels=loaded.class_names,
     )
 
 
@@ -320,7 +333,7 @@ def _make_timm_source(
     module: Any,
     name: str,
     purpose: models.Purpose,
-    described: Mapping[str, Any] | None = None,
+    pretrained_config: Mapping[str, Any] | None = None,
     labels: tuple[str, ...] = (),
 ) -> models.Source:
     """Return the source of a network of timm, for its classes or its features.
@@ -330,38 +343,48 @@ def _make_timm_source(
         module: the network.
         name: name of the model.
         purpose: purpose of the network.
-        described: replaces its ``pretrained_cfg``.
-        labels: replace timm's.
+        pretrained_config: replaces its ``pretrained_cfg``.
+        labels: names of classes, which replace timm's.
     """
     needs_features = purpose.task == TASK
-    n_classes = module.num_classes
-    if n_classes == 0 and not needs_features:
+    has_head = module.num_classes > 0
+    if not has_head and not needs_features:
         raise make_no_classes_error(
             name, "is a network without a head (num_classes is 0)"
         )
-    options = {"pretrained_cfg": dict(described)} if described else {}
+    options = {}
+    if pretrained_config:
+        options = {"pretrained_cfg": dict(pretrained_config)}
     config = timm.data.resolve_model_data_config(module, **options)
-    names = labels or module.pretrained_cfg.get("label_names")
-    if not names:
-        subset = timm.data.infer_imagenet_subset(module)
-        if subset:
-            names = timm.data.ImageNetInfo(subset).label_descriptions()
-    names_fit = names and (labels or len(names) == n_classes)
 
     def compute_features(network: Any, images: Tensor) -> Any:
         return network.forward_head(network.forward_features(images), pre_logits=True)
 
-    has_head = bool(n_classes)
+    network = module
+    if needs_features and has_head:
+        network = AdaptedNetwork(module, compute_features)
+    names = labels or _find_timm_names(timm, module)
     return models.make_source(
-        AdaptedNetwork(module, compute_features)
-        if needs_features and has_head
-        else module,
+        network,
         name,
         input_size=tuple(map(int, config["input_size"][1:])),
         mean=tuple(map(float, config["mean"])),
         std=tuple(map(float, config["std"])),
-        labels=tuple(map(str, names)) if names_fit and not needs_features else None,
+        labels=tuple(map(str, names)) if names and not needs_features else None,
     )
+
+
+def _find_timm_names(timm: Any, module: Any) -> Sequence[str]:
+    """Return the names of the classes of a network of timm; empty if they are not known
+    or not as many as its classes.
+    """
+    names = module.pretrained_cfg.get("label_names")
+    if not names:
+        subset = timm.data.infer_imagenet_subset(module)
+        if subset:
+            names = timm.data.ImageNetInfo(subset).label_descriptions()
+    has_all = names and len(names) == module.num_classes
+    return names if has_all else ()
 
 
 MAX_DETECTOR_BATCH = 4
@@ -375,8 +398,7 @@ def load_torchvision(spec: str) -> models.Source:
     default weights.
 
     Size, normalization and labels are those of the default weights, if torchvision has
-    them. Its detectors normalize and resize by themselves: their size is the one to
-    which they would resize a square image.
+    them.
 
     Raises:
         ModelError: torchvision is missing or broken, its weights cannot be loaded, the
@@ -395,6 +417,7 @@ def load_torchvision(spec: str) -> models.Source:
             "torchvision network", name, models.find_near_names(name, known_names)
         )
     default = getattr(zoo.get_model_weights(name), "DEFAULT", None)
+    # Otherwise torchvision would fetch weights of the backbone, to be replaced.
     options = {} if name in classifiers else {"weights_backbone": None}
     with report_library_errors(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
         module: nn.Module = zoo.get_model(
@@ -409,7 +432,24 @@ def load_torchvision(spec: str) -> models.Source:
         return models.make_source(
             AdaptedNetwork(module, _run_segmenter), name, **fields
         )
-    fields |= {"mean": None, "std": None, "batch_limits": (1, MAX_DETECTOR_BATCH)}
+    return _make_detector_source(module, name, fields)
+
+
+def _make_detector_source(
+    module: nn.Module, name: str, default_fields: Mapping[str, Any]
+) -> models.Source:
+    """Return the source of a detector of torchvision, which normalizes and resizes
+    images by itself.
+
+    Its size is the one to which it would resize a square image. `default_fields` are
+    those that its default weights state.
+    """
+    fields = {
+        **default_fields,
+        "mean": None,
+        "std": None,
+        "batch_limits": (1, MAX_DETECTOR_BATCH),
+    }
     input_size = _find_detector_size(module)
     if input_size is not None:
         fields["input_size"] = input_size
@@ -471,11 +511,12 @@ def _run_segmenter(network: Any, images: Tensor) -> Any:
 def _get_default_fields(
     default: Any | None, classifier: nn.Module | None
 ) -> dict[str, Any]:
-    """Return the fields of a source that default weights state.
+    """Return the fields of a source that default weights of torchvision state.
 
     Args:
         default: the weights; None if there are none.
-        classifier: the labels must fit its last layer; None for other networks.
+        classifier: network whose last layer the labels have to fit, or are left out;
+            None for a network that is no classifier.
     """
     mean, std = models.PRESETS["imagenet"]
     fields: dict[str, Any] = {"input_size": (224, 224), "mean": mean, "std": std}
@@ -485,6 +526,7 @@ def _get_default_fields(
     crop_size = getattr(transforms, "crop_size", None)
     size = crop_size or getattr(transforms, "resize_size", None)
     if size:
+        # A list of one number is the side of a square.
         fields["input_size"] = int(size[0]), int(size[-1])
     for key in ("mean", "std"):
         numbers = getattr(transforms, key, None)

@@ -54,8 +54,7 @@ half a minute.
 """
 
 ADVICE = (
-    "Give a folder that save_pretrained(..., safe_serialization=True) has made "
-    "as "
+    "Give a folder that save_pretrained(..., safe_serialization=True) has made as "
     "'hf:FOLDER'"
 )
 
@@ -78,56 +77,78 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = models.import_library("transformers", spec, "hf")
-    if Path(name).is_dir():
-        name = str(Path(name).resolve())
-    elif Path(name).is_file():
-        raise errors.ModelError(
-            f"model {spec}: is a file; give the folder in which it "
-            "is with its config.json"
-        )
-    elif name.startswith((".", "/", "~")) or name.count("/") > 1:
-        raise errors.ModelError(
-            f"model {spec}: no such folder{_suggest_folders(name)}; a repository is "
-            "written hf:OWNER/NAME"
-        )
+    name = _resolve_name(name, spec)
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
-    where: dict[str, Any] = {"revision": revision} if revision else {}
+    # arguments of the functions of transformers that read from the hub
+    hub_options: dict[str, Any] = {"revision": revision} if revision else {}
     with report_library_errors(spec, ADVICE):
         # otherwise each file would be tried for half a minute
         if not Path(name).is_dir() and _is_hub_unreachable(name):
-            where["local_files_only"] = True
-        saved = _load_config(transformers, name, spec, where)
-        # timm has saved it
-        if saved.get("model_type") == "timm_wrapper" and "architectures" not in saved:
+            hub_options["local_files_only"] = True
+        saved = _load_config(transformers, name, spec, hub_options)
+        is_from_timm = saved.get("model_type") == "timm_wrapper"
+        if is_from_timm and "architectures" not in saved:  # timm has saved it
             return outputs.load_timm_repository(spec, name, revision, purpose)
-        config = transformers.AutoConfig.from_pretrained(
-            name, trust_remote_code=False, **where
-        )
-        architecture = str((getattr(config, "architectures", None) or ["none"])[0])
-        family = _find_family(
-            architecture, getattr(transformers, architecture, None), spec
-        )
-        check_fits(transformers, name, where, spec)
-        builder = architecture if family.loader is None else f"AutoModel{family.loader}"
-        network, report = getattr(transformers, builder).from_pretrained(
-            name,
-            use_safetensors=True,
-            trust_remote_code=False,
-            output_loading_info=True,
-            **where,
-        )
-        _check_weights(network, report, spec)
-        processor = load_processor(transformers, name, where)
+        family, network = _load_network(transformers, name, hub_options, spec)
+        processor = load_processor(transformers, name, hub_options)
     loaded = LoadedNetwork(
         network=network,
         name=name.rstrip("/").rpartition("/")[2],
         spec=spec,
         processor=processor,
-        load_part=partial(_load_part, transformers, spec, name, where),
+        load_part=partial(_load_part, transformers, spec, name, hub_options),
         purpose=purpose,
     )
     return family.source(loaded)
+
+
+def _resolve_name(name: str, spec: str) -> str:
+    """Return the absolute path of a directory, or the name of a repository as it is.
+
+    Raises ModelError for a file, and for the path of a directory that is missing.
+    """
+    if Path(name).is_dir():
+        return str(Path(name).resolve())
+    if Path(name).is_file():
+        raise errors.ModelError(
+            f"model {spec}: is a file; give the folder in which it "
+            "is with its config.json"
+        )
+    is_path = name.startswith((".", "/", "~")) or name.count("/") > 1
+    if is_path:
+        raise errors.ModelError(
+            f"model {spec}: no such folder{_suggest_folders(name)}; a repository is "
+            "written hf:OWNER/NAME"
+        )
+    return name
+
+
+def _load_network(
+    transformers: Any, name: str, hub_options: Mapping[str, Any], spec: str
+) -> tuple[Family, Any]:
+    """Load the network of a repository or a directory, with its family.
+
+    Raises:
+        ModelError: it is of no family, larger than the memory, or lacks weights.
+    """
+    config = transformers.AutoConfig.from_pretrained(
+        name, trust_remote_code=False, **hub_options
+    )
+    # "none" is no architecture of transformers, so that no family has it
+    architecture = str((getattr(config, "architectures", None) or ["none"])[0])
+    family = _find_family(architecture, getattr(transformers, architecture, None), spec)
+    check_fits(transformers, name, hub_options, spec)
+    loader = architecture if family.loader is None else f"AutoModel{family.loader}"
+    network, report = getattr(transformers, loader).from_pretrained(
+        name,
+        use_safetensors=True,
+        trust_remote_code=False,
+        output_loading_info=True,
+        **hub_options,
+    )
+    _check_weights(network, report, spec)
+    return family, network
 
 
 def find_transformers_source(
@@ -146,32 +167,44 @@ def find_transformers_source(
     spec = type(network).__name__
     family = _find_family(spec, network, spec)
     origin = str(getattr(network, "name_or_path", "") or "")
-    where = {"local_files_only": True}
+    hub_options = {"local_files_only": True}
     processor = None
     if origin:
         # it may not be there any more
         with suppress(errors.ModelError), report_library_errors(spec, ""):
-            processor = load_processor(transformers, origin, where)
+            processor = load_processor(transformers, origin, hub_options)
     loaded = LoadedNetwork(
         network=network,
         name=spec,
         spec=spec,
         processor=processor,
-        load_part=partial(_load_part, transformers, spec, origin, where),
+        load_part=partial(_load_part, transformers, spec, origin, hub_options),
         purpose=purpose,
     )
     return family.source(loaded)
 
 
 def _load_part(
-    transformers: Any, spec: str, name: str, where: Mapping[str, Any], loader: str
+    transformers: Any,
+    spec: str,
+    name: str,
+    hub_options: Mapping[str, Any],
+    loader: str,
 ) -> Any:
-    """Load another part of a network's repository by the class that loads it."""
+    """Load what belongs to a network from its repository, such as its tokenizer.
+
+    Args:
+        transformers: the package.
+        spec: what the user wrote, for messages.
+        name: name of the repository or directory.
+        hub_options: arguments of the package, such as a revision.
+        loader: class of the package that loads it, such as "AutoTokenizer".
+    """
     with report_library_errors(
         spec, "Give a repository, or a folder, in which it is beside the network"
     ):
         return getattr(transformers, loader).from_pretrained(
-            name, trust_remote_code=False, **where
+            name, trust_remote_code=False, **hub_options
         )
 
 
@@ -195,19 +228,17 @@ def _find_family(architecture: str, network: Any, spec: str) -> Family:
             return family
     raise errors.ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has "
-        "ForImageClassification, "
-        "ForVideoClassification, ForSemanticSegmentation, ForUniversalSegmentation, "
-        "ForObjectDetection or "
-        "ForDepthEstimation in it, one that compares pictures with texts, as "
-        "CLIPModel, one that goes on in words, as "
-        "LlavaForConditionalGeneration, or one that has features, as Dinov2Model. Wrap "
-        "another in an nn.Module whose "
-        "output a task can judge, your own too, and give that from Python"
+        "ForImageClassification, ForVideoClassification, ForSemanticSegmentation, "
+        "ForUniversalSegmentation, ForObjectDetection or ForDepthEstimation in it, "
+        "one that compares pictures with texts, as CLIPModel, one that goes on in "
+        "words, as LlavaForConditionalGeneration, or one that has features, as "
+        "Dinov2Model. Wrap another in an nn.Module whose output a task can judge, "
+        "your own too, and give that from Python"
     )
 
 
 def _load_config(
-    transformers: Any, name: str, spec: str, where: Mapping[str, Any]
+    transformers: Any, name: str, spec: str, hub_options: Mapping[str, Any]
 ) -> Mapping[str, Any]:
     """Return the config of a repository or a directory, as JSON values.
 
@@ -215,22 +246,21 @@ def _load_config(
         transformers: the package.
         name: name of the repository or directory.
         spec: what the user wrote, for messages.
-        where: arguments of the package, such as a revision.
+        hub_options: arguments of the package, such as a revision.
 
     Raises:
         ModelError: it is a repository of open_clip, or cannot be found.
     """
-    find_file = partial(find_cached_file, transformers, name, where=where)
+    find_file = partial(find_cached_file, transformers, name, hub_options=hub_options)
     try:
         if not find_file("config.json") and find_file("open_clip_config.json"):
             raise errors.ModelError(
                 f"model {spec}: is a repository of open_clip, which transformers can't "
-                "read; give the network as "
-                "transformers has it, such as hf:openai/clip-vit-base-patch32 or "
-                "hf:google/siglip-base-patch16-224"
+                "read; give the network as transformers has it, such as "
+                "hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
             )
         config: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(
-            name, **where
+            name, **hub_options
         )[0]
         return config
     except OSError as error:
@@ -244,10 +274,9 @@ def _load_config(
         raise errors.ModelError(
             f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
             "repository of that name is in the "
-            f"cache{_format_suggestions(models.find_similar_names(name, cached))} or can be "
-            "had "
-            f"({models.get_first_line(error)}). Check the "
-            "name and the network, or give a folder"
+            f"cache{_format_suggestions(models.find_similar_names(name, cached))} or "
+            f"can be had ({models.get_first_line(error)}). Check the name and the "
+            "network, or give a folder"
         ) from error
 
 
@@ -340,13 +369,17 @@ def _run_detector(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _make_named_source(
-    ask: RunNetwork, *, boxes: bool = False
+    run_network: RunNetwork, *, boxes: bool = False
 ) -> Callable[[LoadedNetwork], models.Source]:
     """Return the function that makes the source of a network with class names in its
     ``config``.
+
+    Args:
+        run_network: calls the network on images (N, 3, H, W).
+        boxes: whether what it returns are boxes as corners in pixels.
     """
     return lambda loaded: loaded.make_source(
-        ask, boxes=boxes, labels=loaded.class_names or None
+        run_network, boxes=boxes, labels=loaded.class_names or None
     )
 
 
@@ -366,13 +399,12 @@ class _FrameProcessor:
 
 
 def _make_clip_source(loaded: LoadedNetwork) -> models.Source:
-    """Return the source of a network that takes (N, T, 3, H, W): the T frames are the
-    images of a rig.
+    """Return the source of a network of videos (N, T, 3, H, W): the T frames are the
+    images of a rig, a camera that moves or several cameras.
     """
     config = loaded.network.config
-    loaded = replace(
-        loaded, processor=loaded.processor and _FrameProcessor(loaded.processor)
-    )
+    if loaded.processor is not None:
+        loaded = replace(loaded, processor=_FrameProcessor(loaded.processor))
     module = models.AllAtOnce(
         AdaptedNetwork(loaded.network, _run_classifier), int(config.num_frames)
     )
@@ -430,7 +462,7 @@ MEMORY_FILE = Path("/proc/meminfo")  # Linux's file of memory sizes
 
 
 def check_fits(
-    transformers: Any, name: str, where: Mapping[str, Any], spec: str
+    transformers: Any, name: str, hub_options: Mapping[str, Any], spec: str
 ) -> None:
     """Check that the weights of a network fit into the free memory, swap included.
 
@@ -440,7 +472,7 @@ def check_fits(
     Args:
         transformers: the package.
         name: name of the repository or directory.
-        where: arguments of the package, such as a revision.
+        hub_options: arguments of the package, such as a revision.
         spec: what the user wrote, for messages.
 
     Raises:
@@ -450,20 +482,21 @@ def check_fits(
     if free is None:
         return
     size = 0
-    index = find_cached_file(transformers, name, "model.safetensors.index.json", where)
+    index = find_cached_file(
+        transformers, name, "model.safetensors.index.json", hub_options
+    )
     if index:  # of several files
         metadata = json.loads(Path(index).read_text(encoding="utf-8"))
         size = int(metadata.get("metadata", {}).get("total_size", 0))
     else:
-        weights = find_cached_file(transformers, name, "model.safetensors", where)
+        weights = find_cached_file(transformers, name, "model.safetensors", hub_options)
         if weights:
             size = Path(weights).stat().st_size
     if size > free:
         raise errors.ModelError(
             f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} "
-            "GB of memory are free. Give a "
-            "smaller network, one whose weights are stored in bfloat16, or a machine "
-            "with more memory"
+            "GB of memory are free. Give a smaller network, one whose weights are "
+            "stored in bfloat16, or a machine with more memory"
         )
 
 

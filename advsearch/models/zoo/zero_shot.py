@@ -40,6 +40,10 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
         ModelError: the network takes patches instead of images, or its scores differ
             from those computed here.
         InputError: fewer than two names, or prompts without a place for them.
+
+    Warns:
+        ModelWarning: two names are the same text to the network; or it scores each name
+            by itself, so that scores over all names are computed here.
     """
     check_takes_pictures(loaded.network, loaded.spec)
     name = loaded.name
@@ -54,7 +58,6 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
         )
     tokenizer = loaded.load_part("AutoTokenizer")
     words = get_spoken_names(names)
-    has_sigmoid = hasattr(loaded.network, "logit_bias")
     texts = [prompts[0].replace("{}", word) for word in words]
     with (
         models.translate_errors(f"model {name}: cannot embed the names of `labels`"),
@@ -64,17 +67,17 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
         embeddings = embed_words(network, tokenizer, words, prompts)
         head = _make_head(network, embeddings)
         classifier = _CosineClassifier(network, head.to(network.device))
-        result = loaded.make_text_source(classifier, names, network.dtype)
-        _check_scores(network, classifier, tokenizer, texts[0], result)
+        source = loaded.make_text_source(classifier, names, network.dtype)
+        _check_scores(network, classifier, tokenizer, texts[0], source)
     warn_of_equal_texts(tokenizer, texts, names, name)
-    if has_sigmoid:
+    is_trained_with_sigmoid = hasattr(loaded.network, "logit_bias")
+    if is_trained_with_sigmoid:
         models.warn(
             f"model {name} judges each name by itself, with a sigmoid of its logit: "
-            "the scores that are shown are a "
-            f"softmax over the {len(names)} names, and margins are differences of "
-            "logits"
+            f"the scores that are shown are a softmax over the {len(names)} names, and "
+            "margins are differences of logits"
         )
-    return result
+    return source
 
 
 def _make_head(network: Any, embeddings: Tensor) -> nn.Linear:
@@ -103,8 +106,7 @@ def check_takes_pictures(network: Any, spec: str) -> None:
     if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
         raise errors.ModelError(
             f"model {spec}: takes patches of pictures of any size (NaFlex), which are "
-            "no picture; give a "
-            "checkpoint of a fixed resolution, such as "
+            "no picture; give a checkpoint of a fixed resolution, such as "
             "hf:google/siglip2-base-patch16-224"
         )
 
@@ -170,10 +172,9 @@ def embed_words(
     for prompt in prompts:
         texts = [prompt.replace("{}", word) for word in words]
         batches = []
-        for start in range(0, len(texts), TEXT_BATCH_SIZE):
-            inputs = _tokenize(
-                network, tokenizer, texts[start : start + TEXT_BATCH_SIZE]
-            )
+        for begin in range(0, len(texts), TEXT_BATCH_SIZE):
+            batch = texts[begin : begin + TEXT_BATCH_SIZE]
+            inputs = _tokenize(network, tokenizer, batch)
             batches.append(_get_features(network.get_text_features(**inputs)))
         embeddings = functional.normalize(torch.cat(batches), dim=-1)
         embeddings_of_prompts.append(embeddings)
@@ -218,7 +219,7 @@ def _check_scores(
     text: str,
     source: models.Source,
 ) -> None:
-    """Compare the score of noise and a text with that of the network itself.
+    """Check that a classifier gives noise and a text the same score as the network.
 
     Args:
         network: network with its text encoder.
@@ -235,9 +236,12 @@ def _check_scores(
     noise = noise.to(network.device, network.dtype)
     inputs = _tokenize(network, tokenizer, [text])
     expected = network(**inputs, pixel_values=noise).logits_per_image.float()
+    # rows of the head are embeddings of length 1 times the scale of cosines
     scale = classifier.head.weight.norm(dim=-1).max()
+    # the prompt "{}" leaves the text as it is
     embedding = scale * embed_words(network, tokenizer, [text], ["{}"])
-    computed = classifier.embed_images(noise) @ embedding.T + classifier.head.bias[0]
+    bias = classifier.head.bias[0]  # equal for all names
+    computed = classifier.embed_images(noise) @ embedding.T + bias
     size = max(float(scale), float(expected.abs().max()))
     if expected.shape != computed.shape or not are_nearly_equal(
         expected, computed, size, network.dtype
@@ -262,8 +266,7 @@ def warn_of_equal_texts(
         if first != index:
             models.warn(
                 f"model {name} reads {names[first]!r} (#{first}) and {names[index]!r} "
-                f"(#{index}) as the same text: "
-                "it cannot tell one from the other"
+                f"(#{index}) as the same text: it cannot tell one from the other"
             )
             return
 
@@ -291,10 +294,11 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
         torch.no_grad(),
     ):
         network: Any = models.copy_sharing_weights(loaded.network).eval()
-        ask = DETECTORS[type(network).__name__](loaded, network, tokenizer, words)
+        build_detector = DETECTORS[type(network).__name__]
+        run_network = build_detector(loaded, network, tokenizer, words)
     warn_of_equal_texts(tokenizer, words, names, loaded.name)
     return loaded.make_text_source(
-        AdaptedNetwork(network, ask, boxes=True), names, network.dtype
+        AdaptedNetwork(network, run_network, boxes=True), names, network.dtype
     )
 
 
@@ -314,7 +318,7 @@ def _build_owl(
     base_model.text_model = None
     base_model.text_projection = None
 
-    def ask(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+    def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
         features = network.image_embedder(pixel_values=images)[0]
         patches = features.flatten(1, 2)
         queries = embeddings.to(patches).expand(len(images), -1, -1)
@@ -322,7 +326,7 @@ def _build_owl(
         boxes = network.box_predictor(patches, features)
         return to_pixel_corners(boxes, images), logits.sigmoid()
 
-    return ask
+    return run_network
 
 
 def _build_grounding_dino(
@@ -342,8 +346,7 @@ def _build_grounding_dino(
     if other_prompts:
         raise InputError(
             f"prompt: model {name} reads all names in one text, in which several "
-            "prompts can't be averaged; give one, "
-            "or none for the names alone"
+            "prompts can't be averaged; give one, or none for the names alone"
         )
     text = ". ".join(prompt.replace("{}", word).strip().lower() for word in words) + "."
     tokens = torch.tensor(
@@ -359,19 +362,18 @@ def _build_grounding_dino(
     if len(token_index) != len(words):
         raise InputError(
             f"labels: model {name} reads the names as one text with full stops between "
-            "them, in which these "
-            f"{len(words)} are {len(token_index)}; leave . and ? out of names and "
-            "prompt"
+            f"them, in which these {len(words)} are {len(token_index)}; leave . and ? "
+            "out of names and prompt"
         )
 
-    def ask(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+    def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
         returned = network(
             pixel_values=images, input_ids=tokens.expand(len(images), -1)
         )
         name_logits = returned.logits[..., token_index].amax(dim=-1)
         return to_pixel_corners(returned.pred_boxes, images), name_logits.sigmoid()
 
-    return ask
+    return run_network
 
 
 def _find_token_runs(tokens: Tensor, separators: Any) -> Tensor:
