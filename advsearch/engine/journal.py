@@ -247,10 +247,13 @@ def compute_weights_digest(model: Model) -> str | None:
 def compute_code_digest(function: Callable[..., Any]) -> str | None:
     """Return the SHA-256 of what a function does; None if it has no Python code.
 
-    It covers code, constants, defaults and closures; of an object that is called as a
-    function also the arrays that it holds.
+    It covers code, constants, defaults, closures and the arguments that a `partial`
+    holds; of an object that is called as a function also its arrays.
     """
+    partial_arguments = []
     while isinstance(function, partial):
+        keywords = sorted(function.keywords.items())
+        partial_arguments.append((_simplify(function.args), _simplify(keywords)))
         function = function.func
     # without decorators, and a method without its object
     callee: Any = inspect.unwrap(function)
@@ -271,6 +274,7 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
         _simplify(getattr(callee, "__defaults__", None)),
         [_simplify(cell) for cell in closure],
         arrays,
+        *partial_arguments,
     )
     return hashlib.sha256(repr(components).encode()).hexdigest()
 

@@ -9,15 +9,17 @@ import sys
 import time
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
-from advsearch.engine.journal import Journal, ParallelEvaluator
+from advsearch.engine.journal import Journal, ParallelEvaluator, compute_code_digest
 from advsearch.errors import InputError, RunExistsError
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.settings import AttackConfig
@@ -274,3 +276,12 @@ def test_a_run_that_was_killed_before_its_notes_knows_what_exists_only_in_python
     with RunDirectory.resume(tmp_path / "run", config):
         pass
     assert read_python_only(tmp_path / "run") == [PythonOnly("scene")]
+
+
+def test_arguments_of_a_partial_are_part_of_what_a_function_does() -> None:
+    def scale(values: Tensor, factor: float) -> Tensor:
+        return factor * values
+
+    twice, thrice = (compute_code_digest(partial(scale, factor=factor)) for factor in (2.0, 3.0))
+    assert twice == compute_code_digest(partial(scale, factor=2.0))
+    assert len({twice, thrice, compute_code_digest(scale)}) == 3

@@ -1,5 +1,6 @@
 """What searches leave out changes neither pictures nor gradients, and bounces only within a bound."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +10,7 @@ import torch
 from advsearch import load_scene
 from advsearch.attacks import Query
 from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
-from advsearch.engine.gradients import find_interior_point, make_smooth_loss
+from advsearch.engine.gradients import find_interior_point, make_smooth_loss, planning
 from advsearch.engine.gradients.planning import MAX_CHANGE, measure_path_length
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
@@ -48,6 +49,14 @@ def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> No
     seen = measure_path_length(light, [light.start], seed=0, spp=4)
     assert seen.depth > cut.depth and seen.cuts[-1].levels > MAX_CHANGE
     assert dark.scene.depth == dark.scene.max_depth
+
+
+def test_bounces_are_not_cut_where_a_picture_is_not_finite(monkeypatch: pytest.MonkeyPatch) -> None:
+    changes = iter([0.0, math.nan, 0.0])
+    monkeypatch.setattr(planning, "_compare_depths", lambda *_: (0.0, next(changes)))
+    renderer = made("texture")
+    path_length = measure_path_length(renderer, [renderer.start] * 3, seed=0, spp=1)
+    assert path_length.depth == path_length.full and math.isnan(path_length.cuts[0].levels)
 
 
 def test_searches_cut_paths_and_verifications_do_not() -> None:

@@ -175,8 +175,10 @@ class Race:
         renders = runners[k].renders_left
         runners[k] = replace(runners[k], renders_left=0, is_over=True)
         others = [other for other in self.active_runners if not runners[other].is_over]
-        for other in others:
-            renders_left = runners[other].renders_left + renders // len(others)
+        for index, other in enumerate(others):
+            # the first ones get one more if the renders do not divide evenly
+            added = (renders + len(others) - 1 - index) // len(others)
+            renders_left = runners[other].renders_left + added
             runners[other] = replace(runners[other], renders_left=renders_left)
 
     def _limit_proposal(self, proposal: Proposal, runner: Runner) -> Proposal:

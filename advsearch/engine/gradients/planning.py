@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -506,9 +507,10 @@ def measure_path_length(
         for u, full in zip(configurations, full_renderings, strict=True):
             light, levels = _compare_depths(full, render_twice(u, depth))
             lost_light = max(lost_light, light)
-            changed_levels = max(changed_levels, levels)
+            # `max` would drop NaN, of an image that is not finite
+            changed_levels = float(np.maximum(changed_levels, levels))
         cuts.append(PathCut(depth=depth, light=lost_light, levels=changed_levels))
-        # NaN, of an image that is not finite, counts as too much
+        # NaN counts as too much
         if not changed_levels <= bound:
             break
         chosen_depth = depth
