@@ -456,7 +456,7 @@ def find_min_rows(table: pd.DataFrame) -> int:
     min_rows = max(MIN_COVERED_ROWS, round(MIN_COVERED_SHARE * len(table)))
     if table["unit"].is_unique:
         return min_rows
-    rows_of_units = MIN_COVERED_UNITS * len(table) / table["unit"].nunique()
+    rows_of_units: float = MIN_COVERED_UNITS * len(table) / table["unit"].nunique()
     return max(min_rows, round(rows_of_units))
 
 

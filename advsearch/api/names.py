@@ -132,8 +132,7 @@ def _check_scene(values: Mapping[str, Any]) -> None:
     )
     judge = values.get("judge")
     # a scene in a file may have further things, whose names are not known here
-    is_bundled_object = things and judge and objects[0] in list_objects()
-    if is_bundled_object:
+    if things and judge and objects[0] in list_objects():
         _check_judge(judge, things, thing_objects)
 
 

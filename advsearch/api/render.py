@@ -204,8 +204,7 @@ def _check_replaces_no_input(config: RenderConfig, out: Path) -> None:
     if not out.exists():
         return
     for spec in (config.object, config.environment, config.model, config.labels):
-        is_file = spec is not None and os.path.exists(spec)
-        if is_file and out.samefile(spec):
+        if spec is not None and os.path.exists(spec) and out.samefile(spec):
             raise InputError(
                 f"out: would replace {spec}, which is read; choose another name"
             )
