@@ -40,7 +40,10 @@ class PythonQuantiles(dict[str, object]):
             InputError: the function fails.
         """
         try:
-            quantiles = [float(f"{float(function(p)):.6g}") for p in QUANTILES]
+            quantiles = [
+                float(f"{float(function(probability)):.6g}")
+                for probability in QUANTILES
+            ]
         except Exception as error:  # the user's code may raise anything
             raise InputError(
                 f"distribution {name}: expected a function from a share in [0, 1] to a "

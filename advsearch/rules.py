@@ -498,7 +498,7 @@ def shorten_conditions(
         shorter = max(candidates, key=scorer.score)
         is_added = find_covered(shorter, table) & ~find_covered(conditions, table)
         n_added = int(is_added.sum())
-        # of the loss, so that few rows choose few conditions
+        # a loss within its standard error may be chance
         standard_error = math.sqrt(n_added * variance) / len(table)
         loss = score - scorer.score(shorter)
         if loss > max((1.0 - RETAINED_ACCURACY) * score, standard_error):
@@ -708,7 +708,7 @@ def walk_tree(
         if is_leaf:
             continue
         column = columns[tree.feature[node]]
-        key = column._replace(name=None)
+        key = column._replace(name=None)  # shared by all names of the factor
         condition = conditions.get(key, column.full_condition)
         if column.name is None or condition.options is None:
             threshold = float(f"{tree.threshold[node]:.3g}")  # as it is reported

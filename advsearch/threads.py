@@ -111,25 +111,25 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
 @contextmanager
 def restore_threads() -> Iterator[None]:
     """After the block, give torch and Dr.Jit the threads that they had before it,
-    whatever is configured inside.
+    whatever is configured inside; the default, if they were imported inside.
     """
     global _chosen
     chosen_before = _chosen
     torch = sys.modules.get("torch")
+    torch_threads = None if torch is None else torch.get_num_threads()
     drjit = sys.modules.get("drjit")
-    for_torch = torch and torch.get_num_threads()
-    for_drjit = drjit and drjit.thread_count()
+    drjit_threads = None if drjit is None else drjit.thread_count()
     try:
         yield
     finally:
         _chosen = chosen_before
-        # a library that was imported inside the block gets the default
         if "torch" in sys.modules:
-            sys.modules["torch"].set_num_threads(for_torch or _get_default())
-        if drjit is None and "drjit" in sys.modules:
+            sys.modules["torch"].set_num_threads(torch_threads or _get_default())
+        if drjit is not None:
+            if drjit.thread_count() != drjit_threads:
+                drjit.set_thread_count(drjit_threads)
+        elif "drjit" in sys.modules:
             apply_to_drjit()
-        elif drjit is not None and drjit.thread_count() != for_drjit:
-            drjit.set_thread_count(for_drjit)
 
 
 @contextmanager

@@ -335,6 +335,7 @@ def load_task(task: WorkerTask) -> BatchFunction:
         _loaded.move_to_end(key)
         return _loaded[key]
     folder = make_private_directory()
+    # compiled kernels are shared by all workers of the user, unless the user says where
     if "DRJIT_CACHE_DIR" not in os.environ:
         (folder / KERNELS).mkdir(exist_ok=True)
         os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)

@@ -724,8 +724,8 @@ def _make_absolute(name: str) -> str:
         return "+".join(map(_make_absolute, paths))
     path = name
     node = ""
-    has_file_name = os.path.isfile(name)  # a # in it is no mark of a node then
-    if not has_file_name:
+    is_file = os.path.isfile(name)
+    if not is_file:  # else a # belongs to the name of the file
         path, mark, node_name = name.partition("#")
         node = f"{mark}{node_name}"
     looks_like_path = "/" in path or Path(path).suffix != ""

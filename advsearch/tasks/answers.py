@@ -201,8 +201,8 @@ class FreeAnswer(Task):
         for answer, margin in zip(output, margins, strict=True):
             texts = _list_texts(answer)
             is_right = margin >= 0.0
-            agreeing = [text for text in texts if has_word(text, truth) == is_right]
-            ((most_frequent, _),) = Counter(agreeing or texts).most_common(1)
+            compared = [text for text in texts if has_word(text, truth) == is_right]
+            [(most_frequent, _)] = Counter(compared or texts).most_common(1)
             payload: tasks.JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
             results.append((_make_prediction(most_frequent), payload))
         return results

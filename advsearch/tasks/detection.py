@@ -890,7 +890,7 @@ class Detection(ClassTask):
         return ObjectMatch(
             Outcome.MISSED,
             truth.labels[0],
-            best_score if math.isfinite(best_score) else None,
+            best_score if math.isfinite(best_score) else None,  # JSON has no NaN
         )
 
     @staticmethod
@@ -963,6 +963,6 @@ class Detection(ClassTask):
         ):
             box = (x0 * width, y0 * height, x1 * width, y1 * height)
             marks.append(
-                Mark(f"{self.get_class_name(label)} {score:.2f}", False, box=box)
+                Mark(f"{self.get_class_name(label)} {score:.2f}", true=False, box=box)
             )
         return marks

@@ -596,6 +596,7 @@ def _check_detections(components: Mapping[str, Tensor]) -> Detections:
         return _remove_padded_pairs(boxes, components["score_or_label"].float())
 
     scores, labels = _check_scores(components)
+    # (D, K), with a single score for each box if there are labels
     values = scores.detach() if labels is None else scores.detach()[:, None]
     is_padding = _find_padding(boxes, values, labels)
     _check_probabilities(values[~is_padding], has_labels=labels is not None)
@@ -1091,8 +1092,8 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
             class.
     """
     excess_channels = {n_channels - 4 - classes}
-    if may_be_rows:
-        excess_channels.add(n_channels - 6)
+    if may_be_rows:  # 4 numbers of a box, a score and a class
+        excess_channels.add(n_channels - 4 - 2)
     fitting = [
         f"`labels={name}`"
         for first_score in HEADS.values()

@@ -144,15 +144,19 @@ def _check_unpacked_size(path: Path, unpacked: int, size: int) -> None:
     Raises:
         FileFormatError: they have more than the limit, or than the ratio allows.
     """
-    limit = ""
     if unpacked > scale_limit(LARGEST):
-        limit = f"a model of at most {scale_limit(LARGEST):,} bytes unpacked"
-        got = f"{unpacked:,}"
+        raise make_size_error(
+            path,
+            f"a model of at most {scale_limit(LARGEST):,} bytes unpacked",
+            f"{unpacked:,}",
+        )
     elif unpacked > scale_limit(LARGEST_RATIO) * size + SLACK:
-        limit = f"a model that unpacks to at most {scale_limit(LARGEST_RATIO)} times its size"
-        got = f"{size:,} bytes that unpack to {unpacked:,}"
-    if limit:
-        raise make_size_error(path, limit, got)
+        raise make_size_error(
+            path,
+            f"a model that unpacks to at most {scale_limit(LARGEST_RATIO)} times its "
+            "size",
+            f"{size:,} bytes that unpack to {unpacked:,}",
+        )
 
 
 def make_archive_error(path: Path, what: str) -> FileFormatError:
@@ -359,6 +363,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
         raise make_archive_error(
             archive.path, f"{name!r} is damaged ({get_first_line(error)})"
         ) from None
+    # of torch's native classes only those of quantized networks and the like are plain
     if any(
         family not in _CLASSES
         for text in reader.names

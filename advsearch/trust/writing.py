@@ -322,9 +322,10 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
 
     Args:
         run: the folder.
-        contents: names in it that are looked at, beside the lock.
-        unchecked_suffix: end of the paths of those folders whose subfolders are not
-            looked into.
+        contents: names directly in it that are checked, beside the lock; others are
+            ignored.
+        unchecked_suffix: end of a path; of a folder with such a path the subfolders
+            are not looked into.
 
     Raises:
         FileFormatError: there is a link, or a pipe or the like.
@@ -354,7 +355,7 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
                 )
             if entry.is_dir(follow_symlinks=False):
                 if not folder.endswith(unchecked_suffix):
-                    folders.append(entry.path)
+                    folders.append(entry.path)  # its contents are checked, too
             elif not entry.is_file(follow_symlinks=False) and entry.name != LOCK:
                 raise FileFormatError(
                     f"{entry.path}: expected a file of this run, got a "
