@@ -21,8 +21,8 @@ DEVICES = ("device", "cuda", "gpu", "use_cuda")
 UNSUPPORTED_KEYWORDS = {
     **dict.fromkeys(
         DEVICES,
-        "pictures are made on the processor, and a model stays on "
-        "the device that it is on",
+        "pictures are made on the processor, and a model stays on the device that it "
+        "is on",
     ),
     **dict.fromkeys(
         ("lr", "learning_rate", "step_size", "alpha", "momentum"),
@@ -127,8 +127,8 @@ def check_types(
             )
         if name == "run" and isinstance(value, str) and not value.strip():
             raise InputError(
-                "run: expected the name of a run or a folder, got an "
-                "empty text; leave it out for no run"
+                "run: expected the name of a run or a folder, got an empty text; leave "
+                "it out for no run"
             )
 
 

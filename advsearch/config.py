@@ -88,8 +88,8 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
         names.append(name)
         if mapping:
             options[name] = mapping
-    # A command is written back as detection+depth={depth: {seek: gone}}: what stands
-    # after the last name are then the options of all names.
+    # A command is written back as detection+depth={depth: {seek: gone}}: then the last
+    # name is followed by the options of all names.
     last_name = names[-1]
     last_options = options.get(last_name, {})
     are_of_all_names = last_options.keys() <= set(names)
@@ -192,8 +192,8 @@ class SceneConfig(Config):
     facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting(
         None,
         "scene",
-        "which axis of an imported object's file its front faces, "
-        "turned towards +x here",
+        "which axis of an imported object's file its front faces, turned towards +x "
+        "here",
         otherwise="as the format says (+z in glTF and VRM 1, -z in VRM 0), and +x in "
         "others",
     )
@@ -216,11 +216,10 @@ class SceneConfig(Config):
         None,
         "scene",
         "which camera takes the picture: one of a scene file, or the one around the "
-        "object, mounted somewhere or with "
-        "a lens of its own",
+        "object, mounted somewhere or with a lens of its own",
         "a name that advsearch import lists, orbit, dashcam, robot, fisheye, "
-        "equirectangular, or a camera file of "
-        "OpenCV, Kalibr, ROS, COLMAP or nerfstudio",
+        "equirectangular, or a camera file of OpenCV, Kalibr, ROS, COLMAP or "
+        "nerfstudio",
         metavar="NAME",
         otherwise="orbit, the pinhole around the object that camera.* describes",
         min_length=1,
@@ -294,16 +293,15 @@ class SceneConfig(Config):
         "model",
         "the network under test",
         "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, "
-        "hf:REPOSITORY, an address such as "
-        "http://localhost:8000, or package.module:callable",
+        "hf:REPOSITORY, an address such as http://localhost:8000, or "
+        "package.module:callable",
     )
     labels: str | None = setting(
         None,
         "model",
         "names of the model's classes",
         "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91, voc, "
-        "or the names with commas between "
-        "them",
+        "or the names with commas between them",
         metavar="FILE",
         otherwise="the model's own",
     )
@@ -311,8 +309,8 @@ class SceneConfig(Config):
         None,
         "model",
         "text for a model that takes text beside the picture: for CLIP what a picture "
-        "is compared with, one text for "
-        "each label; for a model such as LLaVA the question",
+        "is compared with, one text for each label; for a model such as LLaVA the "
+        "question",
         "a text, for CLIP with {} where the name goes, or several with | between them",
         otherwise="a photo of a {}, or What is this?",
         metavar="TEXT",
@@ -329,10 +327,8 @@ class SceneConfig(Config):
         dict,
         "model",
         "a limit for a model behind an address, such as calls=500: calls (2000), "
-        "tokens and money of a run, seconds of "
-        "an answer (120), requests at_once (4), and the prices per_call, "
-        "per_million_in and per_million_out; may be "
-        "repeated",
+        "tokens and money of a run, seconds of an answer (120), requests at_once (4), "
+        "and the prices per_call, per_million_in and per_million_out; may be repeated",
         "LIMIT=NUMBER",
         metavar="LIMIT=NUMBER",
     )
@@ -340,8 +336,7 @@ class SceneConfig(Config):
         "classification",
         "model",
         "what the model does, and how its predictions are judged; for several models "
-        "one task each, with + between "
-        "them",
+        "one task each, with + between them",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
     label: str | None = setting(
@@ -375,8 +370,7 @@ class SceneConfig(Config):
         None,
         "search",
         "samples per pixel of a render of the search; auto takes half of the default, "
-        "and renders the best candidates "
-        "again while they are close",
+        "and renders the best candidates again while they are close",
         "a whole number from 1 to 65536, or auto",
         otherwise="8 with the denoiser, 16 without",
         unit="samples",
@@ -388,8 +382,8 @@ class SceneConfig(Config):
         "multijitter",
         "search",
         "how samples are spread over a pixel, in search and verification; multijitter "
-        "has less noise and rounds the "
-        "number of samples up to a product of two near numbers",
+        "has less noise and rounds the number of samples up to a product of two near "
+        "numbers",
     )
 
     seed: int = setting(
@@ -435,15 +429,14 @@ class SceneConfig(Config):
                 if len(names) != len(tasks):
                     raise InputError(
                         f"model: expected {len(tasks)} with commas between them, one "
-                        f"for each of {', '.join(tasks)}, "
-                        f"got {len(names)}"
+                        f"for each of {', '.join(tasks)}, got {len(names)}"
                     )
             elif len(names) > 1 and setting_name not in self.list_settings:
                 raise make_single_value_error(setting_name, names)
         if self.size is not None and len(self.objects) > 1:
             raise InputError(
-                "size: it is the size of one object, and there are "
-                "several; leave it out, or give `unit`"
+                "size: it is the size of one object, and there are several; leave it "
+                "out, or give `unit`"
             )
         return self
 
@@ -616,8 +609,8 @@ def make_single_value_error(name: str, names: Sequence[str]) -> InputError:
     """
     got = written.format_value(",".join(names))
     return InputError(
-        f"{name}: expected one {name}, got {got}; give one, or "
-        "compare several with advsearch sweep"
+        f"{name}: expected one {name}, got {got}; give one, or compare several with "
+        "advsearch sweep"
     )
 
 
@@ -667,8 +660,8 @@ class RenderConfig(SceneConfig):
     out: str = setting(
         ...,
         "picture",
-        "the file to write: a .png holds what the model sees, an .exr "
-        "linear radiance times the gain",
+        "the file to write: a .png holds what the model sees, an .exr linear radiance "
+        "times the gain",
         "the path of a .png or .exr file",
     )
 
@@ -681,11 +674,8 @@ class RenderConfig(SceneConfig):
             ValueError: it does not have the suffix of an image, or has a zero byte in it.
         """
         text = str(value) if isinstance(value, Path) else value
-        if (
-            not isinstance(text, str)
-            or "\0" in text
-            or Path(text).suffix.lower() not in IMAGE_SUFFIXES
-        ):
+        is_path = isinstance(text, str) and "\0" not in text
+        if not is_path or Path(text).suffix.lower() not in IMAGE_SUFFIXES:
             raise ValueError("not a picture")
         return text
 
@@ -713,8 +703,7 @@ class DerivativeConfig(SceneConfig):
         None,
         "search",
         "how far a control may move from its start, in its own unit (for several "
-        "controls CONTROL=NUMBER,...; in "
-        "`attack` also NUMBER,NUMBER,... for a curve)",
+        "controls CONTROL=NUMBER,...; in `attack` also NUMBER,NUMBER,... for a curve)",
         f"a number greater than 0 and at most {MAX_EPSILON:g}",
         otherwise="the control's own",
     )
@@ -748,8 +737,7 @@ class DerivativeConfig(SceneConfig):
         "leave out what the scene and the search don't need",
         flag="--no-specialise",
         switched="compute everything, also what this search does not need; `advsearch "
-        "check` shows what is left out "
-        "otherwise",
+        "check` shows what is left out otherwise",
     )
 
     @field_validator("epsilon", mode="before")

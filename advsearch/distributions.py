@@ -47,9 +47,8 @@ class PythonQuantiles(dict[str, object]):
         except Exception as error:  # the user's code may raise anything
             raise InputError(
                 f"distribution {name}: expected a function from a share in [0, 1] to a "
-                "value (an inverse CDF), or an "
-                "object with such an `icdf` or `ppf`; it raised "
-                f"{type(error).__name__}: {error}"
+                "value (an inverse CDF), or an object with such an `icdf` or `ppf`; it "
+                f"raised {type(error).__name__}: {error}"
             ) from error
         super().__init__(
             {DISTRIBUTION: FROM_PYTHON, "name": name, "quantiles": quantiles}
@@ -110,8 +109,8 @@ def distribution_to_setting(value: object) -> object:
     if is_of_integers:
         raise InputError(
             f"distribution {getattr(family, 'name', kind.__name__)}: expected one of "
-            "real numbers, got one of whole "
-            "ones; give its values as {choices: [...], weights: [...]}"
+            "real numbers, got one of whole ones; give its values as {choices: [...], "
+            "weights: [...]}"
         )
     if family is not value and _is_family_of_scipy(family):
         return _frozen_to_setting(value)
@@ -182,6 +181,5 @@ def _make_setting(name: str, parameters: Mapping[str, Any]) -> dict[str, object]
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
             f"distribution {name}: expected one of a single number, got parameters of "
-            "several; give one for each "
-            "parameter"
+            "several; give one for each parameter"
         ) from None

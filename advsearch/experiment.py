@@ -492,8 +492,8 @@ def experiment(
         # RunContext[NameConfig] has the class of the settings in brackets
         (settings,) = get_args(hints[first_parameter])
         returned = hints["return"]
-        # the first of a union, or the type itself
-        result = (*get_args(returned), returned)[0]
+        union_members = get_args(returned)
+        result = union_members[0] if union_members else returned
         return Experiment(function, settings, result, examples, **attributes)
 
     return decorate

@@ -174,9 +174,8 @@ def check_direction(objective: object, *, targeted: bool) -> None:
         name = getattr(function, "__name__", type(function).__name__)
         raise InputError(
             f"objective: it is maximised, and torch's {name} falls towards the "
-            "`target`; take "
-            "losses.targeted_cross_entropy, or negate it: lambda logits, labels: "
-            "-loss(logits, labels)"
+            "`target`; take losses.targeted_cross_entropy, or negate it: lambda "
+            "logits, labels: -loss(logits, labels)"
         )
     for name in __all__:
         counterpart = f"targeted_{name}"  # the same loss for a target
@@ -189,8 +188,8 @@ def check_direction(objective: object, *, targeted: bool) -> None:
             )
         if function is globals()[counterpart] and not targeted:
             raise InputError(
-                f"objective: losses.{counterpart} needs a `target`; "
-                f"name one, or take losses.{name}"
+                f"objective: losses.{counterpart} needs a `target`; name one, or take "
+                f"losses.{name}"
             )
 
 
@@ -213,8 +212,8 @@ def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Te
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(
             "labels: expected (N,) int64 or the indices of a label set, got "
-            f"{type(labels).__name__}, the truth of "
-            "another task than classification; a loss of your own takes it as it is"
+            f"{type(labels).__name__}, the truth of another task than classification; "
+            "a loss of your own takes it as it is"
         )
     if not isinstance(labels, Tensor):
         return loss(logits, logits, tuple(labels))

@@ -53,8 +53,8 @@ class _MaiteNetwork(nn.Module):
         targets = list(self.model(list(images)))
         if len(targets) != len(images):
             raise InputError(
-                "MAITE model: expected a target for each of "
-                f"{len(images)} images, got {len(targets)}"
+                f"MAITE model: expected a target for each of {len(images)} images, got "
+                f"{len(targets)}"
             )
         if self.task == "classification":
             return torch.stack([torch.as_tensor(scores).float() for scores in targets])

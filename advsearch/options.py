@@ -124,9 +124,8 @@ def _format_thing(thing: Mapping[str, Any]) -> str:
     required = ("object", "x", "y")
     if not thing.keys() >= {*required}:
         raise InputError(
-            f"things: expected an object, x and y, such as {{'object': 'car', 'x': 12, "
-            f"'y': 3.5}}, "
-            f"got {dict(thing)!r:.80}"
+            "things: expected an object, x and y, such as {'object': 'car', 'x': 12, "
+            f"'y': 3.5}}, got {dict(thing)!r:.80}"
         )
     position = [f"{thing['object']}@{thing['x']}", f"{thing['y']}"]
     options = [f"{name}={thing[name]}" for name in thing if name not in required]

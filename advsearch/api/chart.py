@@ -165,8 +165,8 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
     """
     not_found = InputError(
         f"{photograph}: expected a photograph of the whole colour chart, upright, with "
-        "its four black squares, got one "
-        "in which they are not found; leave nothing dark around the sheet"
+        "its four black squares, got one in which they are not found; leave nothing "
+        "dark around the sheet"
     )
     squares = _find_dark_squares(light)
     if len(squares) < 4:

@@ -216,8 +216,8 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
             )
     if not pieces:
         raise InputError(
-            f"{folder}: it has neither a texture nor a patch, so that "
-            "there is nothing to print"
+            f"{folder}: it has neither a texture nor a patch, so that there is nothing "
+            "to print"
         )
     return pieces
 

@@ -252,9 +252,8 @@ def _check_is_name(function_name: str, key: str, value: object) -> None:
     """
     if not isinstance(value, (str, Mapping, type(None))):
         raise InputError(
-            f"{key}: expected a name for {function_name}, got "
-            f"{describe_value(value)}; `attack` "
-            "takes your own, and `sweep` a task of your own"
+            f"{key}: expected a name for {function_name}, got {describe_value(value)}; "
+            "`attack` takes your own, and `sweep` a task of your own"
         )
 
 

@@ -104,8 +104,7 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
     if command not in RENDERERS:
         raise InputError(
             f"{folder}: expected a run of {' or '.join(RENDERERS)}, or one with such "
-            "parts, "
-            f"got one of {command}"
+            f"parts, got one of {command}"
         )
     # objects of the Python session, but for those that only a search needs
     missing = [
@@ -148,8 +147,8 @@ def _render_sweep(
     # they are sorted, so that the first and the last one show it for all
     if images and not 0 <= images[0] <= images[-1] < n_images:
         raise FileFormatError(
-            f"{folder / NAME}: expected rows of its {n_images} "
-            "pictures, got one of another"
+            f"{folder / NAME}: expected rows of its {n_images} pictures, got one of "
+            "another"
         )
     progress.stage("rendering pictures", len(images))
     for image in images:

@@ -203,9 +203,9 @@ class DaskExecutor(WorkerExecutor):
                 if time.monotonic() >= deadline:
                     raise ClusterError(
                         f"{self.description}: there is no scheduler that answers "
-                        f"({error or type(error).__name__}); start "
-                        "one with dask scheduler, check address and certificates, and "
-                        "go on with advsearch resume"
+                        f"({error or type(error).__name__}); start one with dask "
+                        "scheduler, check address and certificates, and go on with "
+                        "advsearch resume"
                     ) from error
                 time.sleep(LOOK_SECONDS)
         self._connection = self._client.scheduler_comm
@@ -315,8 +315,8 @@ class DaskExecutor(WorkerExecutor):
         if isinstance(version, str):
             self._refuse(
                 address,
-                f"it has advsearch {version}, and "
-                f"{compute_version()} asks; install the same on both",
+                f"it has advsearch {version}, and {compute_version()} asks; install "
+                "the same on both",
             )
         elif isinstance(version, (ImportError, AttributeError)):
             self._refuse(
@@ -582,9 +582,8 @@ def parse_site(workers: int | None, cluster: str) -> ClusterSite:
         site = _read_site(Path(cluster), workers)
     else:
         raise InputError(
-            "cluster: expected the address of a scheduler such as "
-            "tcp://10.0.0.1:8786, local, or a .yaml file, got "
-            f"{cluster!r}"
+            "cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, "
+            f"local, or a .yaml file, got {cluster!r}"
         )
     if site.address and workers is not None:
         raise InputError(
@@ -618,7 +617,8 @@ def _read_site(path: Path, workers: int | None) -> ClusterSite:
         return _read_scheduler(path, entries, security)
     name = str(entries["class"])
     start = partial(_import_cluster(path, name), **(entries.get("arguments") or {}))
-    return ClusterSite(name, start=start, security=security, count=count or 1)
+    n_workers = 1 if count is None else count
+    return ClusterSite(name, start=start, security=security, count=n_workers)
 
 
 def _read_security(path: Path, entries: dict[str, Any]) -> dict[str, object] | None:

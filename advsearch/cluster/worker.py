@@ -132,8 +132,8 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
     if size > MAX_SENT_BYTES:
         raise InputError(
             f"cluster: the files of the scene and the model have {size >> 20} MiB, and "
-            f"{MAX_SENT_BYTES >> 20} can be "
-            "sent; put them in a folder that all workers see, each under the same path"
+            f"{MAX_SENT_BYTES >> 20} can be sent; put them in a folder that all "
+            "workers see, each under the same path"
         )
     return contents
 

@@ -198,7 +198,7 @@ class PoolWorkers:
         self.stats.batches += 1
         self.stats.busy += reply.seconds
         self.stats.loading += reply.loading
-        # alive counts without loading
+        # `alive` counts the connected seconds without those of loading
         self.stats.alive -= reply.loading
         machine: str | None = digest_machine(reply.machine)
         if machine == self._this_machine:
@@ -235,9 +235,9 @@ class PoolWorkers:
         if self._dead_starts >= MAX_DEAD_STARTS and not self.stats.batches:
             raise ClusterError(
                 f"{self._executor.description}: workers died of the first "
-                f"{self._dead_starts} batches, and none was done; "
-                "try it with workers=null, or see whether a worker has enough memory "
-                "for the scene and the model"
+                f"{self._dead_starts} batches, and none was done; try it with "
+                "workers=null, or see whether a worker has enough memory for the scene "
+                "and the model"
             )
 
 

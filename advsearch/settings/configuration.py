@@ -369,8 +369,8 @@ class Config(BaseModel):
             field = type(self).model_fields[name]
             if getattr(self, name) != field.get_default(call_default_factory=True):
                 raise InputError(
-                    f"{name}: `advsearch {self.command}` has no such "
-                    "setting; leave it out"
+                    f"{name}: `advsearch {self.command}` has no such setting; leave it "
+                    "out"
                 )
         defaults = {setting.field: setting.default for setting in settings(type(self))}
         for clash in self.clashes:

@@ -195,9 +195,9 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
             if isinstance(settings, str) and settings.startswith("{"):
                 raise InputError(
                     f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for "
-                    f"{name}, got {format_value(settings)}; write "
-                    "a colon and a space behind each parameter, close every bracket, "
-                    "and put a comma before the next control"
+                    f"{name}, got {format_value(settings)}; write a colon and a space "
+                    "behind each parameter, close every bracket, and put a comma "
+                    "before the next control"
                 )
             controls.append((name, settings))
     check_no_duplicates((name for name, _ in controls), where)
@@ -336,8 +336,8 @@ def _read_bases(path: str | Path, value: Any, depth: int) -> list[str]:
         )
     if depth >= MAX_BASES or len(bases) > MAX_BASES:
         raise FileFormatError(
-            f"{path}: base: expected at most {MAX_BASES} files, one "
-            "over the other, got more"
+            f"{path}: base: expected at most {MAX_BASES} files, one over the other, "
+            "got more"
         )
     return bases
 

@@ -90,8 +90,8 @@ def rate_interval(
     has_rows = n_counted.shape == n_rows.shape and n_rows.size and n_rows.max() > 0
     if not has_rows or (n_counted < 0).any() or (n_counted > n_rows).any():
         raise InputError(
-            "share: expected counts from 0 to the predictions of each "
-            "unit, and one prediction at least"
+            "share: expected counts from 0 to the predictions of each unit, and one "
+            "prediction at least"
         )
     are_rows_independent = n_rows.max() == 1.0
     if are_rows_independent:
@@ -107,8 +107,9 @@ def _betting_interval(samples: FloatArray, confidence: float) -> tuple[float, fl
     made more than is likely by chance (`ConfidenceSequence`).
     """
     values, counts = np.unique(samples, return_counts=True)
-    # The capital begins with 1. By chance each side exceeds this one with half of the
-    # probability that is left (Markov).
+    # The capital of each side begins with 1. By chance it reaches 2 / (1 - confidence)
+    # with a probability of (1 - confidence) / 2 at most (Markov), for both sides
+    # together with 1 - confidence.
     winning_log_capital = np.log(2.0 / (1.0 - confidence))
 
     def is_not_too_small(mean: float) -> bool:

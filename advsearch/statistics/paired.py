@@ -38,8 +38,8 @@ def paired_difference(
     correlation = _phi_coefficient(both, first, second, neither)
 
     def combine(second_distance: float, first_distance: float) -> float:
-        """Return the distance of a bound of the difference from it, by the distances of
-        the bounds of both rates from these.
+        """Return how far a bound of the difference is from the difference, by how far
+        the bounds of both rates are from the rates.
         """
         squared = (
             second_distance * second_distance

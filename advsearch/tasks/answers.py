@@ -114,8 +114,8 @@ class FreeAnswer(Task):
         if isinstance(returned, (list, tuple)) and all(map(_is_answer, returned)):
             return list(returned)
         raise ValueError(
-            "expected a mapping with text, logits and begins for each "
-            "picture, as answers in words have"
+            "expected a mapping with text, logits and begins for each picture, as "
+            "answers in words have"
         )
 
     def check(self, facts: tasks.Facts) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -89,8 +90,8 @@ class Command(Task):
             set_field(self, "envelope", _parse_numbers("envelope", self.envelope))
             if min(self.envelope) <= 0.0:
                 raise InputError(
-                    "task command: envelope: expected numbers over 0, "
-                    f"got {min(self.envelope):g}"
+                    "task command: envelope: expected numbers over 0, got "
+                    f"{min(self.envelope):g}"
                 )
 
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
@@ -130,8 +131,8 @@ class Command(Task):
             or actions.shape[:1] != (count,)
         ):
             raise ValueError(
-                "expected an action for each picture, (N, A), or a "
-                "mapping with these under action"
+                "expected an action for each picture, (N, A), or a mapping with these "
+                "under action"
             )
         if actions.ndim == 1:
             actions = actions[:, None]
@@ -178,19 +179,19 @@ class Command(Task):
             )
         if model.labels:
             raise InputError(
-                "labels: task command has no classes; this is a "
-                "classifier: give a policy as `model`"
+                "labels: task command has no classes; this is a classifier: give a "
+                "policy as `model`"
             )
         if self.envelope is None:
             raise InputError(
                 "task command: envelope: expected how far an action may be off, in its "
-                "unit, or a list with a number "
-                "for each element, got none; write `task='command={envelope: 0.2}'`"
+                "unit, or a list with a number for each element, got none; write "
+                "`task='command={envelope: 0.2}'`"
             )
         if minimise:
             raise InputError(
-                "minimise: the clean action is within its envelope "
-                "already; leave it out"
+                "minimise: the clean action is within its envelope already; leave it "
+                "out"
             )
         return replace(
             self, target=None if target is None else self._parse_target(target)
@@ -247,8 +248,8 @@ class Command(Task):
         """
         if len(self.target) != len(clean_action):
             raise InputError(
-                f"target: expected an action of {len(clean_action)} "
-                f"elements, got {len(self.target)}"
+                f"target: expected an action of {len(clean_action)} elements, got "
+                f"{len(self.target)}"
             )
         # The loss is the distance in envelopes, minus 1. Within a distance of 2, an action
         # could be in both envelopes: right, and a success.
@@ -429,13 +430,10 @@ def _parse_numbers(option: str, value: Any) -> Numbers:
     """
     items = value.tolist() if hasattr(value, "tolist") else value
     items = list(items) if isinstance(items, (list, tuple)) else [items]
-    # Nothing remains of what is no number: then the count is refused below.
-    try:
-        if any(isinstance(item, bool) for item in items):
-            raise ValueError
-        numbers = tuple(float(item) for item in items)
-    except (TypeError, ValueError, OverflowError):
-        numbers = ()
+    numbers: Numbers = ()  # remains if an item is no number: then it is refused below
+    if not any(isinstance(item, bool) for item in items):
+        with suppress(TypeError, ValueError, OverflowError):
+            numbers = tuple(float(item) for item in items)
     # well within the range of float32
     are_finite = all(math.isfinite(number) and abs(number) < 1e30 for number in numbers)
     if not 1 <= len(numbers) <= MAX_NUMBERS or not are_finite:

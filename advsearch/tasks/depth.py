@@ -173,7 +173,7 @@ class Depth(Task):
             "a number over 0, under 100",
             "tolerance",
         )
-        # 0, the default, means that there is none
+        # 0, the default, means that there is none: the lower bound lets it pass
         self.check_numbers(
             lambda value: -1e-9 < value < 1e6, "a number over 0, under 1e+06", "size"
         )
@@ -204,8 +204,8 @@ class Depth(Task):
         ):
             raise ValueError(
                 "expected a number for each pixel, (N, height, width) or (N, 1, "
-                "height, width), or a mapping with "
-                f"these under predicted_depth or {', '.join(KINDS)}"
+                "height, width), or a mapping with these under predicted_depth or "
+                f"{', '.join(KINDS)}"
             )
         return [{kind: depth_map} for depth_map in maps.float()]
 
@@ -265,8 +265,8 @@ class Depth(Task):
         if not kind:
             return (
                 f"kind: expected what its numbers are, one of {', '.join(KINDS)}, and "
-                "its network does not say it; "
-                f"give `task='depth={{kind: {DISPARITY}}}'`, say"
+                "its network does not say it; give `task='depth={kind: "
+                f"{DISPARITY}}}'`, say"
             )
         if kind == METRIC:
             has_scene_size = truth is not None and truth.size_in_metres is not None
@@ -274,19 +274,16 @@ class Depth(Task):
                 return ""
             return (
                 "size: it predicts metres, and how large the object is is not known; "
-                "give its longest side in metres, "
-                "such as `size=0.1`"
+                "give its longest side in metres, such as `size=0.1`"
             )
         if truth is None or not truth.is_visible or truth.determines_scale:
             return ""
         return (
-            "it predicts up to a scale and a shift, which are found on what is "
-            "seen beside the object: expected "
-            f"{MIN_FIT_PIXELS} pixels at distances that differ by a factor of "
-            f"{MIN_DISTANCE_RATIO:g}, "
-            f"got {int(truth.outside_object.sum())}; "
-            "give a scene with a ground or a room, and a camera that sees it from "
-            "the side"
+            "it predicts up to a scale and a shift, which are found on what is seen "
+            f"beside the object: expected {MIN_FIT_PIXELS} pixels at distances that "
+            f"differ by a factor of {MIN_DISTANCE_RATIO:g}, got "
+            f"{int(truth.outside_object.sum())}; give a scene with a ground or a room, "
+            "and a camera that sees it from the side"
         )
 
     @property
@@ -327,10 +324,9 @@ class Depth(Task):
         if bool(sees_far_from_axis.any()):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, "
-                "and this lens sees things more "
-                f"than {math.degrees(math.acos(MIN_AXIS_COSINE)):.0f} degrees from its "
-                "axis; "
-                "take a lens that sees less"
+                "and this lens sees things more than "
+                f"{math.degrees(math.acos(MIN_AXIS_COSINE)):.0f} degrees from its "
+                "axis; take a lens that sees less"
             )
         return DepthTruth(facts.mask, facts.z_depth, facts.sight.size_in_metres)
 
@@ -416,6 +412,7 @@ class Depth(Task):
         z = truth.z.to(predicted.device)
         # of predicted to true, both z-depth or both its inverse
         if is_inverse:
+            # divided by the true inverse, 1 / z
             ratio = predicted[mask] * z[mask]
         else:
             ratio = predicted[mask] / z[mask]
@@ -595,11 +592,11 @@ class Depth(Task):
 
 
 def _find_maps(returned: Any) -> tuple[str, Any]:
-    """Find the maps in what a network returned, or None.
+    """Find the maps in what a network returned.
 
     Returns:
         Which of `KINDS` the network states for its values, "" if it states none; and the
-        maps, unchecked.
+        maps, unchecked: None or something else if there are none.
     """
     if isinstance(returned, Mapping):
         kind = next((kind for kind in KINDS if kind in returned), "")

@@ -291,7 +291,7 @@ class Detection(ClassTask):
             unit = "pixels"  # as `DECLARED_FORMAT_ATTRIBUTE` says
         else:
             unit = infer_unit(select_best_boxes(resolved)) or self.inferred_unit
-        # beside boxes: the model fills its outputs up with rows of NaN
+        # rows of NaN beside boxes: with them the model fills its outputs up
         has_nan_rows = any(
             "n_nan_rows" in detections and len(detections["boxes"])
             for detections in resolved
@@ -313,8 +313,8 @@ class Detection(ClassTask):
         """
         stated_order = self._stated_network_order
         has_logits = any("logits" in detections for detections in output)
-        has_class_names = has_logits and self.named
-        if not stated_order and has_class_names and is_nothing_name(self.labels[-1]):
+        is_last_nothing = self.named and is_nothing_name(self.labels[-1])
+        if not stated_order and has_logits and is_last_nothing:
             stated_order = SOFTMAX_QUERIES
         n_classes = len(self.labels) if self.named else None
         try:
@@ -370,10 +370,10 @@ class Detection(ClassTask):
         if not (self.unit or self.inferred_unit):
             return (
                 "unit: expected the unit of the model's boxes, and it finds nothing in "
-                "noise and in the clean scene "
-                f"that shows it; say {format_option('unit: fractions')} or "
-                f"{format_option('unit: pixels')}, and `boxes` too "
-                "unless they are x0, y0, x1, y1"
+                "noise and in the clean scene that shows it; say "
+                f"{format_option('unit: fractions')} or "
+                f"{format_option('unit: pixels')}, and `boxes` too unless they are x0, "
+                "y0, x1, y1"
             )
         return ""
 
@@ -682,8 +682,7 @@ class Detection(ClassTask):
     ) -> Tensor:
         """Return which boxes (D,) are on the object, however loosely.
 
-        A box that overlaps another thing of the right classes more than the object does
-        not count.
+        A box does not count if it overlaps another thing of the right classes more.
         """
         boxes = detections["boxes"]
         true_box = truth.box_fractions
@@ -850,8 +849,8 @@ class Detection(ClassTask):
         """Decide what is detected in an image in which the object is out of view.
 
         It is a phantom if a box of a right class where nothing is reaches `confidence`.
-        Otherwise there is no outcome; neither if phantoms are sought, since
-        `_match_object` has found none then.
+        Otherwise there is no outcome. There is none either if phantoms are sought:
+        `_match_object` has looked for them already.
         """
         right_score = self._find_best_scores(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)

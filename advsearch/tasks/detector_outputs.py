@@ -34,10 +34,9 @@ from advsearch.tasks.boxes import Detections, are_counted, are_invalid, format_o
 
 EXPECTED = (
     "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, "
-    "D) and scores (N, D); rows "
-    "(N, D, 6) of a box, a score and a class; one tensor (N, 4 + classes, D) or (N, D, "
-    "5 + classes) as YOLO's; or for "
-    "each picture a mapping with boxes (D, 4), labels (D,) and scores (D,)"
+    "D) and scores (N, D); rows (N, D, 6) of a box, a score and a class; one tensor "
+    "(N, 4 + classes, D) or (N, D, 5 + classes) as YOLO's; or for each picture a "
+    "mapping with boxes (D, 4), labels (D,) and scores (D,)"
 )
 
 # What the two numbers beside a box may be.
@@ -144,9 +143,8 @@ def parse_order(text: str) -> tuple[str, ...]:
     if sorted(names) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
         raise ValueError(
             f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', "
-            "of a YOLO's head "
-            f"{' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or '{LAYOUTS[1]}' "
-            "after it, or of a DETR's "
+            f"of a YOLO's head {' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or "
+            f"'{LAYOUTS[1]}' after it, or of a DETR's "
             f"{' or '.join(map(repr, QUERIES))}, got {text!r}"
         )
     return names
@@ -1039,8 +1037,8 @@ def find_head_orders(
     if orders == [_WITH_ANGLE] and not order:
         raise ValueError(
             f"its {5 + classes} channels may be those of an OBB head (with an angle), "
-            f"{_UNREAD}; if it has "
-            f"objectness, say `task='detection={{order: {_WITH_ANGLE}}}'`"
+            f"{_UNREAD}; if it has objectness, say `task='detection={{order: "
+            f"{_WITH_ANGLE}}}'`"
         )
     if orders:
         return tuple(orders)

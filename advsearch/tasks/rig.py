@@ -52,8 +52,8 @@ class Rig(tasks.JointTask):
             )
         if not isinstance(self.task, (str, Mapping, Task)):
             raise InputError(
-                "task rig: task: expected a name, or a mapping with a "
-                f"`name`, got {self.task!r:.80}"
+                "task rig: task: expected a name, or a mapping with a `name`, got "
+                f"{self.task!r:.80}"
             )
 
     @property

@@ -71,8 +71,7 @@ def list_name_folders(folder: str) -> list[tuple[str, Path]]:
         got = f"only {folders[0][0]}" if folders else "no folder"
         raise InputError(
             f"references: expected two folders of pictures at least in {root}, each "
-            "called by its name, such as mug "
-            f"and bowl, got {got}"
+            f"called by its name, such as mug and bowl, got {got}"
         )
     return folders
 
@@ -235,8 +234,7 @@ def _list_visible(folder: Path) -> list[Path]:
     except OSError as error:
         raise InputError(
             "references: expected a folder with a folder of pictures for each name, "
-            f"got {folder} "
-            f"({error.strerror}); check the path"
+            f"got {folder} ({error.strerror}); check the path"
         ) from None
 
 
@@ -317,8 +315,8 @@ class Similarity(tasks.Classification):
         super().__post_init__()
         if self.method not in METHODS:
             raise InputError(
-                "task similarity: method: expected one of "
-                f"{', '.join(METHODS)}, got {self.method!r}"
+                f"task similarity: method: expected one of {', '.join(METHODS)}, got "
+                f"{self.method!r}"
             )
         if isinstance(self.k, bool) or not isinstance(self.k, int) or self.k < 1:
             raise InputError(
@@ -353,10 +351,9 @@ class Similarity(tasks.Classification):
         if not self.references and self.threshold is None:
             raise InputError(
                 "task similarity: references: expected a folder with a folder of "
-                "pictures for each name, or a "
-                "`threshold` of the cosine to the clean picture, got neither; write "
-                "`task='similarity={references: FOLDER}'` or "
-                "`task='similarity={threshold: 0.8}'`"
+                "pictures for each name, or a `threshold` of the cosine to the clean "
+                "picture, got neither; write `task='similarity={references: FOLDER}'` "
+                "or `task='similarity={threshold: 0.8}'`"
             )
         if target is not None and not self.references:
             raise InputError(
@@ -456,8 +453,8 @@ class Similarity(tasks.Classification):
         """
         if self.clean is None or self.threshold is None:
             raise InputError(
-                "task similarity: expected references, or a clean "
-                "picture that it was shown first"
+                "task similarity: expected references, or a clean picture that it was "
+                "shown first"
             )
         cosine = features @ self.clean.to(features)
         threshold = torch.full_like(cosine, self.threshold)

@@ -484,8 +484,7 @@ def make_each_thing_task(task: Task) -> EachThingTask:
     if isinstance(task, EnsembleTask) or task.name not in PER_THING_TASKS:
         raise InputError(
             f"judge: all is for {' and '.join(PER_THING_TASKS)}, got task {task.name}; "
-            "judge "
-            "one thing, by its name"
+            "judge one thing, by its name"
         )
     # a class of its own, since name and objective are attributes of the class
     attributes = {"name": task.name, "objective": task.objective}

@@ -138,8 +138,8 @@ def _check_journal(journal: Path) -> None:
         last_bytes = file.read()
         if last_bytes == _JOURNAL:
             raise FileFormatError(
-                f"{journal}: expected the journal of one file, got "
-                "one that names another; remove it"
+                f"{journal}: expected the journal of one file, got one that names "
+                "another; remove it"
             )
 
 
@@ -154,8 +154,8 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     """
     if not os.path.isfile(path):
         raise FileFormatError(
-            f"{path}: expected the results of a run, got no such "
-            "file; check the name of the run"
+            f"{path}: expected the results of a run, got no such file; check the name "
+            "of the run"
         )
     address = path.resolve().as_uri()
     db = sqlite3.connect(f"{address}?mode=ro", uri=True)

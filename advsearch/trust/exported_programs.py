@@ -40,9 +40,8 @@ NUMBER = 1 << 63  # numbers are smaller than this
 
 FUNCTIONS = frozenset(
     "Integer Rational Float Add Mul Max Min Mod Abs Eq Ne Lt Le Gt Ge Equality "
-    "Unequality StrictLessThan LessThan "
-    "StrictGreaterThan GreaterThan And Or Not Piecewise ExprCondPair FloorDiv "
-    "ModularIndexing Where PythonMod CleanDiv "
+    "Unequality StrictLessThan LessThan StrictGreaterThan GreaterThan And Or Not "
+    "Piecewise ExprCondPair FloorDiv ModularIndexing Where PythonMod CleanDiv "
     "CeilToInt FloorToInt CeilDiv FloatTrueDiv IntTrueDiv "
     "IsNonOverlappingAndDenseIndicator TruncToFloat TruncToInt "
     "RoundToInt RoundDecimal ToFloat Identity floor ceiling".split()
@@ -420,11 +419,11 @@ def _read_shape(archive: Archive, member: str, entry: JsonObject) -> list[int]:
     """
     meta = entry.get("tensor_meta")
     sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
-    shape: list[Any] = [None]  # refused below
-    if isinstance(sizes, list):
-        shape = [
-            size.get("as_int") if isinstance(size, dict) else None for size in sizes
-        ]
+    if not isinstance(sizes, list):
+        sizes = [None]  # refused below
+    shape: list[Any] = [
+        size.get("as_int") if isinstance(size, dict) else None for size in sizes
+    ]
     if not all(isinstance(size, int) and size >= 0 for size in shape):
         raise make_archive_error(
             archive.path,

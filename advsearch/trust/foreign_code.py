@@ -48,9 +48,8 @@ class TimedOut(Exception):
 
     def __init__(self) -> None:
         super().__init__(
-            f"no answer within {scale_limit(LONGEST)} seconds; if you trust it, {FACTOR}=10 "
-            "in the environment "
-            "waits ten times as long"
+            f"no answer within {scale_limit(LONGEST)} seconds; if you trust it, "
+            f"{FACTOR}=10 in the environment waits ten times as long"
         )
 
 

@@ -82,8 +82,8 @@ def _check_no_secret(address: SplitResult) -> None:
     if secret_names:
         where = f"`{secret_names[0]}` in the address"
     raise InputError(
-        f"model: {where} would be stored with the run; put the key "
-        f"into {KEY} and leave it out there"
+        f"model: {where} would be stored with the run; put the key into {KEY} and "
+        "leave it out there"
     )
 
 
@@ -177,9 +177,8 @@ def _write_certificate(hosts: Sequence[str], key: Path, certificate: Path) -> No
         )
     except FileNotFoundError:
         raise InputError(
-            "https: needs the program openssl, which makes the certificate; "
-            "apt-get install openssl, or leave "
-            "`host` and `https` out"
+            "https: needs the program openssl, which makes the certificate; apt-get "
+            "install openssl, or leave `host` and `https` out"
         ) from None
     except (OSError, subprocess.SubprocessError) as error:
         output: bytes = getattr(error, "stderr", None) or b""

@@ -58,9 +58,8 @@ def run_converter(
     except subprocess.TimeoutExpired:
         raise FileFormatError(
             f"{path}: {program} had not read it after {longest} seconds; export glTF "
-            "(.glb) from it yourself, or give "
-            f"it longer: {FACTOR}=10 in the environment makes all limits ten times as "
-            "large"
+            f"(.glb) from it yourself, or give it longer: {FACTOR}=10 in the "
+            "environment makes all limits ten times as large"
         ) from None
 
 
@@ -104,8 +103,7 @@ def find_blender(who: str, otherwise: str) -> list[str]:
             missing = f"{BLENDER} names {program}, which can't be run"
         raise FileFormatError(
             f"{who}, and {missing}; install Blender so that `blender` is found, or "
-            "type "
-            "`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
+            "type `python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
             f"{BLENDER}=bpy/bin/python; or {otherwise}"
         )
     program = os.path.abspath(executable)

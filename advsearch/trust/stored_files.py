@@ -101,8 +101,7 @@ def make_size_error(path: Path | str, expected: str, size: str) -> FileFormatErr
     """
     return FileFormatError(
         f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the "
-        "environment makes all limits "
-        "ten times as large"
+        "environment makes all limits ten times as large"
     )
 
 

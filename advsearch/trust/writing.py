@@ -226,8 +226,8 @@ def check_not_moved(path: Path) -> None:
         if not is_same_file:
             raise StorageError(
                 f"{folder}: the folder of this run was removed or renamed while the "
-                "run went on; start it again, or "
-                "go on with what was renamed by advsearch resume"
+                "run went on; start it again, or go on with what was renamed by "
+                "advsearch resume"
             )
 
 
@@ -279,8 +279,8 @@ class RunLock:
         if not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
             self.release()
             raise FileFormatError(
-                f"{self._path}: expected an ordinary file, got a "
-                "pipe or the like; remove it"
+                f"{self._path}: expected an ordinary file, got a pipe or the like; "
+                "remove it"
             )
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -350,8 +350,8 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
         for entry in inside:
             if entry.is_symlink():
                 raise FileFormatError(
-                    f"{entry.path}: expected a file or a folder of "
-                    "this run, got a link; remove it"
+                    f"{entry.path}: expected a file or a folder of this run, got a "
+                    "link; remove it"
                 )
             if entry.is_dir(follow_symlinks=False):
                 if not folder.endswith(unchecked_suffix):
