@@ -92,8 +92,8 @@ if not TYPE_CHECKING:  # else a checker would take any name
             return get_experiment(name).python
         if name == "plan":
             raise AttributeError(
-                "`plan` is a part of `check` now: use "
-                "advsearch.check(..., loss='model')"
+                "`plan` is a part of `check` now: use advsearch.check(..., "
+                "loss='model')"
             )
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -21,8 +21,8 @@ DEVICES = ("device", "cuda", "gpu", "use_cuda")
 UNSUPPORTED_KEYWORDS = {
     **dict.fromkeys(
         DEVICES,
-        "pictures are made on the processor, and a model stays on "
-        "the device that it is on",
+        "pictures are made on the processor, and a model stays on the device that it "
+        "is on",
     ),
     **dict.fromkeys(
         ("lr", "learning_rate", "step_size", "alpha", "momentum"),
@@ -54,8 +54,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def make_unexpected_error(
     function: str, keywords: Mapping[str, object], known: Sequence[str]
 ) -> TypeError | None:
-    """Return the error for the first keyword that a function does not have; None if it
-    has all.
+    """Return the error for the first of some keywords that a function does not have;
+    None if it has all of them.
 
     The message suggests what is probably meant.
 
@@ -68,7 +68,9 @@ def make_unexpected_error(
         if name in known:
             continue
         suggestions, reason = suggest_keyword(name, known)
-        if not suggestions and name.lower() not in DEVICES:
+        # a device is chosen by no keyword, whatever is spelled like it
+        is_device = name.lower() in DEVICES
+        if not suggestions and not is_device:
             suggestions = find_similar_names(name, known)[:2]
         hint = ""
         if suggestions:
@@ -99,28 +101,34 @@ def check_types(
 
     Arrays and tensors pass, since they may stand for numbers and lists.
 
+    Args:
+        parameters: parameters by name.
+        values: values by name of the parameter; others are not checked.
+
     Raises:
-        InputError: a value has none of the types.
+        InputError: a value has none of the types, or `run` is an empty text.
     """
     for name, value in values.items():
         parameter = parameters.get(name)
-        if parameter is None or value is parameter.default or hasattr(value, "tolist"):
+        if parameter is None or value is parameter.default:
+            continue
+        is_array = hasattr(value, "tolist")
+        if is_array:
             continue
         type_names = _parse_annotation(str(parameter.annotation))
         if type_names and not any(_has_type(kind, value) for kind in type_names):
-            expected = either(
-                [
-                    TYPE_WORDS.get(kind, f"a {kind.rpartition('.')[2]}")
-                    for kind in type_names
-                ]
-            )
+            words = [
+                # a class by its name, without its module
+                TYPE_WORDS.get(kind, f"a {kind.rpartition('.')[2]}")
+                for kind in type_names
+            ]
             raise InputError(
-                f"{name}: expected {expected}, got {describe_value(value)}"
+                f"{name}: expected {either(words)}, got {describe_value(value)}"
             )
         if name == "run" and isinstance(value, str) and not value.strip():
             raise InputError(
-                "run: expected the name of a run or a folder, got an "
-                "empty text; leave it out for no run"
+                "run: expected the name of a run or a folder, got an empty text; leave "
+                "it out for no run"
             )
 
 
@@ -159,6 +167,7 @@ def _has_type(kind: str, value: object) -> bool:
     }
     if kind in fits:
         return fits[kind]
+    # a class, "package.module.Class", or one that is derived from it
     class_names = [base.__name__ for base in type(value).__mro__]
     return kind.rpartition(".")[2] in class_names
 

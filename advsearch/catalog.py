@@ -539,18 +539,20 @@ def is_present(module: str) -> bool:
     in.
     """
     names = module.split(".")
-    path: Sequence[str] | None = None
+    path: Sequence[str] | None = None  # where to look; None is Python's own path
     for depth in range(1, len(names) + 1):
         spec = _find_spec(".".join(names[:depth]), path)
         if spec is None:
             return False
-        # where the next part of the name is looked for; none in a plain module
+        # the next name is looked for inside of this package; a module has nothing inside
         path = spec.submodule_search_locations or ()
     return True
 
 
 def _find_spec(module: str, path: Sequence[str] | None) -> ModuleSpec | None:
-    """Return where Python would import a module from, without importing it or its parents."""
+    """Return where Python would import a module from, without importing it or its
+    parents; None if it is nowhere.
+    """
     for finder in sys.meta_path:
         try:
             spec = finder.find_spec(module, path)
@@ -566,7 +568,9 @@ def list_built_ins(kind: str) -> dict[str, BuiltIn]:
     """Return the built-in parts of one kind by name, without those whose module is
     missing.
     """
-    parts = (part for part in BUILT_INS if part.kind == kind)
-    return {
-        part.name: part for part in parts if is_present(part.target.partition(":")[0])
-    }
+    built_ins = {}
+    for part in BUILT_INS:
+        module, _, _ = part.target.partition(":")
+        if part.kind == kind and is_present(module):
+            built_ins[part.name] = part
+    return built_ins

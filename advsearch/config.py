@@ -45,8 +45,8 @@ def read_named(value: Any, setting: str, default_name: str) -> Any:
     if isinstance(value, str) and "=" in value:
         name, options = written.parse_assignment(value, setting)
         if not isinstance(options, Mapping):
-            # no mapping: kept under a name that nothing has, so that it is refused
-            # later
+            # no mapping: stored under a name that no option has, so that it is
+            # refused where options are checked
             options = {"": options}
         value = {"name": name, **options}
     if not isinstance(value, Mapping):
@@ -66,6 +66,11 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
 
     Several become their names with + between them, and under each name its options:
     ``{"name": "detection+depth", "detection": {"iou": 0.7}}``.
+
+    Args:
+        value: the value of the setting; what is no name is returned as it is.
+        setting: its name, for messages.
+        default_name: the name of a mapping without one.
     """
     # at each + that is not in braces
     entries = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
@@ -83,11 +88,13 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
         names.append(name)
         if mapping:
             options[name] = mapping
-    last_options = options.get(names[-1], {})
-    # A command is written back as detection+depth={depth: {seek: gone}}: the options of
-    # the last name are then those of all names.
-    if last_options.keys() <= set(names):
-        options[names[-1]] = {}
+    # A command is written back as detection+depth={depth: {seek: gone}}: then the last
+    # name is followed by the options of all names.
+    last_name = names[-1]
+    last_options = options.get(last_name, {})
+    are_of_all_names = last_options.keys() <= set(names)
+    if are_of_all_names:
+        options[last_name] = {}
         options.update(last_options)
     options = {name: value for name, value in options.items() if value}
     return read_named(
@@ -185,8 +192,8 @@ class SceneConfig(Config):
     facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting(
         None,
         "scene",
-        "which axis of an imported object's file its front faces, "
-        "turned towards +x here",
+        "which axis of an imported object's file its front faces, turned towards +x "
+        "here",
         otherwise="as the format says (+z in glTF and VRM 1, -z in VRM 0), and +x in "
         "others",
     )
@@ -209,11 +216,10 @@ class SceneConfig(Config):
         None,
         "scene",
         "which camera takes the picture: one of a scene file, or the one around the "
-        "object, mounted somewhere or with "
-        "a lens of its own",
+        "object, mounted somewhere or with a lens of its own",
         "a name that advsearch import lists, orbit, dashcam, robot, fisheye, "
-        "equirectangular, or a camera file of "
-        "OpenCV, Kalibr, ROS, COLMAP or nerfstudio",
+        "equirectangular, or a camera file of OpenCV, Kalibr, ROS, COLMAP or "
+        "nerfstudio",
         metavar="NAME",
         otherwise="orbit, the pinhole around the object that camera.* describes",
         min_length=1,
@@ -287,16 +293,15 @@ class SceneConfig(Config):
         "model",
         "the network under test",
         "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, "
-        "hf:REPOSITORY, an address such as "
-        "http://localhost:8000, or package.module:callable",
+        "hf:REPOSITORY, an address such as http://localhost:8000, or "
+        "package.module:callable",
     )
     labels: str | None = setting(
         None,
         "model",
         "names of the model's classes",
         "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91, voc, "
-        "or the names with commas between "
-        "them",
+        "or the names with commas between them",
         metavar="FILE",
         otherwise="the model's own",
     )
@@ -304,8 +309,8 @@ class SceneConfig(Config):
         None,
         "model",
         "text for a model that takes text beside the picture: for CLIP what a picture "
-        "is compared with, one text for "
-        "each label; for a model such as LLaVA the question",
+        "is compared with, one text for each label; for a model such as LLaVA the "
+        "question",
         "a text, for CLIP with {} where the name goes, or several with | between them",
         otherwise="a photo of a {}, or What is this?",
         metavar="TEXT",
@@ -322,10 +327,8 @@ class SceneConfig(Config):
         dict,
         "model",
         "a limit for a model behind an address, such as calls=500: calls (2000), "
-        "tokens and money of a run, seconds of "
-        "an answer (120), requests at_once (4), and the prices per_call, "
-        "per_million_in and per_million_out; may be "
-        "repeated",
+        "tokens and money of a run, seconds of an answer (120), requests at_once (4), "
+        "and the prices per_call, per_million_in and per_million_out; may be repeated",
         "LIMIT=NUMBER",
         metavar="LIMIT=NUMBER",
     )
@@ -333,8 +336,7 @@ class SceneConfig(Config):
         "classification",
         "model",
         "what the model does, and how its predictions are judged; for several models "
-        "one task each, with + between "
-        "them",
+        "one task each, with + between them",
         "the name of a task, or NAME={OPTION: VALUE}",
     )
     label: str | None = setting(
@@ -368,8 +370,7 @@ class SceneConfig(Config):
         None,
         "search",
         "samples per pixel of a render of the search; auto takes half of the default, "
-        "and renders the best candidates "
-        "again while they are close",
+        "and renders the best candidates again while they are close",
         "a whole number from 1 to 65536, or auto",
         otherwise="8 with the denoiser, 16 without",
         unit="samples",
@@ -381,8 +382,8 @@ class SceneConfig(Config):
         "multijitter",
         "search",
         "how samples are spread over a pixel, in search and verification; multijitter "
-        "has less noise and rounds the "
-        "number of samples up to a product of two near numbers",
+        "has less noise and rounds the number of samples up to a product of two near "
+        "numbers",
     )
 
     seed: int = setting(
@@ -423,19 +424,19 @@ class SceneConfig(Config):
         tasks = self.task_name.split(TASK_SEPARATOR)
         for setting_name in ("object", "environment", "model"):
             names = written.split_names(getattr(self, setting_name) or "")
-            if setting_name == "model" and len(tasks) > 1:
+            needs_model_per_task = setting_name == "model" and len(tasks) > 1
+            if needs_model_per_task:
                 if len(names) != len(tasks):
                     raise InputError(
                         f"model: expected {len(tasks)} with commas between them, one "
-                        f"for each of {', '.join(tasks)}, "
-                        f"got {len(names)}"
+                        f"for each of {', '.join(tasks)}, got {len(names)}"
                     )
             elif len(names) > 1 and setting_name not in self.list_settings:
                 raise make_single_value_error(setting_name, names)
         if self.size is not None and len(self.objects) > 1:
             raise InputError(
-                "size: it is the size of one object, and there are "
-                "several; leave it out, or give `unit`"
+                "size: it is the size of one object, and there are several; leave it "
+                "out, or give `unit`"
             )
         return self
 
@@ -468,16 +469,17 @@ class SceneConfig(Config):
 
     @property
     def search_spp(self) -> int:
-        """Samples a pixel of the search: what was asked for, or the default for the
-        denoiser.
+        """Samples per pixel of a render of the search: what is set, or the default for
+        the denoiser, of which "auto" takes a part.
         """
-        if self.spp == "auto":
-            return SEARCH_SPP[self.denoise] // AUTO_SPP_DIVISOR
-        return self.spp if isinstance(self.spp, int) else SEARCH_SPP[self.denoise]
+        if isinstance(self.spp, int):
+            return self.spp
+        default = SEARCH_SPP[self.denoise]
+        return default // AUTO_SPP_DIVISOR if self.spp == "auto" else default
 
     @property
     def image_settings(self) -> dict[str, Any]:
-        """Keywords of `render` for the images that the models see."""
+        """The settings of the images that the models see, as keywords of `render`."""
         return {
             "resolution": self.resolution,
             "denoise": self.denoise,
@@ -498,24 +500,27 @@ class SceneConfig(Config):
 
     @property
     def models(self) -> tuple[str, ...]:
-        """The models by name; those of several tasks are one together."""
-        return (
-            (self.model,)
-            if TASK_SEPARATOR in self.task_name
-            else written.split_names(self.model)
-        )
+        """The models by name. For a joint task, "detection+depth", its models are a single
+        one, whose name has commas.
+        """
+        is_joint_task = TASK_SEPARATOR in self.task_name
+        return (self.model,) if is_joint_task else written.split_names(self.model)
 
     @field_validator(*TEXT_SETTINGS, mode="before", check_fields=False)
     @classmethod
     def _as_text(cls, value: Any, info: Any) -> Any:
-        listed = info.field_name == "labels" and isinstance(value, (list, tuple))
-        if listed and any("," in str(name) for name in value):
+        """Return names, in a list or not, as a text with commas between them."""
+        is_list_of_labels = info.field_name == "labels" and isinstance(
+            value, (list, tuple)
+        )
+        if is_list_of_labels and any("," in str(name) for name in value):
             raise ValueError("a name that would be two; a file can have it")
         return written.to_text(value, several=info.field_name in LIST_SETTINGS)
 
     @field_validator("facing", mode="before", check_fields=False)
     @classmethod
     def _with_a_sign(cls, value: Any) -> Any:
+        """Return an axis with its sign: "x" is "+x"."""
         return f"+{value}" if value in ("x", "y", "z") else value
 
     _things_as_text = field_validator("things", mode="before")(format_things)
@@ -524,12 +529,12 @@ class SceneConfig(Config):
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
         """Join a list of prompts by " | "; none of them may be empty."""
-        if isinstance(value, (list, tuple)) and all(
-            isinstance(text, str) for text in value
-        ):
+        is_list = isinstance(value, (list, tuple))
+        if is_list and all(isinstance(text, str) for text in value):
             value = " | ".join(value)
-        if isinstance(value, str) and not all(map(str.strip, value.split("|"))):
-            raise ValueError("no text")
+        if isinstance(value, str):
+            if not all(prompt.strip() for prompt in value.split("|")):
+                raise ValueError("no text")
         return value
 
     @field_validator("task", mode="before")
@@ -540,6 +545,9 @@ class SceneConfig(Config):
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
     def _controls_with_options(cls, value: Any) -> Any:
+        """Return controls as a mapping from their names to options; those without options
+        get an empty mapping, and Mitsuba's names are gathered in one control.
+        """
         if not isinstance(value, Mapping):
             return value
         return {
@@ -550,16 +558,17 @@ class SceneConfig(Config):
     @field_validator("resolution", mode="before")
     @classmethod
     def _resolution_from_text(cls, value: Any) -> Any:
-        sizes = value.lower().split("x") if isinstance(value, str) else value
-        if isinstance(sizes, int):
-            sizes = [sizes]
-        if isinstance(sizes, (list, tuple)) and len(sizes) == 1:
-            return [*sizes, *sizes]
-        return sizes
+        """Read ``SIDE`` or ``HEIGHTxWIDTH``; a single side is that of a square."""
+        sides = value.lower().split("x") if isinstance(value, str) else value
+        if isinstance(sides, int):
+            sides = [sides]
+        is_square = isinstance(sides, (list, tuple)) and len(sides) == 1
+        return [*sides, *sides] if is_square else sides
 
     @field_validator("resolution")
     @classmethod
     def _sides_in_range(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        """Check that both sides are within their limits."""
         if not all(8 <= side <= 4096 for side in value or ()):
             raise ValueError("out of range")
         return value
@@ -567,6 +576,7 @@ class SceneConfig(Config):
     @field_validator("value_range", mode="before")
     @classmethod
     def _range_from_text(cls, value: Any) -> Any:
+        """Read ``LOW,HIGH``."""
         return value.split(",") if isinstance(value, str) else value
 
     @field_validator("value_range")
@@ -574,6 +584,7 @@ class SceneConfig(Config):
     def _range_in_order(
         cls, value: tuple[float, float] | None
     ) -> tuple[float, float] | None:
+        """Check that the first value is below the second one."""
         if value is not None and value[0] >= value[1]:
             raise ValueError("out of order")
         return value
@@ -581,22 +592,25 @@ class SceneConfig(Config):
     @field_validator("set_", mode="before")
     @classmethod
     def _numbers_from_text(cls, value: Any) -> Any:
+        """Read texts that are numbers as such; YAML takes 1e-3 for a text."""
         if not isinstance(value, Mapping):
             return value
-        # YAML takes 1e-3 for text
         return {
             name: written.parse_number_or_text(text) for name, text in value.items()
         }
 
 
 def make_single_value_error(name: str, names: Sequence[str]) -> InputError:
-    """Return the error for several objects, environments or models where one is
-    expected.
+    """Return the error for several names where one is expected.
+
+    Args:
+        name: the setting: "object", "environment" or "model".
+        names: its names.
     """
-    listed = written.format_value(",".join(names))
+    got = written.format_value(",".join(names))
     return InputError(
-        f"{name}: expected one {name}, got {listed}; give one, or "
-        "compare several with advsearch sweep"
+        f"{name}: expected one {name}, got {got}; give one, or compare several with "
+        "advsearch sweep"
     )
 
 
@@ -646,8 +660,8 @@ class RenderConfig(SceneConfig):
     out: str = setting(
         ...,
         "picture",
-        "the file to write: a .png holds what the model sees, an .exr "
-        "linear radiance times the gain",
+        "the file to write: a .png holds what the model sees, an .exr linear radiance "
+        "times the gain",
         "the path of a .png or .exr file",
     )
 
@@ -657,14 +671,11 @@ class RenderConfig(SceneConfig):
         """Return the path of an image as a text.
 
         Raises:
-            ValueError: it has not the suffix of an image, or a zero byte in it.
+            ValueError: it does not have the suffix of an image, or has a zero byte in it.
         """
         text = str(value) if isinstance(value, Path) else value
-        if (
-            not isinstance(text, str)
-            or "\0" in text
-            or Path(text).suffix.lower() not in IMAGE_SUFFIXES
-        ):
+        is_path = isinstance(text, str) and "\0" not in text
+        if not is_path or Path(text).suffix.lower() not in IMAGE_SUFFIXES:
             raise ValueError("not a picture")
         return text
 
@@ -692,8 +703,7 @@ class DerivativeConfig(SceneConfig):
         None,
         "search",
         "how far a control may move from its start, in its own unit (for several "
-        "controls CONTROL=NUMBER,...; in "
-        "`attack` also NUMBER,NUMBER,... for a curve)",
+        "controls CONTROL=NUMBER,...; in `attack` also NUMBER,NUMBER,... for a curve)",
         f"a number greater than 0 and at most {MAX_EPSILON:g}",
         otherwise="the control's own",
     )
@@ -727,8 +737,7 @@ class DerivativeConfig(SceneConfig):
         "leave out what the scene and the search don't need",
         flag="--no-specialise",
         switched="compute everything, also what this search does not need; `advsearch "
-        "check` shows what is left out "
-        "otherwise",
+        "check` shows what is left out otherwise",
     )
 
     @field_validator("epsilon", mode="before")
@@ -738,28 +747,20 @@ class DerivativeConfig(SceneConfig):
         that the numbers are in range and none comes twice.
 
         The result is a single value, a tuple to be tried one after the other, or a
-        mapping by control.
+        mapping by control. Texts in it stay: pydantic turns them into numbers.
         """
         if isinstance(value, str):
-            entries = [entry.strip() for entry in value.split(",")]
-            if "=" in value:
-                pairs = [
-                    written.parse_assignment(entry, "epsilon") for entry in entries
-                ]
-                written.check_no_duplicates((name for name, _ in pairs), "epsilon")
-                value = dict(pairs)
-            else:
-                value = tuple(entries)
+            value = _split_epsilons(value)
         if isinstance(value, (list, tuple)) and len(value) == 1:
             value = value[0]
+        if value is None:
+            return value
         if isinstance(value, Mapping):
             values = list(value.values())
         elif isinstance(value, (list, tuple)):
             values = list(value)
         else:
-            # None passes, as 1.0 would
-            values = [1.0 if value is None else value]
-        # for the checks alone: pydantic itself turns the value into numbers
+            values = [value]
         numbers = [_parse_positive(number) for number in values]
         if isinstance(value, (list, tuple)):
             written.check_no_duplicates(
@@ -775,14 +776,30 @@ class DerivativeConfig(SceneConfig):
         return self.epsilon if isinstance(self.epsilon, tuple) else ()
 
 
+def _split_epsilons(text: str) -> dict[str, Any] | tuple[str, ...]:
+    """Return the values in a text by control, or without controls in order.
+
+    Raises:
+        InputError: there are two values for one control.
+    """
+    entries = [entry.strip() for entry in text.split(",")]
+    if "=" not in text:
+        return tuple(entries)
+    pairs = [written.parse_assignment(entry, "epsilon") for entry in entries]
+    written.check_no_duplicates((name for name, _ in pairs), "epsilon")
+    return dict(pairs)
+
+
 def _parse_positive(value: Any) -> float:
     """Return a positive number in range, given as a number or a text.
 
     Raises:
         ValueError: it is none.
     """
+    if isinstance(value, bool):
+        raise ValueError("out of range")
     try:
-        number = float("nan") if isinstance(value, bool) else float(value)
+        number = float(value)
     except (TypeError, OverflowError):
         raise ValueError("not a number") from None
     # what is smaller has no square in float32

@@ -25,45 +25,48 @@ def copy_value(value: Value) -> Value:
     on demand.
     """
     original: Any = value
-    copy_of_value: Any = original
-    if hasattr(original, "requires_grad"):
-        copy_of_value = original.clone()
+    copied: Any = original
+    is_tensor = hasattr(original, "requires_grad")
+    if is_tensor:
+        copied = original.clone()
     elif isinstance(original, np.ndarray):
-        copy_of_value = original.copy()
+        copied = original.copy()
     elif isinstance(original, MutableMapping):
-        copy_of_value = copy.copy(original)
-        copy_of_value.update(
-            {key: copy_value(inner) for key, inner in original.items()}
-        )
+        copied = copy.copy(original)
+        copied.update({key: copy_value(inner) for key, inner in original.items()})
     elif isinstance(original, MappingProxyType):
-        copy_of_value = MappingProxyType(
+        copied = MappingProxyType(
             {key: copy_value(inner) for key, inner in original.items()}
         )
     elif isinstance(original, list):
-        copy_of_value = copy.copy(original)
-        copy_of_value[:] = map(copy_value, original)
+        copied = copy.copy(original)
+        copied[:] = map(copy_value, original)
     elif isinstance(original, tuple):
-        copied_items = map(copy_value, original)
-        copy_of_value = (
-            type(original)(*copied_items)
-            # a named tuple takes its items one by one
-            if hasattr(original, "_fields")
-            else type(original)(copied_items)
-        )
+        copied = _copy_tuple(original)
     elif isinstance(original, SimpleNamespace):
-        copy_of_value = SimpleNamespace(**copy_value(vars(original)))
-    elif (
-        is_dataclass(original)
-        and not isinstance(original, type)
-        and not getattr(original, "gives_copies", False)
-    ):
-        copy_of_value = copy.copy(original)
-        for field in fields(original):
-            # also in a frozen dataclass
-            object.__setattr__(
-                copy_of_value, field.name, copy_value(getattr(original, field.name))
-            )
-    return copy_of_value  # type: ignore[no-any-return]
+        copied = SimpleNamespace(**copy_value(vars(original)))
+    elif is_dataclass(original) and not isinstance(original, type):
+        if not getattr(original, "gives_copies", False):
+            copied = _copy_dataclass(original)
+    return copied  # type: ignore[no-any-return]
+
+
+def _copy_tuple(original: tuple[Any, ...]) -> Any:
+    """Return a tuple of the same type with copies of its items."""
+    items = map(copy_value, original)
+    is_named = hasattr(original, "_fields")
+    # a named tuple takes its items one by one
+    return type(original)(*items) if is_named else type(original)(items)
+
+
+def _copy_dataclass(original: Any) -> Any:
+    """Return a dataclass with copies of its fields."""
+    copied = copy.copy(original)
+    for field in fields(original):
+        field_value = copy_value(getattr(original, field.name))
+        # also in a frozen dataclass
+        object.__setattr__(copied, field.name, field_value)
+    return copied
 
 
 def is_ours(kind: type) -> bool:
@@ -72,10 +75,8 @@ def is_ours(kind: type) -> bool:
 
 
 def hand_copies(kind: type, **argument_slices: slice) -> None:
-    """Replace methods of a class from outside of this package by ones that are called
-    with copies of their arguments.
-
-    So code of others can change what it is given without harm.
+    """Make methods of a class from outside of this package get copies of their
+    arguments, so that code of others can change what it gets without harm.
 
     Args:
         kind: the class; one of this package is left as it is.
@@ -91,8 +92,12 @@ def hand_copies(kind: type, **argument_slices: slice) -> None:
 
 
 def _wrap_with_copies(method: Callable[..., Any], which: slice) -> Callable[..., Any]:
-    """Return a method that is called with copies: of the positional arguments `which`,
-    after `self`, and of all keyword arguments.
+    """Return a method that calls another one with copies of arguments.
+
+    Args:
+        method: the method that is called.
+        which: the positional arguments after `self` that are copied; all keyword
+            arguments are.
     """
 
     @wraps(method)

@@ -32,17 +32,23 @@ class PythonQuantiles(dict[str, object]):
         """Evaluate an inverse CDF at `QUANTILES`; values are rounded to six digits, as
         a file has them.
 
+        Args:
+            name: name of the distribution, for the setting and for errors.
+            function: the inverse CDF.
+
         Raises:
             InputError: the function fails.
         """
         try:
-            quantiles = [float(f"{float(function(p)):.6g}") for p in QUANTILES]
+            quantiles = [
+                float(f"{float(function(probability)):.6g}")
+                for probability in QUANTILES
+            ]
         except Exception as error:  # the user's code may raise anything
             raise InputError(
                 f"distribution {name}: expected a function from a share in [0, 1] to a "
-                "value (an inverse CDF), or an "
-                "object with such an `icdf` or `ppf`; it raised "
-                f"{type(error).__name__}: {error}"
+                "value (an inverse CDF), or an object with such an `icdf` or `ppf`; it "
+                f"raised {type(error).__name__}: {error}"
             ) from error
         super().__init__(
             {DISTRIBUTION: FROM_PYTHON, "name": name, "quantiles": quantiles}
@@ -51,6 +57,7 @@ class PythonQuantiles(dict[str, object]):
 
 
 def _loc_scale(d: Any) -> dict[str, Any]:
+    """Return the parameters that a distribution of torch has in common with scipy's."""
     return {"loc": d.loc, "scale": d.scale}
 
 
@@ -90,51 +97,23 @@ def distribution_to_setting(value: object) -> object:
             inverse CDF.
     """
     if isinstance(value, Mapping):
-        # weights may be numbers of numpy or torch
-        weights = [
-            w.item() if getattr(w, "ndim", 1) == 0 else w for w in value.values()
-        ]
-        are_numbers = all(
-            isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights
-        )
-        if value and are_numbers and not value.keys() & {DISTRIBUTION, CHOICES}:
-            # an integer too large for a float is left: whoever reads the setting says
-            # what it takes
-            with suppress(OverflowError):
-                return {CHOICES: list(value), WEIGHTS: list(map(float, weights))}
-        return value
+        return _choices_to_setting(value)
     kind = type(value)
-    if (
-        kind.__module__.startswith("torch.distributions")
-        and kind.__name__ in TORCH_DISTRIBUTIONS
-    ):
-        name, parameters = TORCH_DISTRIBUTIONS[kind.__name__]
-        return _named(name, parameters(value))
+    is_of_torch = kind.__module__.startswith("torch.distributions")
+    if is_of_torch and kind.__name__ in TORCH_DISTRIBUTIONS:
+        name, get_parameters = TORCH_DISTRIBUTIONS[kind.__name__]
+        return _make_setting(name, get_parameters(value))
     # a frozen distribution of scipy has its family there
     family = getattr(value, "dist", value)
-    if hasattr(family, "pmf") and hasattr(family, "ppf"):
+    is_of_integers = hasattr(family, "pmf") and hasattr(family, "ppf")
+    if is_of_integers:
         raise InputError(
             f"distribution {getattr(family, 'name', kind.__name__)}: expected one of "
-            "real numbers, got one of whole "
-            "ones; give its values as {choices: [...], weights: [...]}"
+            "real numbers, got one of whole ones; give its values as {choices: [...], "
+            "weights: [...]}"
         )
-    # a family of the user may have the name of one of scipy's, but is of another class
-    of_scipy = getattr(
-        sys.modules.get("scipy.stats"), str(getattr(family, "name", "")), NotImplemented
-    )
-    if family is not value and type(family) is type(of_scipy):
-        frozen: Any = value
-        # parameters by position or name, in scipy's own order
-        shapes, loc, scale = frozen.dist._parse_args(*frozen.args, **frozen.kwds)
-        names = [
-            name.strip()
-            for name in (frozen.dist.shapes or "").split(",")
-            if name.strip()
-        ]
-        return _named(
-            frozen.dist.name,
-            {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale},
-        )
+    if family is not value and _is_family_of_scipy(family):
+        return _frozen_to_setting(value)
     quantile = getattr(value, "icdf", None) or getattr(value, "ppf", None)
     if quantile and kind.__module__.startswith("torch"):
         torch = sys.modules["torch"]  # it is there: the distribution is one of its own
@@ -149,8 +128,51 @@ def distribution_to_setting(value: object) -> object:
     return value
 
 
-def _named(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:
-    """Return the setting of a distribution of scipy with its parameters."""
+def _choices_to_setting(value: Mapping[Any, Any]) -> object:
+    """Return choices and their weights as a setting; a mapping that is something else,
+    such as a setting already, as it is.
+    """
+    # weights may be numbers of numpy or torch
+    weights = [w.item() if getattr(w, "ndim", 1) == 0 else w for w in value.values()]
+    are_numbers = all(
+        isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights
+    )
+    is_setting = bool(value.keys() & {DISTRIBUTION, CHOICES})
+    if value and are_numbers and not is_setting:
+        # an integer too large for a float is left: whoever reads the setting says what
+        # it takes
+        with suppress(OverflowError):
+            return {CHOICES: list(value), WEIGHTS: list(map(float, weights))}
+    return value
+
+
+def _is_family_of_scipy(family: Any) -> bool:
+    """Return whether a family of distributions is one of scipy's; one of the user may
+    have the name of one of these, but is of another class.
+    """
+    name = str(getattr(family, "name", ""))
+    family_of_scipy = getattr(sys.modules.get("scipy.stats"), name, NotImplemented)
+    return type(family) is type(family_of_scipy)
+
+
+def _frozen_to_setting(frozen: Any) -> dict[str, object]:
+    """Return a frozen distribution of scipy as a setting."""
+    # parameters by position or name, in scipy's own order
+    shapes, loc, scale = frozen.dist._parse_args(*frozen.args, **frozen.kwds)
+    names = [
+        name.strip() for name in (frozen.dist.shapes or "").split(",") if name.strip()
+    ]
+    parameters = {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale}
+    return _make_setting(frozen.dist.name, parameters)
+
+
+def _make_setting(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:
+    """Return the setting of a distribution of scipy with its parameters, rounded to
+    twelve digits.
+
+    Raises:
+        InputError: a parameter is not a single number.
+    """
     try:
         return {
             DISTRIBUTION: name,
@@ -159,6 +181,5 @@ def _named(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:
     except (TypeError, ValueError, RuntimeError):
         raise InputError(
             f"distribution {name}: expected one of a single number, got parameters of "
-            "several; give one for each "
-            "parameter"
+            "several; give one for each parameter"
         ) from None

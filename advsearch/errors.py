@@ -53,10 +53,10 @@ class UnknownNameError(InputError):
         """
         names = sorted(known)
         near = find_similar_names(name, names)[:3]
-        guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
-        listed = ", ".join(names) or "none"
-        more = f" {hint}" if hint else ""
-        super().__init__(f"unknown {kind} {name!r}.{guess} Known: {listed}.{more}")
+        guess = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+        all_names = ", ".join(names) or "none"
+        ending = f" {hint}" if hint else ""
+        super().__init__(f"unknown {kind} {name!r}.{guess} Known: {all_names}.{ending}")
         self.near = tuple(near)
 
 
@@ -105,8 +105,8 @@ def find_similar_names(name: str, known: Iterable[str]) -> list[str]:
     First come names with all of its words ("coffee mug" for "mug"; a plural s is no
     difference), then those with words that begin like its words, then those that
     contain it. Among equals, fewer other words are better, then the same last word.
-    Only where there are none, names of nearly the same spelling follow, as a whole or
-    in one word.
+    If there are none, names are returned that are spelled nearly like it, or of which
+    a word is.
     """
     query_words = _split_words(name)
     names = list(dict.fromkeys(known))
@@ -119,12 +119,12 @@ def find_similar_names(name: str, known: Iterable[str]) -> list[str]:
         return sorted(ranks, key=ranks.__getitem__)
     matcher = difflib.SequenceMatcher(None, "", name.casefold())
     similarities = {known: _compute_similarity(matcher, known) for known in names}
-    return sorted(
-        filter(similarities.get, names), key=lambda known: -similarities[known]
-    )
+    similar = [known for known in names if similarities[known] > 0.0]
+    return sorted(similar, key=lambda known: -similarities[known])
 
 
 def _split_words(name: str) -> list[str]:
+    """Return the words of a name in lower case; longer words without a plural s."""
     words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
     return [
         re.sub("(?<=ss|sh|ch)es$|(?<=[^s])s$", "", word) if len(word) > 3 else word
@@ -133,40 +133,42 @@ def _split_words(name: str) -> list[str]:
 
 
 def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] | None:
-    """Return how well a name fits to what was asked for; smaller is better, None is not
-    at all.
+    """Return how well a name fits a query; smaller is better, None is not at all.
 
     Args:
-        query: the words that were asked for.
-        words: those of the name.
+        query: the words of the query.
+        words: the words of the name.
 
     Returns:
-        The kind of likeness (0 is best), how many words it has more, and whether its
-        last word is another one.
+        The kind of likeness: 0 if the name has all words of the query, 1 if each begins
+        a word of the name, 2 if the name contains the query; how many words it has
+        more; and whether its last word is another one.
     """
     if not query or not words:
         return None
-    preference = len(words) - len(query), words[-1] != query[-1]
+    n_more_words = len(words) - len(query)
+    has_other_end = words[-1] != query[-1]
     if set(query) <= set(words):
-        return (0, *preference)
+        return 0, n_more_words, has_other_end
     if all(any(word.startswith(query_word) for word in words) for query_word in query):
-        return (1, *preference)
-    return (2, *preference) if "".join(query) in "".join(words) else None
+        return 1, n_more_words, has_other_end
+    if "".join(query) in "".join(words):
+        return 2, n_more_words, has_other_end
+    return None
 
 
 def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> float:
-    """Return how near the spelling of a name is to what was asked for, as a whole or in
-    one word, in [0, 1]; 0 where it is not near enough.
+    """Return how near the spelling of a name, or of one of its words, is to a query, in
+    [0, 1]; 0 where it is not near enough.
 
     Args:
-        matcher: has what was asked for as its second sequence.
+        matcher: has the query as its second sequence.
         name: name to compare.
     """
+    candidates = [(name.casefold(), MIN_SIMILARITY)]
+    candidates += [(word, MIN_WORD_SIMILARITY) for word in _split_words(name)]
     best_ratio = 0.0
-    for text, threshold in [
-        (name.casefold(), MIN_SIMILARITY),
-        *((word, MIN_WORD_SIMILARITY) for word in _split_words(name)),
-    ]:
+    for text, threshold in candidates:
         matcher.set_seq1(text)
         if (
             # upper bounds that take less time

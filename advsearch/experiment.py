@@ -84,7 +84,8 @@ class RunContext(ExitStack, Generic[Settings]):
         progress: Progress | None = None,
         resumed: Path | None = None,
     ) -> None:
-        """Begin to measure the time; the run itself is made when it is asked for first.
+        """Begin to measure the time; the run directory is created by the first access to
+        `run`.
 
         Args:
             config: the settings of the experiment.
@@ -117,8 +118,8 @@ class RunContext(ExitStack, Generic[Settings]):
 
     @contextmanager
     def until_interrupted(self) -> Iterator[None]:
-        """Run a block that Ctrl-C ends; the experiment goes on after it with `ending`
-        set to `INTERRUPTED`.
+        """Let Ctrl-C end the block, but not the experiment: that goes on after it, with
+        `ending` set to `INTERRUPTED`.
         """
         try:
             with interruptible():
@@ -152,8 +153,8 @@ class RunContext(ExitStack, Generic[Settings]):
         """Return a result with the given fields and those that every result has.
 
         These are what the settings state (`SHARED_RESULT_FIELDS`), the run, how it
-        ended, the command line, and the total seconds, which join the `seconds` that
-        are given.
+        ended, the command line, and the seconds. To `seconds` among the given fields, which
+        has those of stages, the total is added.
         """
         settings = self.config
         shared = {
@@ -163,7 +164,7 @@ class RunContext(ExitStack, Generic[Settings]):
         }
         for name in ("objects", "controls"):
             if name in shared:
-                shared[name] = list(shared[name])
+                shared[name] = list(shared[name])  # a tuple, and a mapping by name
         seconds = {
             "total": time.perf_counter() - self._start_time,
             **fields.pop("seconds", {}),
@@ -184,24 +185,23 @@ def run_and_save(
     """Call the function of an experiment, and save its result, page and figure in the
     directory of its run.
 
-    Where the function made no run through the context, it has saved its result itself,
-    and nothing is saved here.
+    If the function has not created the run through the context, it has saved its result
+    itself, and nothing is saved here.
     """
     with context:
         result = function(context)
         if not context.has_run:
             return result
+        images = context.run.path / "images"
         for suffix, data in render_result_figure(get_view(result)).items():
-            write_bytes(
-                context.run.path / "images" / f"{context.config.command}.{suffix}", data
-            )
+            write_bytes(images / f"{context.config.command}.{suffix}", data)
         return write_result(context.run, result)
 
 
 def run_experiment(
     config: Config, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> Result:
-    """Run the experiment that the settings are of.
+    """Run the experiment to which settings belong, and return its result.
 
     Args:
         config: settings of any experiment; `config.command` names it.
@@ -215,6 +215,7 @@ def run_experiment(
 
     if not config.python_only_parts:  # objects of a session may have any name
         check_names(dict(config))
+    # an experiment with `out` writes a file or folder of its own
     writes_run = resumed is None and getattr(config, "out", None) is None
     # The folder is made before heavy imports, so that a run that is stopped early can
     # be listed.
@@ -249,7 +250,8 @@ def run_part(
         run: runs the experiment with settings; None for `run_experiment`.
     """
     run = run or run_experiment
-    if not is_run(folder) or not (folder / CONFIG).is_file():
+    is_started = is_run(folder) and (folder / CONFIG).is_file()
+    if not is_started:
         return run(
             # what lies there was left before the run began
             config.model_copy(update={"run": str(folder), "overwrite": True}),
@@ -350,8 +352,14 @@ class Experiment(Generic[AnyResult]):
         resumed: Path | None = None,
         **arguments: Any,
     ) -> AnyResult:
-        """Run the experiment with settings, and save its result; `arguments` go to the
-        function.
+        """Run the experiment with settings, and save its result.
+
+        Args:
+            config: the settings.
+            progress: is told how far it is.
+            resumed: folder of the run to go on with; None for a new run.
+            arguments: further arguments of the experiment's function
+                (`python_arguments`).
         """
         return run_and_save(
             partial(self.function, **arguments), RunContext(config, progress, resumed)
@@ -373,13 +381,10 @@ class Experiment(Generic[AnyResult]):
         """Return the function of the experiment for Python callers, whose keywords are
         the settings.
         """
-        # only Python callers need it
-        from advsearch.api.keywords import (
-            make_config,
-            with_settings_signature,
-        )  # imports torch
+        # only Python callers need it; imports torch
+        from advsearch.api.keywords import make_config, with_settings_signature
 
-        own_arguments = self._find_python_arguments()
+        object_parameters = self._find_python_arguments()
 
         def function(
             *args: Any, progress: Any = None, resume: bool = False, **settings: Any
@@ -387,11 +392,13 @@ class Experiment(Generic[AnyResult]):
             positional = dict(zip(self.positional_args, args, strict=False))
             values = {**positional, **settings}
             # objects that settings cannot have go to the experiment's function directly
-            arguments = {name: values[name] for name in own_arguments if name in values}
+            arguments = {
+                name: values[name] for name in object_parameters if name in values
+            }
             config_values = {
                 name: value
                 for name, value in values.items()
-                if name not in own_arguments or name in self.positional_args
+                if name not in object_parameters or name in self.positional_args
             }
             config = make_config(self.settings, **config_values)
             resumed = find_stopped_run(config) if resume else None
@@ -399,7 +406,7 @@ class Experiment(Generic[AnyResult]):
                 config, progress=as_progress(progress), resumed=resumed, **arguments
             )
 
-        signature = self._make_signature(own_arguments)
+        signature = self._make_signature(object_parameters)
         function.__signature__ = signature  # type: ignore[attr-defined]
         function.__name__ = self.settings.command
         function.__qualname__ = self.settings.command
@@ -408,10 +415,14 @@ class Experiment(Generic[AnyResult]):
         return with_settings_signature(self.settings)(function)
 
     def _make_signature(
-        self, own_arguments: Mapping[str, inspect.Parameter]
+        self, object_parameters: Mapping[str, inspect.Parameter]
     ) -> inspect.Signature:
         """Return the signature of the function for Python callers, with `**settings`
         for the settings.
+
+        Args:
+            object_parameters: parameters, by name, that take objects and are no settings
+                (`_find_python_arguments`).
         """
         make = inspect.Parameter
         parameters = [
@@ -419,7 +430,7 @@ class Experiment(Generic[AnyResult]):
         ]
         parameters += [
             parameter
-            for name, parameter in own_arguments.items()
+            for name, parameter in object_parameters.items()
             if name not in self.positional_args
         ]
         if self.resumes_in_python:
@@ -435,8 +446,8 @@ class Experiment(Generic[AnyResult]):
         return inspect.Signature(parameters, return_annotation=self.result.__name__)
 
     def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
-        """Return the parameters, by name, that Python callers may pass beside settings;
-        they are objects, not texts.
+        """Return the parameters, by name, by which Python callers may pass objects that
+        no setting can have.
         """
         if not self.python_arguments:
             return {}
@@ -481,8 +492,8 @@ def experiment(
         # RunContext[NameConfig] has the class of the settings in brackets
         (settings,) = get_args(hints[first_parameter])
         returned = hints["return"]
-        # the first of a union, or the type itself
-        result = (*get_args(returned), returned)[0]
+        union_members = get_args(returned)
+        result = union_members[0] if union_members else returned
         return Experiment(function, settings, result, examples, **attributes)
 
     return decorate

@@ -23,9 +23,8 @@ packages' readers.
 
 def either(names: Sequence[str], word: str = "or") -> str:
     """Return names as a sentence lists them: ".a, .b or .c"."""
-    return f" {word} ".join(
-        [*([", ".join(names[:-1])] if names[1:] else []), names[-1]]
-    )
+    *first, last = names
+    return f"{', '.join(first)} {word} {last}" if first else last
 
 
 PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
@@ -40,12 +39,12 @@ def split_paths(name: str) -> list[str]:
     ``camera.csv+orbit``.
     """
     first, _, second = name.partition("+")
-    is_camera_path, is_object_path = (
+    if not second or os.path.isfile(name):  # the name of a file may have a + in it
+        return [name]
+    is_camera_file, is_object_file = (
         part.lower().endswith(PATH_ENDINGS) for part in (first, second)
     )
-    has_two_paths = (
-        second
-        and (is_camera_path or (is_object_path and "/" not in first))
-        and not os.path.isfile(name)
-    )
-    return [first, second] if has_two_paths else [name]
+    # beside the object's file, the camera's path may be a built-in one, by its name
+    may_be_camera_name = "/" not in first
+    is_pair = is_camera_file or (is_object_file and may_be_camera_name)
+    return [first, second] if is_pair else [name]

@@ -32,12 +32,14 @@ class Interrupts:
         self._last = -DUPLICATE_SECONDS
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Handle a signal: count it, and raise KeyboardInterrupt unless all is over. A
-        duplicate of the signal before is ignored.
+        """Handle a signal: count it, and raise KeyboardInterrupt unless nothing is left
+        to interrupt (`ended`).
+
+        A signal soon after another one is the same Ctrl-C, and is ignored.
         """
-        before = self._last
+        previous = self._last
         self._last = time.monotonic()
-        if self._last - before < DUPLICATE_SECONDS:
+        if self._last - previous < DUPLICATE_SECONDS:
             return
         self.count += 1
         if not self.ended:
@@ -48,9 +50,16 @@ class Interrupts:
         """Whether one has come that nobody has handled."""
         return self.count > self.handled
 
+    def mark_handled(self) -> None:
+        """Count all interrupts so far as handled."""
+        self.handled = self.count
+
     def look(self) -> None:
         """Raise an interrupt that has come already and was not handled; in the main
         thread, where it belongs.
+
+        Raises:
+            KeyboardInterrupt: there is one.
         """
         if self.waiting and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
@@ -69,25 +78,25 @@ def interruptible() -> Iterator[None]:
             any error, which may have come of it.
     """
     handler = signal.getsignal(signal.SIGINT)
-    in_main = threading.current_thread() is threading.main_thread()
+    is_main_thread = threading.current_thread() is threading.main_thread()
     # in a notebook Python's own handler is in place: ours takes over, to count
-    counted = in_main and handler is signal.default_int_handler
-    if counted:
-        INTERRUPTS.handled = INTERRUPTS.count
+    replaces_handler = is_main_thread and handler is signal.default_int_handler
+    if replaces_handler:
+        INTERRUPTS.mark_handled()
         signal.signal(signal.SIGINT, INTERRUPTS)
     try:
         yield
         INTERRUPTS.look()
     except KeyboardInterrupt:
-        INTERRUPTS.handled = INTERRUPTS.count
+        INTERRUPTS.mark_handled()
         raise
     except Exception as error:
         if INTERRUPTS.waiting:
-            INTERRUPTS.handled = INTERRUPTS.count
+            INTERRUPTS.mark_handled()
             raise KeyboardInterrupt from error
         raise
     finally:
-        if counted:
+        if replaces_handler:
             signal.signal(signal.SIGINT, handler)
 
 
@@ -95,43 +104,46 @@ def end_at_the_second() -> None:
     """Let a second Ctrl-C end this process at once, wherever it is, also in native
     code.
 
-    A thread hears of the signals. What is stored is kept, as when the process is
+    A thread waits for the signals. What is stored is kept, as when the process is
     killed. Call it in the main thread, once.
     """
-    ours, theirs = socket.socketpair()
-    theirs.setblocking(False)
+    reading_end, writing_end = socket.socketpair()
+    writing_end.setblocking(False)
     # Python's signal handler in C writes the number of each signal there at once
-    signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
-    # `theirs` must live as long as the thread
+    signal.set_wakeup_fd(writing_end.fileno(), warn_on_full_buffer=False)
     threading.Thread(
-        target=_hear, args=(ours, theirs), name="interrupts", daemon=True
+        target=_wait_for_second,
+        # the writing end, too: it must live as long as the thread
+        args=(reading_end, writing_end),
+        name="interrupts",
+        daemon=True,
     ).start()
 
 
-def _hear(ours: socket.socket, theirs: socket.socket) -> None:
+def _wait_for_second(reading_end: socket.socket, writing_end: socket.socket) -> None:
     """End the process at the second Ctrl-C; the body of a thread that waits for
     signals.
 
     Args:
-        ours: ours from which the numbers of signals are read.
-        theirs: the other end, to which they are written; it is only kept open here.
+        reading_end: socket from which the numbers of signals are read.
+        writing_end: the other end, to which they are written; it is only kept open
+            here.
     """
-    first: float | None = None
+    first_time: float | None = None  # of the first Ctrl-C
     while True:
-        if signal.SIGINT not in ours.recv(64):
+        if signal.SIGINT not in reading_end.recv(64):
             continue
         now = time.monotonic()
-        if (
-            # one Ctrl-C may come as two signals in a short time
-            first is not None
-            and now - first >= DUPLICATE_SECONDS
-            and not INTERRUPTS.ended
-        ):
+        if first_time is None:
+            first_time = now
+            continue
+        # one Ctrl-C may come as two signals in a short time
+        is_duplicate = now - first_time < DUPLICATE_SECONDS
+        if not is_duplicate and not INTERRUPTS.ended:
+            show_cursor = b"\x1b[?25h" if os.isatty(2) else b""  # bars hide it
             with suppress(OSError):
-                # bars hide the cursor
-                os.write(2, b"\x1b[?25h" * os.isatty(2) + b"advsearch: interrupted\n")
+                os.write(2, show_cursor + b"advsearch: interrupted\n")
             os._exit(128 + signal.SIGINT)
-        first = now if first is None else first
 
 
 def unless_interrupted(unraisable: sys.UnraisableHookArgs) -> None:

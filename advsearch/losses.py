@@ -64,7 +64,8 @@ def carlini_wagner(
 ) -> Tensor:
     """Return `margin`, clipped at a confidence (Carlini and Wagner 2017, f_6).
 
-    Beyond it, only other terms have a gradient.
+    Where it is clipped it has no gradient: there a search improves what else the
+    objective consists of.
     """
     return margin(logits, labels).clamp(max=confidence)
 
@@ -166,29 +167,29 @@ def check_direction(objective: object, *, targeted: bool) -> None:
     """
     function = getattr(objective, "func", objective)  # of functools.partial
     module = str(getattr(function, "__module__", None) or type(function).__module__)
-    if targeted and module.startswith(
+    is_of_torch = module.startswith(
         ("torch.nn.functional", "torch.nn.modules", "torch._C")
-    ):
+    )
+    if targeted and is_of_torch:
         name = getattr(function, "__name__", type(function).__name__)
         raise InputError(
             f"objective: it is maximised, and torch's {name} falls towards the "
-            "`target`; take "
-            "losses.targeted_cross_entropy, or negate it: lambda logits, labels: "
-            "-loss(logits, labels)"
+            "`target`; take losses.targeted_cross_entropy, or negate it: lambda "
+            "logits, labels: -loss(logits, labels)"
         )
-    # each loss of this module, and its counterpart for a target
     for name in __all__:
-        if f"targeted_{name}" not in __all__:
+        counterpart = f"targeted_{name}"  # the same loss for a target
+        if counterpart not in __all__:
             continue
         if function is globals()[name] and targeted:
             raise InputError(
                 f"objective: losses.{name} leads away from the `target`; "
-                f"take losses.targeted_{name}"
+                f"take losses.{counterpart}"
             )
-        if function is globals()[f"targeted_{name}"] and not targeted:
+        if function is globals()[counterpart] and not targeted:
             raise InputError(
-                f"objective: losses.targeted_{name} needs a `target`; "
-                f"name one, or take losses.{name}"
+                f"objective: losses.{counterpart} needs a `target`; name one, or take "
+                f"losses.{name}"
             )
 
 
@@ -198,14 +199,21 @@ def check_direction(objective: object, *, targeted: bool) -> None:
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
     """Return a loss (N,) of logits (N, C) for their labels.
 
-    Labels are (N,) or (1,) int64, one for each row or for all; or the indices of a
-    label set, any of which counts, for all rows.
+    Args:
+        loss: objective function (logits, images, label set) -> (N,) that does not look
+            at the images: it gets the logits in their place.
+        logits: (N, C).
+        labels: (N,) or (1,) int64, one for each row or for all; or the indices of a
+            label set, any of which counts, for all rows.
+
+    Raises:
+        InputError: labels are something else, or their number is another one.
     """
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(
             "labels: expected (N,) int64 or the indices of a label set, got "
-            f"{type(labels).__name__}, the truth of "
-            "another task than classification; a loss of your own takes it as it is"
+            f"{type(labels).__name__}, the truth of another task than classification; "
+            "a loss of your own takes it as it is"
         )
     if not isinstance(labels, Tensor):
         return loss(logits, logits, tuple(labels))
@@ -215,14 +223,13 @@ def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Te
             f"labels: expected {len(logits)}, one for each row of logits, "
             f"got {len(label_sets)}"
         )
-    if len(set(label_sets)) == 1:
+    if len(set(label_sets)) == 1:  # the same label for all rows
         return loss(logits, logits, label_sets[0])
-    return torch.cat(
-        [
-            loss(row[None], row[None], label_set)
-            for row, label_set in zip(logits, label_sets, strict=True)
-        ]
-    )
+    row_losses = [
+        loss(row[None], row[None], label_set)
+        for row, label_set in zip(logits, label_sets, strict=True)
+    ]
+    return torch.cat(row_losses)
 
 
 def _to_batch(colors: Tensor) -> Tensor:

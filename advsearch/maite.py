@@ -53,8 +53,8 @@ class _MaiteNetwork(nn.Module):
         targets = list(self.model(list(images)))
         if len(targets) != len(images):
             raise InputError(
-                "MAITE model: expected a target for each of "
-                f"{len(images)} images, got {len(targets)}"
+                f"MAITE model: expected a target for each of {len(images)} images, got "
+                f"{len(targets)}"
             )
         if self.task == "classification":
             return torch.stack([torch.as_tensor(scores).float() for scores in targets])
@@ -66,6 +66,7 @@ def _to_detections(target: Any) -> dict[str, Tensor]:
     scores = torch.as_tensor(target.scores).float()
     if scores.ndim == 2:  # of every class; `labels` has the likeliest
         n_classes = scores.shape[1]
+        # `amax` needs a class
         scores = scores.amax(dim=1) if n_classes else scores.new_zeros(len(scores))
     boxes = torch.as_tensor(target.boxes).float().reshape(-1, 4)
     return {
@@ -110,6 +111,7 @@ def load_model(
     metadata = getattr(model, "metadata", {})
     index2label = metadata.get("index2label")
     if labels is None and index2label:
+        # indices without a label in between get a placeholder
         labels = [
             index2label.get(index, f"class {index}")
             for index in range(max(index2label) + 1)
@@ -170,7 +172,7 @@ class Scenes:
         spp: int = 64,
         seed: int = 0,
     ) -> None:
-        """Draw `count` configurations of the controls; arguments are those of the
+        """Sample `count` configurations of the controls; arguments are those of the
         class.
 
         Raises:
@@ -232,7 +234,7 @@ class Scenes:
         """Return the target of a configuration (d,): a one-hot vector of the right
         class, or the boxes and classes of the visible things.
 
-        Things whose names are no labels are left out.
+        Things that are of none of the classes are left out.
         """
         right_class = self.right.indices[0]
         if self.task == "classification":

@@ -26,8 +26,8 @@ TASK_SEPARATOR = (
 
 
 def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
-    """Return controls with all keys of Mitsuba in one: ``{"mitsuba:KEY": RANGE}``
-    becomes ``{"mitsuba": {KEY: RANGE}}``.
+    """Return controls in which the one for Mitsuba's names has all of them:
+    ``{"mitsuba:KEY": RANGE}`` becomes ``{"mitsuba": {KEY: RANGE}}``.
 
     A range of a single parameter becomes one of a control: ``{"pose.yaw": RANGE}``
     becomes ``{"pose.yaw": {"yaw": RANGE}}``.
@@ -64,8 +64,10 @@ def _with_parameter(name: str, options: object) -> object:
     of the parameter "yaw".
     """
     _, dot, parameter = name.partition(".")
-    if not dot or ":" in name or options is None:
+    is_class = ":" in name  # "package.module:Class", whose dot is of another kind
+    if not dot or is_class or options is None:
         return options
+    # a range may be a mapping, too
     is_range = not isinstance(options, Mapping) or bool(
         options.keys() & {"distribution", "choices", "range"}
     )
@@ -97,25 +99,33 @@ def format_things(things: object) -> str | None:
         _format_thing(item) if isinstance(item, Mapping) else str(item)
         for item in items
     )
-    texts = []
-    for thing in filter(None, map(str.strip, text.split(";"))):
-        object_name, at, options = thing.rpartition("@")
-        object_name = object_name.strip()
-        file, mark, node = object_name.partition("#")
-        if "." in file and Path(file).is_file():
-            object_name = f"{Path(file).resolve()}{mark}{node}"
-        texts.append(f"{object_name}{at}{options}")
+    texts = [_make_thing_absolute(part) for part in text.split(";") if part.strip()]
     return "; ".join(texts) or None
 
 
+def _make_thing_absolute(thing: str) -> str:
+    """Return a thing as text, ``OBJECT@OPTIONS``, with the absolute path of its object
+    if that is a file, perhaps with a node: ``scene.glb#NODE``.
+    """
+    object_name, at, options = thing.strip().rpartition("@")
+    object_name = object_name.strip()
+    file, mark, node = object_name.partition("#")
+    if "." in file and Path(file).is_file():
+        object_name = f"{Path(file).resolve()}{mark}{node}"
+    return f"{object_name}{at}{options}"
+
+
 def _format_thing(thing: Mapping[str, Any]) -> str:
-    """Return a thing as text: its object, x and y, and further options."""
+    """Return a thing as text, ``OBJECT@X,Y,OPTION=VALUE``.
+
+    Raises:
+        InputError: it has no object, or no place.
+    """
     required = ("object", "x", "y")
     if not thing.keys() >= {*required}:
         raise InputError(
-            f"things: expected an object, x and y, such as {{'object': 'car', 'x': 12, "
-            f"'y': 3.5}}, "
-            f"got {dict(thing)!r:.80}"
+            "things: expected an object, x and y, such as {'object': 'car', 'x': 12, "
+            f"'y': 3.5}}, got {dict(thing)!r:.80}"
         )
     position = [f"{thing['object']}@{thing['x']}", f"{thing['y']}"]
     options = [f"{name}={thing[name]}" for name in thing if name not in required]
@@ -153,22 +163,35 @@ def check_options(
     for option, value in options.items():
         if option not in declared:
             raise UnknownNameError(f"option of {what} {name!r}:", option, declared)
-        is_number = (
-            isinstance(value, (int, float))
-            and not isinstance(value, bool)
-            and not abs(value) > MAX_OPTION
-        )
-        is_integer = is_number and value % 1 == 0  # type: ignore[operator]
-        fits, expected = {
-            "float": (is_number, f"a finite number from {-MAX_OPTION} to {MAX_OPTION}"),
-            "int": (is_integer, f"a whole number from {-MAX_OPTION} to {MAX_OPTION}"),
-            "bool": (isinstance(value, bool), "true or false"),
-            "str": (isinstance(value, str), "a text"),
-        }.get(get_option_type(declared[option]), (True, ""))
-        if not fits:
+        expected = _find_expected(get_option_type(declared[option]), value)
+        if expected:
             raise InputError(
                 f"{option} of {what} {name}: expected {expected}, got {value!r:.80}"
             )
+
+
+def _find_expected(option_type: str, value: object) -> str:
+    """Return what is expected of an option, if the value is something else; "" if it
+    fits, or the type is another than the four that are checked.
+
+    Args:
+        option_type: name of the type, such as "float".
+        value: value of the option.
+    """
+    is_number = (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and not abs(value) > MAX_OPTION
+    )
+    if option_type == "float" and not is_number:
+        return f"a finite number from {-MAX_OPTION} to {MAX_OPTION}"
+    if option_type == "int" and not (is_number and value % 1 == 0):  # type: ignore[operator]
+        return f"a whole number from {-MAX_OPTION} to {MAX_OPTION}"
+    if option_type == "bool" and not isinstance(value, bool):
+        return "true or false"
+    if option_type == "str" and not isinstance(value, str):
+        return "a text"
+    return ""
 
 
 def get_option_type(option: Field[Any]) -> str:
@@ -212,10 +235,9 @@ def to_setting(entry: Any) -> str | dict[str, JsonValue]:
     options = {}
     for option, declared in list_declared_options(type(entry)).items():
         value = getattr(entry, option)
-        if (plain := _to_json(value)) is not None and value != get_option_default(
-            declared
-        ):
-            options[option] = plain
+        json_value = _to_json(value)
+        if json_value is not None and value != get_option_default(declared):
+            options[option] = json_value
     return {"name": name, **options} if options else name
 
 
@@ -232,7 +254,7 @@ def check_takes(what: str, function: Callable[..., object], *names: str) -> None
     """Check that a user's function takes arguments of these names by position.
 
     Args:
-        what: what of the function, for messages ("metrics: f").
+        what: what is checked, for messages ("metrics: f").
         function: function to check.
         *names: names of the arguments.
 

@@ -80,12 +80,12 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
             f"{path}: expected a picture such as PNG or JPEG, got "
             f"{image.format}; convert it"
         )
-    if image.format in ("JPEG", "MPO") and _count_scans(image) > scale_limit(MAX_SCANS):
-        raise make_size_error(
-            path,
-            f"a JPEG of at most {scale_limit(MAX_SCANS)} scans",
-            f"{_count_scans(image)}",
-        )
+    if image.format in ("JPEG", "MPO"):
+        n_scans = _count_scans(image)
+        if n_scans > scale_limit(MAX_SCANS):
+            raise make_size_error(
+                path, f"a JPEG of at most {scale_limit(MAX_SCANS)} scans", f"{n_scans}"
+            )
 
 
 @contextlib.contextmanager
@@ -110,6 +110,7 @@ def open_image(path: Path, limit: int) -> Iterator[Image.Image]:
 
 
 def encode_levels(levels: npt.NDArray[np.uint8]) -> bytes:
+    """Return a picture of 8 bits, (H, W, 3 or 4), as a PNG."""
     file = io.BytesIO()
     Image.fromarray(levels).save(file, "PNG")
     return file.getvalue()
@@ -135,41 +136,40 @@ def load_upright(path: Path, side: int) -> npt.NDArray[np.float32]:
         if max(reduced.size) > side:
             # BOX averages the pixels
             reduced.thumbnail((side, side), Image.Resampling.BOX)
-        values: npt.NDArray[np.float32] = np.asarray(reduced, np.float32) / np.float32(
-            255.0
-        )
+        levels = np.asarray(reduced, np.float32)
+        values: npt.NDArray[np.float32] = levels / np.float32(255.0)
         return values
 
 
 def to_8bit_levels(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
-    """Return the colours of a decoded picture in 8 bits, (H, W, 3); with alpha (H, W,
+    """Return the colors of a decoded picture in 8 bits, (H, W, 3); with alpha (H, W,
     4), opaque where the picture has none.
     """
-    if image.mode == "F" or image.mode.startswith("I"):  # grey in floats or 16 bits
-        grey = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(
-            1.0 if image.mode == "F" else 65535.0
-        )
-        steps: npt.NDArray[np.uint8] = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(
-            np.uint8
-        )
-        # grey as three equal channels
-        steps = steps[:, :, None].repeat(3, axis=2)
+    is_float = image.mode == "F"
+    is_16bit = image.mode.startswith("I")
+    levels: npt.NDArray[np.uint8]
+    if is_float or is_16bit:  # gray
+        white = np.float32(1.0 if is_float else 65535.0)
+        gray = np.nan_to_num(np.asarray(image, np.float32)) / white
+        levels = np.round(np.clip(gray, 0.0, 1.0) * 255.0).astype(np.uint8)
+        levels = levels[:, :, None].repeat(3, axis=2)  # three equal channels
     else:
-        steps = np.asarray(
-            image.convert("RGBA" if alpha or "transparency" in image.info else "RGB")
-        )
-    # opaque
-    if alpha and steps.shape[2] == 3:
-        steps = np.concatenate([steps, np.full_like(steps[:, :, :1], 255)], axis=2)
-    return steps if alpha else steps[:, :, :3]
+        has_transparent_color = "transparency" in image.info
+        mode = "RGBA" if alpha or has_transparent_color else "RGB"
+        levels = np.asarray(image.convert(mode))
+    has_alpha = levels.shape[2] == 4
+    if alpha and not has_alpha:
+        opaque = np.full_like(levels[:, :, :1], 255)
+        levels = np.concatenate([levels, opaque], axis=2)
+    return levels if alpha else levels[:, :, :3]
 
 
 def _count_scans(image: Image.Image) -> int:
-    """Return how many scans the file of a JPEG has; each may take as long as a whole
-    picture. The position in the file is kept.
+    """Return how many scans the file of a JPEG has; each may take as long to decode as
+    a picture. The file stays at its position.
     """
     file = getattr(image, "fp", None)
-    if file is None:
+    if file is None:  # decoded already
         return 0
     position = file.tell()
     file.seek(0)

@@ -29,7 +29,7 @@ class Progress(Protocol):
         hint: str = "",
         at_most: bool = False,
     ) -> None:
-        """End the stage before and begin another.
+        """End the stage before and begin another; by default this does nothing.
 
         Args:
             name: what is being done, in a user's words: "searching", say.
@@ -80,10 +80,8 @@ class Stages:
 
         Args:
             name: name under which its seconds are counted; those of one name add up.
-            title: what the user reads; this and the rest as for `Progress.stage`.
-            total: see there.
-            hint: see there.
-            at_most: see there.
+            title: what the user reads: `name` of `Progress.stage`.
+            total, hint, at_most: as for `Progress.stage`.
         """
         self.end()
         self._name = name
@@ -144,28 +142,29 @@ def open_progress(
     Raises:
         InputError: something else was asked for.
     """
-    stream = sys.stderr
-    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     if requested not in (None, True, False):
         if not callable(getattr(requested, "stage", None)):
             raise InputError(
                 f"progress: expected True, False, None or a Progress, got {requested!r:.80}"
             )
         return nullcontext(requested)  # type: ignore[arg-type]
-    if requested and getattr(shell, "kernel", None) is not None:  # a notebook asks
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    is_notebook = getattr(shell, "kernel", None) is not None
+    if requested and is_notebook:
         return NotebookProgress(written)
+    stream = sys.stderr  # None in a process without a terminal or a pipe
     if requested is not False and stream is not None and stream.isatty():
         # the stream of the terminal itself, since a `Screen` would escape the bars
         return BarProgress(getattr(stream, "stream", stream), written)
-    return (
-        LineProgress(stream, written)
-        if requested and stream is not None
-        else nullcontext(NullProgress())
-    )
+    if requested and stream is not None:
+        return LineProgress(stream, written)
+    return nullcontext(NullProgress())
 
 
 def with_progress_option(function: Function) -> Function:
-    """Let a function with a keyword `progress` be called with what `open_progress` takes."""
+    """Make a function that takes a watcher as its keyword `progress` take what
+    `open_progress` does: True, False, None or a watcher.
+    """
 
     @wraps(function)
     def wrapper(*args: Any, progress: ProgressOption = None, **keywords: Any) -> Any:
@@ -187,8 +186,12 @@ class LineProgress:
         written: Callable[[str], str] = str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Write lines to `stream`; `written` turns settings that texts name into how
-        the reader writes them.
+        """Write lines to a stream.
+
+        Args:
+            stream: the stream.
+            written: turns settings that texts name into how the reader writes them.
+            clock: returns seconds; another one in tests.
         """
         self._stream = stream
         self._format_names = written
@@ -199,7 +202,7 @@ class LineProgress:
         self._stage_title = ""
         self._info = ""
         self._total: int | None = None
-        self._printed: float | None = None
+        self._printed_at: float | None = None  # None: the stage was not announced yet
         self._at_most = False
         self._done = 0
         self._stage_started = clock()
@@ -221,7 +224,7 @@ class LineProgress:
             self._done = 0
             self._info = ""
             self._stage_started = self._clock()
-            self._printed = None
+            self._printed_at = None
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         with self._lock:
@@ -236,19 +239,20 @@ class LineProgress:
     def tick(self) -> None:
         """Print a line if it is time for one.
 
-        A stage is announced when it has lasted a while; later lines come the more
-        rarely the longer it lasts.
+        A stage is announced when it has lasted a while; the longer it lasts, the rarer
+        are the lines that follow.
         """
         with self._lock:
             now = self._clock()
-            if self._printed is None:
-                if self._name and now - self._stage_started >= ANNOUNCE_SECONDS:
-                    self._printed = now
+            elapsed = now - self._stage_started
+            if self._printed_at is None:  # not announced yet
+                if self._name and elapsed >= ANNOUNCE_SECONDS:
+                    self._printed_at = now
                     self._print(self._stage_title)
-            elif now - self._printed >= max(
-                LINE_INTERVAL, LINE_FRACTION * (now - self._stage_started)
-            ):
-                self._printed = now
+                return
+            interval = max(LINE_INTERVAL, LINE_FRACTION * elapsed)
+            if now - self._printed_at >= interval:
+                self._printed_at = now
                 self._print(f"{self._name}: {self._format_state()}")
 
     def _format_state(self) -> str:
@@ -265,10 +269,12 @@ class LineProgress:
         elif done:
             texts.append(f"{done} done")
         times = _seconds(elapsed)
-        # below a tenth of an upper bound nothing is said of what is left: most such
-        # stages end long before
-        if total and 0 < done < total and not (self._at_most and 10 * done < total):
-            times += f", {limit}{_seconds(elapsed / done * (total - done))} left"
+        if total and 0 < done < total:
+            # most stages with an upper bound end long before it: of these nothing is said
+            # of what is left below a tenth
+            is_unsure = self._at_most and 10 * done < total
+            if not is_unsure:
+                times += f", {limit}{_seconds(elapsed / done * (total - done))} left"
         return ", ".join(filter(None, [*texts, times, self._info]))
 
     def _print(self, text: str) -> None:
@@ -277,11 +283,13 @@ class LineProgress:
     def __enter__(self) -> LineProgress:
         """Start the thread that prints lines from time to time."""
 
-        def call() -> None:
+        def tick_every_second() -> None:
             while not self._ended.wait(1.0):
                 self.tick()
 
-        self._thread = threading.Thread(target=call, name="progress", daemon=True)
+        self._thread = threading.Thread(
+            target=tick_every_second, name="progress", daemon=True
+        )
         self._thread.start()
         return self
 
@@ -331,15 +339,11 @@ class BarProgress:
         from rich.console import Console
 
         columns = (
-            *(
-                bars.TextColumn("{task.description}", markup=False),
-                bars.BarColumn(bar_width=12),
-            ),
-            *(
-                bars.MofNCompleteColumn(separator=" of "),
-                bars.TimeElapsedColumn(),
-                bars.TimeRemainingColumn(),
-            ),
+            bars.TextColumn("{task.description}", markup=False),
+            bars.BarColumn(bar_width=12),
+            bars.MofNCompleteColumn(separator=" of "),
+            bars.TimeElapsedColumn(),
+            bars.TimeRemainingColumn(),
             bars.TextColumn("{task.fields[info]}", markup=False),
         )
         self.bars = bars.Progress(
@@ -355,14 +359,16 @@ class BarProgress:
         hint: str = "",
         at_most: bool = False,
     ) -> None:
-        """Begin a stage: the bar before is full now, and only the newest ones stay visible."""
-        # the last one, if there is any
-        for task in self.bars.tasks[-1:]:
-            self.bars.update(
-                task.id, total=max(task.completed, 1), completed=max(task.completed, 1)
-            )
-        for task in self.bars.tasks[: 1 - MAX_BARS]:
-            self.bars.update(task.id, visible=False)
+        """See `Progress.stage`: the bar of the stage before is full now, and only the
+        newest bars stay visible.
+        """
+        if self.bars.tasks:
+            last_bar = self.bars.tasks[-1]
+            steps = max(last_bar.completed, 1)
+            self.bars.update(last_bar.id, total=steps, completed=steps)
+        # one less than there may be, since another one is added below
+        for bar in self.bars.tasks[: -(MAX_BARS - 1)]:
+            self.bars.update(bar.id, visible=False)
         if hint:
             self._print(f"{name}: {self._format_names(hint)}", style="dim")
         self.bars.add_task(
@@ -370,12 +376,10 @@ class BarProgress:
         )
 
     def advance(self, n: int = 1, **info: float | str) -> None:
-        for task in self.bars.tasks[-1:]:
-            self.bars.update(
-                task.id,
-                advance=n,
-                info=escape_text(format_info(info)) if info else task.fields["info"],
-            )
+        """See `Progress.advance`; nothing is shown before the first stage."""
+        for bar in self.bars.tasks[-1:]:
+            text = escape_text(format_info(info)) if info else bar.fields["info"]
+            self.bars.update(bar.id, advance=n, info=text)
 
     def message(self, text: str) -> None:
         self._print(self._format_names(text))

@@ -45,21 +45,28 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     imports: bool = False
 
     def __getitem__(self, name: str) -> Entry:
-        """Return an entry.
+        """Return an entry, imported if it is not yet.
 
         Raises:
-            InputError: the class that a name is cannot be imported, is something else,
-                or must not be imported (`check_import`).
+            InputError: it cannot be imported, is something else, or is code that only a
+                file names (`check_import`).
         """
-        if not self.names_class(name):
-            if name not in self.built_ins:
-                # of another package
-                return self._load(name)
-            built_in = self.built_ins[name]
-            if not isinstance(built_in, BuiltIn):
-                return built_in
-            target: Entry = load_attribute(built_in.target)
-            return target
+        if self.names_class(name):
+            return self._import_class(name)
+        if name not in self.built_ins:
+            return self._load_installed(name)
+        built_in = self.built_ins[name]
+        if not isinstance(built_in, BuiltIn):
+            return built_in
+        target: Entry = load_attribute(built_in.target)
+        return target
+
+    def _import_class(self, name: str) -> Entry:
+        """Import "package.module:Class" from the Python path or the current directory.
+
+        Raises:
+            InputError: it must not be imported, cannot be, or is something else.
+        """
         check_import(name)
         try:
             with current_directory_importable():
@@ -74,8 +81,12 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return entry
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is an entry. Only a class that is named by its module is
-        imported for it.
+        """Return whether there is an entry.
+
+        Only a class that is named by its module is imported for that.
+
+        Raises:
+            InputError: as for `__getitem__`, for such a class.
         """
         if not isinstance(name, str):
             return False
@@ -91,8 +102,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return sum(1 for _ in self)
 
     def get_help(self, name: str) -> str:
-        """Return a sentence about an entry: of the catalog, or the first line of its
-        docstring; if it cannot be imported, why.
+        """Return a sentence about an entry: that of the catalog, or the first line of the
+        entry's docstring; if it cannot be imported, why.
         """
         entry = self.built_ins.get(name)
         if isinstance(entry, BuiltIn):
@@ -119,14 +130,15 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         if not self.imports or not is_class_name:
             return False
         packages = module.split(".")
-        is_entry = packages[0] in self.built_ins or packages[0] in self._installed
-        return not is_entry and all(package.isidentifier() for package in packages)
+        if packages[0] in self.built_ins or packages[0] in self._installed:
+            return False  # what stands before the colon is an entry
+        return all(package.isidentifier() for package in packages)
 
     @cached_property
     def _installed(self) -> dict[str, EntryPoint]:
         return {point.name: point for point in entry_points(group=self.group)}
 
-    def _load(self, name: str) -> Entry:
+    def _load_installed(self, name: str) -> Entry:
         """Import what an entry point of another package names.
 
         Raises:
@@ -147,11 +159,11 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
 
 def get_first_doc_line(entry: Any) -> str:
-    """Return the summary of an object's docstring, on one line; empty for plain
-    values.
+    """Return the summary of the docstring of a function, a class or an instance's
+    class, on one line; a text is returned as it is, and "" for other plain values.
     """
-    is_documented = inspect.isroutine(entry) or inspect.isclass(entry)
-    documented = entry if is_documented else type(entry)
+    has_docstring = inspect.isroutine(entry) or inspect.isclass(entry)
+    documented = entry if has_docstring else type(entry)
     if documented.__module__ == "builtins":
         return str(entry) if isinstance(entry, str) else ""
     summary = (inspect.getdoc(documented) or "").partition("\n\n")[0]
@@ -199,8 +211,8 @@ def get_experiment(name: str) -> Any:
 
 
 def get_experiment_help(name: str) -> str:
-    """Return a line about an experiment: that of the catalog, or for an installed one
-    the first line of its docstring.
+    """Return a line about an experiment, which begins in lower case: that of the
+    catalog, or the first line of the docstring of an installed one.
     """
     built_in = EXPERIMENTS.built_ins.get(name)
     if isinstance(built_in, BuiltIn):

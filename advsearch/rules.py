@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -92,6 +92,9 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
             not judged counts as not right.
         names: names of parameters; those that vary, and that all rows have, become
             factors.
+
+    Returns:
+        The table as the module describes it, with `outcome` if rows have it.
     """
     columns = dict[str, pd.Series]()
     units = dict[str, str]()
@@ -109,7 +112,7 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     table = pd.DataFrame(
         {**columns, "correct": rows["correct"] == 1, "unit": rows["unit"]}
     )
-    table.attrs["units"] = units
+    table.attrs["units"] = units  # of measurement, by factor
     return table
 
 
@@ -119,8 +122,8 @@ def is_in_view(rows: pd.DataFrame) -> Mask:
 
 
 def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
-    """Return how often each outcome came about among rows that are not right, by name;
-    None where rows have no outcomes.
+    """Return how many rows that are not right have each outcome (`Outcome`), by name;
+    None if there are none.
     """
     if "outcome" not in rows:
         return None
@@ -155,12 +158,12 @@ def count_per_unit(table: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
 
 
 def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table in which units that share a configuration are one unit, since it
-    is the same draw that was made twice.
+    """Return a table in which units with a row of the same configuration are one unit.
 
-    This is done only where two draws are never the same by chance: where some factor is
-    a number with at least half as many values as there are rows. Values of a grid and
-    names come again in independent draws, too.
+    Such rows are the same draw, made twice, if independent draws are never the same by
+    chance. That is so if some factor is a number with at least half as many values as
+    there are rows. Otherwise the table stays: values of a grid, and names, repeat in
+    independent draws.
     """
     factors = list(table.attrs["units"])
     is_continuous = any(
@@ -174,7 +177,7 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
         table.groupby(factors, sort=False, observed=True).ngroup().to_numpy()
     )
     n_configurations = int(configuration.max()) + 1
-    if n_configurations == len(table):
+    if n_configurations == len(table):  # all are different
         return table
     unit_index = np.unique(table["unit"], return_inverse=True)[1]
     merged = table.assign(unit=find_connected(unit_index, configuration))
@@ -186,15 +189,14 @@ def find_connected(first: IntArray, second: IntArray) -> IntArray:
     """Return the group (n,) of each row, where rows are in one group if they have the
     same `first` or the same `second` number, or are linked by other rows.
 
-    Both are (n,) with numbers from 0. The groups are numbered by the lowest number in
-    them.
+    Both are (n,) with numbers from 0. A group has the lowest `first` number in it.
     """
     group = first
+    # the lowest number of a group spreads from row to row until nothing changes
     while True:
         linked = group
         for number in (second, first):
-            # the lowest group of all rows with this number; repeated until nothing
-            # changes
+            # the lowest group of all rows with each number
             lowest = np.full(int(number.max()) + 1, len(group))
             np.minimum.at(lowest, number, linked)
             linked = lowest[number]
@@ -206,8 +208,12 @@ def find_connected(first: IntArray, second: IntArray) -> IntArray:
 def split_in_halves(
     table: pd.DataFrame, seed: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return two halves of a table, whose units are drawn by a seed: rules are chosen
-    on the first and counted on the second.
+    """Return two random halves of a table, with whole units: rules are chosen on the
+    first and tested on the second.
+
+    Args:
+        table: the table.
+        seed: root seed of the choice.
     """
     table = merge_repeats(table)
     units, unit_index = np.unique(table["unit"], return_inverse=True)
@@ -250,29 +256,29 @@ class RuleCondition:
             values = values % self.turn
         is_over = values > self.low
         is_at_most = values <= self.high
-        # the part goes through 0
-        if self.turn and self.low > self.high:
+        goes_through_zero = self.turn and self.low > self.high
+        if goes_through_zero:
             return np.asarray(is_over | is_at_most)
         return np.asarray(is_over & is_at_most)
 
     @property
     def arcs(self) -> tuple[tuple[float, float], ...]:
-        """The arcs of a full turn in which it holds, (begin, end) in degrees; none for
-        what is no angle.
+        """The arcs of a full turn in which it holds, (start, end) in degrees; none for
+        a factor that is no angle.
 
         With a `turn` of 180 there are two arcs, opposite each other.
         """
         if not self.turn:
             return ()
         width = (self.high - self.low) % self.turn
-        begins = [
+        starts = [
             self.low + offset for offset in np.arange(0.0, 360.0, self.turn).tolist()
         ]
-        return tuple((begin, begin + width) for begin in begins)
+        return tuple((start, start + width) for start in starts)
 
     @property
     def row(self) -> ConditionRow:
-        """What a result holds of it."""
+        """The condition as a result stores it."""
         return ConditionRow(
             parameter=self.factor,
             unit=self.unit,
@@ -290,18 +296,17 @@ class RuleCondition:
             return " or ".join(sorted(self.options))
         bounds = []
         if self.turn:
-            bounds = [
-                " or ".join(
-                    f"from {begin % 360:g} to {end % 360:g}" for begin, end in self.arcs
-                )
+            arcs = [
+                f"from {start % 360:g} to {end % 360:g}" for start, end in self.arcs
             ]
+            bounds.append(" or ".join(arcs))
         else:
             if np.isfinite(self.low):
                 bounds.append(f"over {self.low:g}")
             if np.isfinite(self.high):
                 bounds.append(f"at most {self.high:g}")
-        unit = f" {self.unit}" if self.unit not in ("", "1") else ""
-        return " and ".join(bounds) + unit
+        has_unit = self.unit not in ("", "1")  # "1" is that of a plain number
+        return " and ".join(bounds) + (f" {self.unit}" if has_unit else "")
 
 
 # all of which hold, at most one for each factor
@@ -328,8 +333,8 @@ class CountedRule:
 
     @property
     def gap(self) -> float:
-        """By how much more often the model is right elsewhere than under it, with equal
-        weight of all units.
+        """How much higher the rate of right predictions is elsewhere than under the
+        rule; all units weigh the same. 0 without rows in either.
         """
         if self.inside.empty or self.elsewhere.empty:
             return 0.0
@@ -348,21 +353,23 @@ class CountedRule:
         return self.gap >= MIN_GAP and self.p_value <= SIGNIFICANCE
 
     def find_needed_factor(self) -> float | None:
-        """Return how many times as many rows, with the same shares of right ones, would
-        show the rule; None where no number up to `MAX_NEEDED` would.
+        """Return how many times as many rows, with the same rates of right ones, would
+        show the rule; None if no number of rows up to `MAX_NEEDED` would.
         """
+        has_gap = self.gap >= MIN_GAP
+        if not has_gap:  # no number of rows makes it larger
+            return None
         factor = 1.0
         n_rows = len(self.inside) + len(self.elsewhere)
-        while self.gap >= MIN_GAP and n_rows * factor <= MAX_NEEDED:
+        while n_rows * factor <= MAX_NEEDED:
             if self._compute_p_value(factor) <= SIGNIFICANCE:
                 return factor
-            # tried in steps of 5 %
             factor *= 1.05
         return None
 
     def _compute_p_value(self, factor: float) -> float:
         """Return the p-value of the rule if there were `factor` times as many rows with
-        the same shares.
+        the same rates of right ones.
         """
         units = np.concatenate([self.inside["unit"], self.elsewhere["unit"]])
         is_right = np.concatenate([self.inside["correct"], self.elsewhere["correct"]])
@@ -393,7 +400,7 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
     """Find rules under which the model is wrong more often.
 
     Each rule is chosen on some rows and tested on others; the rows that it covers are
-    left out for the next. The search ends at the first rule that does not hold.
+    left out for the next rule. The search ends at the first rule that does not hold.
 
     Args:
         choosing: rows to choose rules on.
@@ -413,8 +420,8 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
         if not rule.holds:
             return FoundRules(accepted, rule)
         accepted.append(rule)
+        # both without the rows of this rule
         choosing = choosing[~find_covered(conditions, choosing)]
-        # without the rows of this rule, in both halves
         counting = rule.elsewhere
     return FoundRules(accepted, None)
 
@@ -423,14 +430,15 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
 
 
 def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
-    """Return the conditions with the largest weighted relative accuracy, without those
-    that add little to it.
+    """Return the conditions with the best score (`ConditionScorer`), without those that
+    add little to it, and with adjusted bounds.
 
-    There are none where too few rows are left, or no conditions are better than chance.
+    There are none if too few rows are left, or no conditions are better than chance.
     """
     n_wrong = int((~table["correct"].to_numpy()).sum())
     min_rows = find_min_rows(table)
-    if len(table) < 2 * min_rows or not 0 < n_wrong < len(table):
+    has_both_answers = 0 < n_wrong < len(table)
+    if len(table) < 2 * min_rows or not has_both_answers:
         return ()
     scorer = ConditionScorer(table, min_rows)
     best = max(find_candidates(table, min_rows, seed), key=scorer.score, default=())
@@ -442,15 +450,14 @@ def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
 def find_min_rows(table: pd.DataFrame) -> int:
     """Return how many rows a rule has to cover at least.
 
-    Rows of one unit are not independent: where units have several rows, it is at least
-    what some units have on average.
+    Rows of one unit are not independent: if units have several rows, it is also at
+    least as many rows as `MIN_COVERED_UNITS` units have on average.
     """
     min_rows = max(MIN_COVERED_ROWS, round(MIN_COVERED_SHARE * len(table)))
-    if not table["unit"].is_unique:
-        min_rows = max(
-            min_rows, round(MIN_COVERED_UNITS * len(table) / table["unit"].nunique())
-        )
-    return min_rows
+    if table["unit"].is_unique:
+        return min_rows
+    rows_of_units: float = MIN_COVERED_UNITS * len(table) / table["unit"].nunique()
+    return max(min_rows, round(rows_of_units))
 
 
 class ConditionScorer:
@@ -465,7 +472,9 @@ class ConditionScorer:
         self._excess = is_wrong - is_wrong.mean()
 
     def score(self, conditions: RuleConditions) -> float:
-        """Return the score; -1 where too few rows lie under the conditions."""
+        """Return the score: the fraction of rows that lie under the conditions, times by
+        how much more of them are wrong than of all; -1 if they are too few.
+        """
         is_covered = find_covered(conditions, self.table)
         if int(is_covered.sum()) < self._min_rows:
             return -1.0
@@ -475,7 +484,9 @@ class ConditionScorer:
 def shorten_conditions(
     conditions: RuleConditions, scorer: ConditionScorer
 ) -> RuleConditions:
-    """Leave conditions out, one at a time, where that costs little of their score."""
+    """Return conditions without those that add little to their score, left out one at
+    a time.
+    """
     table = scorer.table
     score = scorer.score(conditions)
     variance = float(table["correct"].to_numpy().var())
@@ -485,11 +496,9 @@ def shorten_conditions(
             for index in range(len(conditions))
         ]
         shorter = max(candidates, key=scorer.score)
-        # rows that the shorter conditions cover in addition
-        n_added = int(
-            (find_covered(shorter, table) & ~find_covered(conditions, table)).sum()
-        )
-        # the standard error of the loss, so that few rows choose few conditions
+        is_added = find_covered(shorter, table) & ~find_covered(conditions, table)
+        n_added = int(is_added.sum())
+        # a loss within its standard error may be chance
         standard_error = math.sqrt(n_added * variance) / len(table)
         loss = score - scorer.score(shorter)
         if loss > max((1.0 - RETAINED_ACCURACY) * score, standard_error):
@@ -501,8 +510,8 @@ def shorten_conditions(
 def adjust_bounds(
     conditions: RuleConditions, scorer: ConditionScorer
 ) -> RuleConditions:
-    """Move the bounds of conditions to where their score is largest, one bound at a
-    time, and all of them several times over.
+    """Return conditions with bounds at which their score is larger: one bound is
+    adjusted after the other, and all of them several times.
     """
     for _ in range(N_ADJUSTMENTS):
         for index in range(len(conditions)):
@@ -510,7 +519,7 @@ def adjust_bounds(
                 (*conditions[:index], condition, *conditions[index + 1 :])
                 for condition in list_adjusted(conditions[index], scorer.table)
             ]
-            # the first of equals: they change only for a better score
+            # the present ones first: `max` returns the first of equally good ones
             conditions = max([conditions, *adjusted], key=scorer.score)
     return conditions
 
@@ -518,10 +527,11 @@ def adjust_bounds(
 def list_adjusted(
     condition: RuleCondition, table: pd.DataFrame
 ) -> Iterator[RuleCondition]:
-    """Yield a condition with one of its bounds moved to other quantiles of the values.
+    """Yield a condition with one of its bounds at other quantiles of the factor; none
+    for a condition on names.
 
-    Trees choose each bound below others; once these have moved, another one may be
-    better.
+    A tree chooses a bound together with those that it has chosen before; once these are
+    adjusted, another bound may be better.
     """
     if condition.options is not None:
         return
@@ -530,13 +540,16 @@ def list_adjusted(
         values = values % condition.turn
     # without the smallest and the largest value, which bound nothing
     quantiles = np.quantile(values, np.linspace(0, 1, N_BOUNDS + 1)[1:-1])
+    # a bound that is infinite stays so
+    has_low = condition.low > -np.inf
+    has_high = condition.high < np.inf
+    is_angle = bool(condition.turn)  # its low bound may be over the high one
     for bound in dict.fromkeys(float(f"{quantile:.3g}") for quantile in quantiles):
         if bound in (condition.low, condition.high):
             continue
-        # a bound that is infinite stays so; of an angle, low may be over high
-        if condition.low > -np.inf and (condition.turn or bound < condition.high):
+        if has_low and (is_angle or bound < condition.high):
             yield replace(condition, low=bound)
-        if condition.high < np.inf and (condition.turn or bound > condition.low):
+        if has_high and (is_angle or bound > condition.low):
             yield replace(condition, high=bound)
 
 
@@ -557,8 +570,8 @@ class TreeColumn(NamedTuple):
     zero: float = 0.0
 
     def read_values(self, table: pd.DataFrame) -> FloatArray:
-        """Return the values (n,) of the column: 1 where the factor has the name, else
-        the number, for an angle measured from `zero`.
+        """Return the values (n,) of the column: for a name, 1 in rows that have it and
+        0 in others; for numbers these, for an angle measured from `zero`.
         """
         column = table[self.full_condition.factor]
         if self.name is not None:
@@ -569,16 +582,18 @@ class TreeColumn(NamedTuple):
         return values
 
     def to_factor(self, condition: RuleCondition) -> RuleCondition:
-        """Return a condition on the column as one on the factor: the bounds of an angle
-        are turned back by `zero`.
+        """Return a condition on the column as one on the factor: bounds of an angle are
+        measured from 0 again, and not from `zero`.
         """
         turn = self.full_condition.turn
         if not turn:
             return condition
         low = max(condition.low, 0.0) + self.zero
         high = min(condition.high, turn) + self.zero
-        # an arc that ends at 0 ends at the full turn
-        return replace(condition, low=low % turn, high=high % turn or turn)
+        end = high % turn
+        if end == 0.0:  # of an arc that ends with the full turn
+            end = turn
+        return replace(condition, low=low % turn, high=end)
 
 
 def find_candidates(
@@ -589,24 +604,35 @@ def find_candidates(
     yielded_conditions: set[RuleConditions] = {()}
     for tree, columns in grow_trees(table, min_rows, seed):
         for node in walk_tree(tree, columns):
-            conditions_of_factor: dict[str, list[RuleCondition]] = {
-                name: [] for name in table.attrs["units"]
-            }
-            for column, condition in node.items():
-                conditions_of_factor[condition.factor].append(
-                    column.to_factor(condition)
-                )
-            # a node may have conditions on several columns of one angle; a rule takes
-            # one of them, so each is tried, and its bounds are adjusted later
-            for conditions in product(*filter(None, conditions_of_factor.values())):
+            for conditions in _list_rules_of_node(node, table.attrs["units"]):
                 if conditions not in yielded_conditions:
                     yielded_conditions.add(conditions)
                     yield conditions
 
 
+def _list_rules_of_node(
+    node: Mapping[TreeColumn, RuleCondition], factors: Iterable[str]
+) -> Iterator[RuleConditions]:
+    """Yield the conditions that lead to a node, with one for each factor at most.
+
+    A node may have conditions on several columns of one angle. A rule takes one of
+    them, so each is tried; its bounds are adjusted later.
+
+    Args:
+        node: the conditions that lead to it, by column.
+        factors: names of all factors, in the order that conditions have.
+    """
+    conditions_of_factor: dict[str, list[RuleCondition]] = {
+        name: [] for name in factors
+    }
+    for column, condition in node.items():
+        conditions_of_factor[condition.factor].append(column.to_factor(condition))
+    yield from product(*filter(None, conditions_of_factor.values()))
+
+
 def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
-    """Return the columns of data for trees: one for each number and for each name of a
-    factor.
+    """Return the columns of data for trees: one for each factor of numbers, and one for
+    each name of a factor of names.
 
     An angle that goes all the way round has further columns, each measured from another
     zero (`ARCS`).
@@ -635,8 +661,8 @@ def grow_trees(
     """Return trees of scikit-learn that predict whether the model is right, each with
     the columns of its data.
 
-    They are one tree of all columns, those of a random forest, and one for each further
-    column of an angle alone.
+    They are one tree of all columns, those of a random forest, and one for each column
+    of an angle with a `turn`, of that column alone.
     """
     make_tree = import_library("sklearn.tree").DecisionTreeClassifier
     make_forest = import_library("sklearn.ensemble").RandomForestClassifier
@@ -654,8 +680,7 @@ def grow_trees(
     ]
     for index, column in enumerate(columns):
         if column.full_condition.turn:
-            # by itself too: in a tree of all columns other splits of the same angle
-            # come first
+            # alone, since in a tree of all columns other splits of the angle come first
             tree = make_tree(**shape).fit(data[:, [index]], is_right).tree_
             trees.append((tree, [column]))
     return trees
@@ -664,10 +689,10 @@ def grow_trees(
 def walk_tree(
     tree: Any, columns: list[TreeColumn]
 ) -> Iterator[dict[TreeColumn, RuleCondition]]:
-    """Yield the conditions that lead to each node of a tree.
+    """Yield the conditions that lead to each node of a tree, by column.
 
-    They are kept by column without its name, so that the names of one factor have one
-    condition.
+    The columns of the names of one factor share a condition, so that it stands under
+    the column without its name.
 
     Args:
         tree: `tree_` of scikit-learn.
@@ -679,18 +704,18 @@ def walk_tree(
         yield conditions
         left = int(tree.children_left[node])
         right = int(tree.children_right[node])
-        # a leaf: both are -1
-        if left == right:
+        is_leaf = left == right  # both are -1
+        if is_leaf:
             continue
         column = columns[tree.feature[node]]
-        key = column._replace(name=None)
+        key = column._replace(name=None)  # shared by all names of the factor
         condition = conditions.get(key, column.full_condition)
         if column.name is None or condition.options is None:
             threshold = float(f"{tree.threshold[node]:.3g}")  # as it is reported
             below = replace(condition, high=min(condition.high, threshold))
             above = replace(condition, low=max(condition.low, threshold))
         else:
-            # column 0 is below the threshold: another name; 1 is above: this name
+            # a row with the name has 1 in the column, and is above; others have 0
             below = replace(condition, options=condition.options - {column.name})
             above = replace(condition, options=condition.options & {column.name})
         open_nodes.append((left, {**conditions, key: below}))

@@ -39,13 +39,13 @@ def assert_right(
     """Assert that a model is right in at least a share of the pictures that the
     controls span.
 
-    Pictures are drawn until that is shown or refuted at the stated confidence.
+    Pictures are sampled until that is shown or refuted at the stated confidence.
 
     Args:
         object: object from `load_scene`, or the name of an object, or a file of one.
         model: model from `load_model`, or what that takes.
         at_least: the share, over 0 and under 1.
-        pictures: pictures that are drawn, at most.
+        pictures: maximum number of pictures.
         confidence: probability with which an assertion that passes, or fails, does so
             rightly.
         seed: root of all random numbers.
@@ -73,8 +73,9 @@ def assert_not_broken(
     run: str | Path | None = None,
     **settings: Any,
 ) -> SuiteResult:
-    """Assert that a search finds no configuration that a model gets wrong. That it
-    finds none is no proof.
+    """Assert that a search finds no configuration that a model gets wrong.
+
+    That it finds none is no proof that there is none.
 
     Args:
         object, model, seed, run: as for `assert_right`.
@@ -86,8 +87,10 @@ def assert_not_broken(
         InputError: anything that the caller can put right.
     """
     __tracebackhide__ = True
+    claim = {"claim": "not_broken"}
+    confidence = 0.95  # the default of a suite; a search makes no use of it
     return _assert_claim(
-        {"claim": "not_broken"}, object, {"model": model}, settings, 0.95, seed, run
+        claim, object, {"model": model}, settings, confidence, seed, run
     )
 
 
@@ -146,10 +149,13 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
         result: SuiteResult = experiment.run(
             experiment.settings(**{"suite": str(suite), **settings})
         )
-    if bad := [claim for claim in result.claims if not claim.accepted]:
-        raise AssertionError(
-            "\n\n".join(_format_report(result, claim, claim.repeat) for claim in bad)
-        )
+    reports = [
+        _format_report(result, claim, claim.repeat)
+        for claim in result.claims
+        if not claim.accepted
+    ]
+    if reports:
+        raise AssertionError("\n\n".join(reports))
     return result
 
 
@@ -167,7 +173,8 @@ def _assert_claim(
     Args:
         claim: as in a suite, without models.
         object: object of the scene, or the scene.
-        models: models by the settings that name them.
+        models: models by the settings that name them: "model" of the suite, and "than"
+            of the claim.
         settings: settings of the suite.
         confidence: confidence of the test.
         seed: seed of the images.
@@ -181,7 +188,6 @@ def _assert_claim(
     from advsearch.extend import workbench
 
     experiment = workbench.get_experiment("test")
-    claim_name = str(claim["claim"]).replace("_", "-")
     title = f"assert_{claim['claim']}"
     with workbench.hold_process_lock():
         workbench.allow_named(settings)
@@ -189,47 +195,65 @@ def _assert_claim(
             workbench.allow_named({"model": model})
         suite_settings, objects = _name_objects(object, settings)
         claim_settings = dict(claim)
-        python_only = [workbench.PythonOnly("call", f"of {title}")]
         for key, model in models.items():
             model_name = workbench.get_model_name(model)
-            target = suite_settings if key == "model" else claim_settings
-            target[key] = model_name
+            if key == "model":
+                suite_settings[key] = model_name
+            else:
+                claim_settings[key] = model_name
             if not isinstance(model, (str, Path)):
                 objects["model", model_name] = model
-            if workbench.is_session_only(model):
-                python_only.append(workbench.PythonOnly("model", model_name))
+        # what no file can name: the call itself, and models of this session
+        python_only = [
+            workbench.PythonOnly("call", f"of {title}"),
+            *(
+                workbench.PythonOnly("model", workbench.get_model_name(model))
+                for model in models.values()
+                if workbench.is_session_only(model)
+            ),
+        ]
         suite = {
             "title": title,
             "settings": suite_settings,
             "seed": seed,
             "confidence": confidence,
-            "claims": {claim_name: claim_settings},
+            "claims": {str(claim["claim"]).replace("_", "-"): claim_settings},
         }
-        config = experiment.settings(suite=title, run=None if run is None else str(run))
-        config = config.with_python_only_parts(python_only).with_python_objects(objects)
+        config = (
+            experiment.settings(suite=title, run=None if run is None else str(run))
+            .with_python_only_parts(python_only)
+            .with_python_objects(objects)
+        )
         result: SuiteResult = experiment.run(config, suite=suite)
     (claim_result,) = result.claims
     if claim_result.answer != "held":
-        test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
-        repeat = "call the same function with the same arguments"
-        if test:
-            repeat = f"pytest {shlex.quote(test)}"
-        raise AssertionError(_format_report(result, claim_result, repeat))
+        raise AssertionError(_format_report(result, claim_result, _describe_repeat()))
     return result
+
+
+def _describe_repeat() -> str:
+    """Return what runs the present assertion again: the pytest command of the test that
+    is running, or else a sentence.
+    """
+    # pytest sets the variable: "tests/test_mug.py::test_name (call)"
+    test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
+    if test:
+        return f"pytest {shlex.quote(test)}"
+    return "call the same function with the same arguments"
 
 
 def _name_objects(
     object: str | Path | workbench.Scene, settings: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[tuple[str, str], Any]]:
-    """Return settings in which names stand for the objects among them, and the objects.
+    """Replace the objects among settings by names, as a file has them.
 
     Args:
         object: the scene, or the name of its object.
         settings: may have controls that are objects.
 
     Returns:
-        The settings; and the scene and controls by (role, name), as
-        `Config.with_python_objects` takes them.
+        The settings with names; and the objects (scene and controls) by (role, name),
+        as `Config.with_python_objects` takes them.
     """
     # heavy, and pytest imports this module before it collects
     from advsearch.extend import workbench

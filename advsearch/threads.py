@@ -44,11 +44,10 @@ def count_cores(quota: Path = _CPU_MAX) -> int:
         quota: the file with quota and period in microseconds (control groups, version
             2).
     """
-    allowed = (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
+    if hasattr(os, "sched_getaffinity"):
+        allowed = len(os.sched_getaffinity(0))
+    else:
+        allowed = os.cpu_count() or 1
     try:
         limit, period = quota.read_text(encoding="ascii").split()
         allowed = min(allowed, max(1, round(int(limit) / int(period))))
@@ -94,10 +93,9 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
     global _chosen
     if threads is not None and threads < 1:
         raise InputError(f"threads: expected a number of at least 1, got {threads}")
-    _chosen = min(
-        threads if threads is not None else _get_default(),
-        MAX_THREADS_PER_CORE * count_cores(),
-    )
+    requested = threads if threads is not None else _get_default()
+    _chosen = min(requested, MAX_THREADS_PER_CORE * count_cores())
+    # Dr.Jit's workers still hold their cores for a while after a render
     for_torch = max(1, _chosen // 2) if rendering else _chosen
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(for_torch)
@@ -113,25 +111,24 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
 @contextmanager
 def restore_threads() -> Iterator[None]:
     """After the block, give torch and Dr.Jit the threads that they had before it,
-    whatever is configured inside.
+    whatever is configured inside; the default, if they were imported inside.
     """
     global _chosen
-    chosen = _chosen
+    chosen_before = _chosen
     torch = sys.modules.get("torch")
+    torch_threads = None if torch is None else torch.get_num_threads()
     drjit = sys.modules.get("drjit")
-    for_torch = torch and torch.get_num_threads()
-    for_drjit = drjit and drjit.thread_count()
+    drjit_threads = None if drjit is None else drjit.thread_count()
     try:
         yield
     finally:
-        _chosen = chosen
+        _chosen = chosen_before
         if "torch" in sys.modules:
-            # the default if it was imported inside the block
-            sys.modules["torch"].set_num_threads(for_torch or _get_default())
-        if drjit is not None and drjit.thread_count() != for_drjit:
-            drjit.set_thread_count(for_drjit)
-        # imported inside the block
-        elif "drjit" in sys.modules and drjit is None:
+            sys.modules["torch"].set_num_threads(torch_threads or _get_default())
+        if drjit is not None:
+            if drjit.thread_count() != drjit_threads:
+                drjit.set_thread_count(drjit_threads)
+        elif "drjit" in sys.modules:
             apply_to_drjit()
 
 
@@ -149,17 +146,18 @@ def all_for_torch() -> Iterator[None]:
 
 def apply_to_drjit() -> None:
     """Set the threads of Dr.Jit, which is imported, to what `configure` chose, or else
-    to every core.
+    to the default.
     """
     drjit = sys.modules["drjit"]
-    wanted = _chosen if _chosen is not None else _get_default()
-    if drjit.thread_count() != wanted:
-        drjit.set_thread_count(wanted)
+    n_threads = _chosen if _chosen is not None else _get_default()
+    if drjit.thread_count() != n_threads:
+        drjit.set_thread_count(n_threads)
 
 
 def _get_default() -> int:
-    return (
-        int(_USERS_COUNT)
-        if _USERS_COUNT.isdecimal() and int(_USERS_COUNT) > 0
-        else count_cores()
-    )
+    """Return the threads that the user has set by OMP_NUM_THREADS, or else every core
+    that this process may use.
+    """
+    if _USERS_COUNT.isdecimal() and int(_USERS_COUNT) > 0:
+        return int(_USERS_COUNT)
+    return count_cores()

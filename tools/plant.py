@@ -294,8 +294,8 @@ FAULTS = (
     Fault(
         "cluster: a batch that kills workers is not taken apart",
         "advsearch/cluster/workers.py",
-        "elif len(items) > 1:",
-        "elif len(items) > 100:",
+        "if len(items) > 1:",
+        "if len(items) > 100:",
         ("tests/cluster/test_workers.py",),
     ),
     Fault(

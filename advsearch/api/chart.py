@@ -69,10 +69,12 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
         convert: the colour transform of PIL to the printer's profile; None for none.
     """
     figure, axes = make_blank_page(paper)
+    # the upper left corner of the patches; the black squares are outside of it
     left = (paper[0] - CHART_SIZE[0]) / 2.0
     top = MARGIN + 2.0 * CORNER_SIZE
 
     def draw_square(x: float, y: float, size: float, color: object) -> None:
+        """Draw a square around a center, in millimetres from that corner."""
         corner = (left + x - size / 2, top + y - size / 2)
         axes.add_patch(
             Rectangle(
@@ -120,22 +122,23 @@ def measured_palette(photograph: str | Path) -> Tensor:
         np.float64
     )
     homography = _compute_homography(CORNER_CENTERS, _find_corners(light, photograph))
+
+    def measure(points: Floats) -> Floats:
+        """Return the median light (3,) at points (N, 2) of the chart, in millimetres."""
+        median: Floats = np.median(_sample(light, homography, points), axis=0)
+        return median
+
     # points in the middle of a patch, away from its edges, in millimetres
     patch_offsets = _make_pairs(np.linspace(-0.25, 0.25, 7) * PATCH_SIZE)
-    # points in the gap between patches
+    # bare paper: points in the gaps at the four corners between a patch and its
+    # neighbours
     paper_offsets = _make_pairs(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH_SIZE))
-    # Bare paper at the four corners between a patch and its neighbours.
     crossings = _make_pairs((-PITCH / 2.0, PITCH / 2.0))
     colors = []
     for center in PATCH_CENTERS:
-        patch_light = np.median(
-            _sample(light, homography, center + patch_offsets), axis=0
-        )
+        patch_light = measure(center + patch_offsets)
         paper_light = [
-            np.median(
-                _sample(light, homography, center + crossing + paper_offsets), axis=0
-            )
-            for crossing in crossings
+            measure(center + crossing + paper_offsets) for crossing in crossings
         ]
         # relative to the paper around it, so that uneven light cancels out
         colors.append(patch_light / np.maximum(np.mean(paper_light, axis=0), 1e-4))
@@ -162,8 +165,8 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
     """
     not_found = InputError(
         f"{photograph}: expected a photograph of the whole colour chart, upright, with "
-        "its four black squares, got one "
-        "in which they are not found; leave nothing dark around the sheet"
+        "its four black squares, got one in which they are not found; leave nothing "
+        "dark around the sheet"
     )
     squares = _find_dark_squares(light)
     if len(squares) < 4:
@@ -189,8 +192,10 @@ def _find_dark_squares(light: Floats) -> list[tuple[float, float, int]]:
         light: (H, W, 3), linear.
     """
     brightness = light.mean(axis=2)
-    # paper is nearly the brightest; the limit is display-referred, hence the power
-    is_dark = brightness < MAX_DARK_BRIGHTNESS**2.2 * np.percentile(brightness, 95)
+    # paper is nearly the brightest in the photograph
+    paper_brightness = np.percentile(brightness, 95)
+    # the limit is display-referred, and made linear by the power
+    is_dark = brightness < MAX_DARK_BRIGHTNESS**2.2 * paper_brightness
     labels, count = ndimage.label(is_dark)
     squares = []
     boxes = ndimage.find_objects(labels) if count else []
@@ -227,7 +232,7 @@ def _sample(light: Floats, homography: Floats, points: Floats) -> Floats:
     """
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     x, y, w = homography @ homogeneous.T
-    coordinates = [y / w, x / w]
+    coordinates = [y / w, x / w]  # row and column
     channels = [
         ndimage.map_coordinates(
             light[..., channel], coordinates, order=1, mode="nearest"

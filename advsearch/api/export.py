@@ -73,20 +73,15 @@ class AdversarialRun:
                 f"{folder}: ended with {summary.ending!r}, so that there is no "
                 "adversarial configuration to export"
             )
-        problem, _ = problem_from_config(
-            with_evaluation_only(AttackConfig.from_yaml(folder / CONFIG))
-        )
-        # where conditions vary, those of the picture that the run keeps
+        config = with_evaluation_only(AttackConfig.from_yaml(folder / CONFIG))
+        problem, _ = problem_from_config(config)
+        # where conditions vary, they are those of the trial whose picture the run stores
         trial = summary.adversarial.trial
-        # the seed of the conditions of that trial
-        draw = (
-            None if trial is None else seeds.stream(problem.seed, "verification", trial)
-        )
-        return cls(
-            folder,
-            problem,
-            problem.add_conditions(read_stored_configuration(folder, problem), draw),
-        )
+        conditions_seed = None
+        if trial is not None:
+            conditions_seed = seeds.stream(problem.seed, "verification", trial)
+        u = read_stored_configuration(folder, problem)
+        return cls(folder, problem, problem.add_conditions(u, conditions_seed))
 
     def split_inputs(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return the inputs of the scene inside Mitsuba, and those applied to its
@@ -97,7 +92,7 @@ class AdversarialRun:
         return inputs, on_image
 
     def posed_object(self) -> tuple[MeshPart, Shape]:
-        """Return the object as the scene describes it, and its mesh as it stands in the
+        """Return the object as the scene describes it, and its mesh as it is in the
         adversarial scene: displaced, in its pose, with its texture.
         """
         description = self.problem.space.scene
@@ -106,7 +101,7 @@ class AdversarialRun:
         return part, pose_mesh(part, self.inputs)
 
     def render(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render the scene with some inputs as the run does.
+        """Render the scene with other inputs, by the renderer of the run.
 
         Args:
             inputs: inputs of the scene and of the finished image, by name.
@@ -130,13 +125,13 @@ class AdversarialRun:
     @property
     def image_controls(self) -> list[str]:
         """The names of the controls that change the rendered image."""
-        # an image of noise: a control that changes images changes it
-        grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
+        # an image of noise: any control that changes images changes it
+        noise = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
         slices = self.problem.space.split_by_control(self.u)
         return [
             control.name
             for control, part in slices
-            if not torch.equal(control.apply_to_image(part, grey), grey)
+            if not torch.equal(control.apply_to_image(part, noise), noise)
         ]
 
     @property
@@ -165,9 +160,8 @@ def get_real_size(run: str | Path) -> float | None:
     """
     folder = find_run(run)
     load_attack_summary(folder)  # raises for runs of other commands
-    metres = _load_object_scene(
-        AttackConfig.from_yaml(folder / CONFIG)
-    ).description.object.size_in_metres
+    scene = _load_object_scene(AttackConfig.from_yaml(folder / CONFIG))
+    metres = scene.description.object.size_in_metres
     return None if metres is None else metres * 1000.0
 
 
@@ -188,7 +182,7 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
 
     A patch is one piece. A texture has a piece for each connected part of the unwrapped
     surface, stretched along both axes to the mean size of its texels on the object; the
-    distortion that remains within a piece is in its name.
+    distortion that remains within a piece is part of its name.
 
     Args:
         run: its name or folder.
@@ -222,8 +216,8 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
             )
     if not pieces:
         raise InputError(
-            f"{folder}: it has neither a texture nor a patch, so that "
-            "there is nothing to print"
+            f"{folder}: it has neither a texture nor a patch, so that there is nothing "
+            "to print"
         )
     return pieces
 
@@ -266,20 +260,22 @@ def _get_relative_patch_size(
         size = found.value
     else:
         size = config.controls.get(control.name, {}).get("size")
-    if not isinstance(size, (int, float)):
-        size = next(
-            parameter.default
-            for parameter in control.parameters
-            if parameter.name == "size"
-        )
-    return float(size)
+    if isinstance(size, (int, float)):
+        return float(size)
+    # not set, or a range
+    default = next(
+        parameter.default
+        for parameter in control.parameters
+        if parameter.name == "size"
+    )
+    return float(default)
 
 
 def _find_charts(
     name: str, texture: Float32Array, mesh: Mesh, faces: IntArray | None, scale: float
 ) -> Iterator[Piece]:
-    """Yield the connected parts of an unwrapped texture as pieces, seen from outside,
-    the largest first.
+    """Yield the charts of an unwrapped texture (its connected parts) as pieces, seen
+    from outside, the largest first.
 
     Args:
         name: name of the texture.
@@ -307,8 +303,7 @@ def _find_charts(
             image = image[:, ::-1]
             inside = inside[:, ::-1]
         title = name if len(charts) == 1 else f"{name}, piece {number}"
-        # less is rounded to 0 %
-        if distortion >= 0.005:
+        if distortion >= 0.005:  # half a percent: less is rounded to 0 %
             title += f" (sizes within it differ by {100 * distortion:.0f} %)"
         yield _make_piece(title, image, texel_size, inside)
 
@@ -317,9 +312,10 @@ def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
     """Return the connected parts of a mask (h, w), the largest first: the bounding box
     of each (rows, columns), and its mask inside the box.
     """
-    labels, count = ndimage.label(is_printed)
+    labels, _ = ndimage.label(is_printed)
+    # the label 0 is what is outside of all parts
     boxes = ndimage.find_objects(labels)
-    charts = [(boxes[k], labels[boxes[k]] == k + 1) for k in range(count)]
+    charts = [(box, labels[box] == label) for label, box in enumerate(boxes, 1)]
     return sorted(charts, key=lambda chart: -int(chart[1].sum()))
 
 
@@ -342,17 +338,17 @@ def _measure_texel_size(
         inside: (h, w) bool, the texels of the part.
 
     Returns:
-        The mean distance of neighbouring texels along columns and rows, and the larger
-        of the coefficients of variation of these distances; None if the part is a line
-        or a point of texels, which has no area to print.
+        Width and height of a texel, the mean distances of neighbours along rows and
+        columns; and the distortion, the larger of the coefficients of variation of
+        these distances. None if the part is a line or a point of texels, which has no
+        area to print.
     """
     distances_by_axis = []
-    # along a row first, which gives the width
-    for axis in (1, 0):
+    for axis in (1, 0):  # along rows, then along columns
         distances = np.linalg.norm(np.diff(positions, axis=axis), axis=-1)
-        # without the first, and without the last: pairs of neighbours that both belong
-        # to the part
-        both_inside = np.delete(inside, 0, axis) & np.delete(inside, -1, axis)
+        # whether a texel and the next one along the axis both belong to the part
+        next_inside = np.delete(inside, 0, axis)
+        both_inside = next_inside & np.delete(inside, -1, axis)
         distances_by_axis.append(distances[both_inside])
     if not all(len(distances) for distances in distances_by_axis):
         return None
@@ -377,23 +373,34 @@ def _make_piece(
         pixel_size: (width, height) of a pixel in millimetres.
         inside: (h, w) bool, what is cut out; None for the full image.
     """
-    subdivisions = 1
-    if max(pixel_size) > MAX_PIXEL_SIZE:
-        # rounded up to an odd number, so that the centre of a texel keeps its own
-        # colour
-        odd = 2 * math.ceil((max(pixel_size) / MAX_PIXEL_SIZE - 1.0) / 2.0) + 1
-        subdivisions = min(MAX_SUBDIVISIONS, odd)
+    subdivisions = _count_subdivisions(max(pixel_size))
     if subdivisions > 1:
         fine = enlarge(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
     else:
         fine = torch.from_numpy(image)
-    size = pixel_size[0] / subdivisions, pixel_size[1] / subdivisions
-    bleed_columns = math.ceil(BLEED / size[0])
-    bleed_rows = math.ceil(BLEED / size[1])
+    fine_size = pixel_size[0] / subdivisions, pixel_size[1] / subdivisions
+    bleed_columns = math.ceil(BLEED / fine_size[0])
+    bleed_rows = math.ceil(BLEED / fine_size[1])
     padding = ((bleed_rows, bleed_rows), (bleed_columns, bleed_columns))
     # the edge is repeated into the bleed
     levels = np.pad(to_8bit(fine.numpy()), (*padding, (0, 0)), mode="edge")
     mask = None
     if inside is not None and not inside.all():
         mask = np.pad(inside.repeat(subdivisions, 0).repeat(subdivisions, 1), padding)
-    return Piece(name, levels, size, (bleed_columns, bleed_rows), mask)
+    return Piece(name, levels, fine_size, (bleed_columns, bleed_rows), mask)
+
+
+def _count_subdivisions(pixel_size: float) -> int:
+    """Return into how many parts a pixel is divided along each axis, so that none is
+    larger than `MAX_PIXEL_SIZE`; 1 if it need not be.
+
+    The number is odd, so that the center of a texel keeps its own color, and at most
+    `MAX_SUBDIVISIONS`.
+
+    Args:
+        pixel_size: longer side of the pixel in millimetres.
+    """
+    if pixel_size <= MAX_PIXEL_SIZE:
+        return 1
+    odd = 2 * math.ceil((pixel_size / MAX_PIXEL_SIZE - 1.0) / 2.0) + 1
+    return min(MAX_SUBDIVISIONS, odd)

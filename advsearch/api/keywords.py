@@ -37,7 +37,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import describe_value
 from advsearch.progress import open_progress
-from advsearch.settings import Config, PythonOnly, settings, to_python
+from advsearch.settings import Config, PythonOnly, Setting, settings, to_python
 from advsearch.trust.code import allow_named
 from advsearch.trust.stored_files import is_shallow
 
@@ -134,65 +134,77 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
     """
 
     def decorate(function: Function) -> Function:
-        own_signature = inspect.signature(function)
-        own_parameters = [
+        declared_signature = inspect.signature(function)
+        parameters = [
             parameter
-            for parameter in own_signature.parameters.values()
+            for parameter in declared_signature.parameters.values()
             if parameter.kind is not parameter.VAR_KEYWORD
         ]
-        added_parameters = []
-        lines = []
+        names = [parameter.name for parameter in parameters]
+        setting_lines = []
         for setting in settings(config):
             name = setting.field.removesuffix("_")
-            if name in own_signature.parameters or setting.required:
+            if name in declared_signature.parameters or setting.required:
                 continue
-            hint = make_hint(
-                setting.field, config.model_fields[setting.field].annotation
-            )
-            added_parameters.append(
-                inspect.Parameter(
-                    name, KEYWORD_ONLY, default=setting.default, annotation=hint
-                )
-            )
+            parameters.append(_make_parameter(config, setting, name))
             line = f"{name}: {setting.text}"
-            lines.append(textwrap.fill(line, 110, subsequent_indent="    "))
+            setting_lines.append(textwrap.fill(line, 110, subsequent_indent="    "))
         signature = _Signature(
-            [*own_parameters, *added_parameters],
-            return_annotation=own_signature.return_annotation,
+            parameters, return_annotation=declared_signature.return_annotation
         )
-        # what `help` shows
-        signature.short = own_signature
-
-        @wraps(function)
-        def wrapper(*args: Any, **keywords: Any) -> Any:
-            _check_call(function.__name__, signature, args, keywords)
-            # numbers of numpy and torch become Python's
-            plain_keywords = {
-                key: value
-                if key in UNCONVERTED_ARGUMENTS or not is_shallow(value)
-                else to_python(value)
-                for key, value in keywords.items()
-            }
-            with ExitStack() as stack:
-                stack.enter_context(hold_process_lock())
-                if "progress" in own_signature.parameters:
-                    progress = open_progress(plain_keywords.get("progress"))
-                    plain_keywords["progress"] = stack.enter_context(progress)
-                for key in ("task", "objective", "policy"):
-                    if key in plain_keywords and key not in own_signature.parameters:
-                        _check_name(function.__name__, key, plain_keywords[key])
-                return function(*args, **plain_keywords)
-
+        signature.short = declared_signature  # what `help` shows
+        wrapper = _wrap_call(function, signature)
         wrapper.__doc__ = _make_docstring(
-            function.__doc__ or "",
-            [parameter.name for parameter in own_parameters],
-            config.command,
-            lines,
+            function.__doc__ or "", names, config.command, setting_lines
         )
         wrapper.__signature__ = signature  # type: ignore[attr-defined]
-        return wrapper  # type: ignore[return-value]
+        return wrapper
 
     return decorate
+
+
+def _make_parameter(
+    config: type[Config], setting: Setting, name: str
+) -> inspect.Parameter:
+    """Return the parameter of a setting for Python callers, with a name."""
+    hint = make_hint(setting.field, config.model_fields[setting.field].annotation)
+    return inspect.Parameter(
+        name, KEYWORD_ONLY, default=setting.default, annotation=hint
+    )
+
+
+def _wrap_call(function: Function, signature: _Signature) -> Function:
+    """Return a function that checks its arguments, turns them into plain Python values
+    and calls another one, with the lock of the process and with progress.
+
+    Args:
+        function: the function that is called.
+        signature: signature with all settings.
+    """
+    declared = signature.short.parameters
+
+    @wraps(function)
+    def wrapper(*args: Any, **keywords: Any) -> Any:
+        _check_call(function.__name__, signature, args, keywords)
+        # numbers of numpy and torch become Python's
+        plain_keywords = {
+            key: value
+            if key in UNCONVERTED_ARGUMENTS or not is_shallow(value)
+            else to_python(value)
+            for key, value in keywords.items()
+        }
+        with ExitStack() as stack:
+            stack.enter_context(hold_process_lock())
+            if "progress" in declared:
+                progress = open_progress(plain_keywords.get("progress"))
+                plain_keywords["progress"] = stack.enter_context(progress)
+            for key in ("task", "objective", "policy"):
+                takes_object = key in declared
+                if key in plain_keywords and not takes_object:
+                    _check_is_name(function.__name__, key, plain_keywords[key])
+            return function(*args, **plain_keywords)
+
+    return wrapper  # type: ignore[return-value]
 
 
 UNCONVERTED_ARGUMENTS = ("scene", "model", "beside", "progress", "metrics", "tracker")
@@ -220,9 +232,10 @@ def _check_call(
     error = make_unexpected_error(name, keywords, list(signature.parameters))
     if error:
         raise error
-    own_parameters = signature.short.parameters
-    positional = dict(zip(own_parameters, args, strict=False))
-    check_types({**own_parameters, **RUN}, {**positional, **keywords})
+    # settings check their values themselves, but for `run`, which is checked here
+    declared = signature.short.parameters
+    positional = dict(zip(declared, args, strict=False))
+    check_types({**declared, **RUN}, {**positional, **keywords})
     try:
         bound = signature.bind(*args, **keywords)
     except TypeError as error:
@@ -230,18 +243,17 @@ def _check_call(
     allow_named({**bound.arguments, **keywords})
 
 
-def _check_name(function_name: str, key: str, value: object) -> None:
-    """Check that a setting is given by its name, for a function that takes no object
-    there.
+def _check_is_name(function_name: str, key: str, value: object) -> None:
+    """Check that a function that takes no object for a setting gets a name, or a
+    mapping with one.
 
     Raises:
         InputError: it is an object.
     """
     if not isinstance(value, (str, Mapping, type(None))):
         raise InputError(
-            f"{key}: expected a name for {function_name}, got "
-            f"{describe_value(value)}; `attack` "
-            "takes your own, and `sweep` a task of your own"
+            f"{key}: expected a name for {function_name}, got {describe_value(value)}; "
+            "`attack` takes your own, and `sweep` a task of your own"
         )
 
 
@@ -278,10 +290,11 @@ def make_hint(field: str, kind: Any) -> str:
     """
     text = inspect.formatannotation(kind)
     text = text.replace("typing.", "").replace("NoneType", "None")
-    # Constraints are no part of a hint.
+    # without constraints: Annotated[float, Gt(gt=0)] is float
     text = re.sub(r"Annotated\[(\w+), .*?\]\)\]", r"\1", text)
     # The label of a recipe may be a mapping from objects.
-    if field in PYTHON_HINTS and not (field == "label" and "dict" in text):
+    is_label_of_recipe = field == "label" and "dict" in text
+    if field in PYTHON_HINTS and not is_label_of_recipe:
         return PYTHON_HINTS[field]
     optional = re.fullmatch(r"Optional\[(.*)\]", text)
     if optional:
@@ -292,13 +305,17 @@ def make_hint(field: str, kind: Any) -> str:
     string_hint = "Path | Names" if field in PYTHON_LIST_SETTINGS else "str | Path"
     hints = []
     for type_name in types:
-        hint = string_hint if type_name == "str" else type_name
-        hints.append(re.sub(r"^dict\[.*", "Mapping[str, Any]", hint))
+        if type_name == "str":
+            hints.append(string_hint)
+        elif type_name.startswith("dict["):
+            hints.append("Mapping[str, Any]")
+        else:
+            hints.append(type_name)
     return " | ".join(hints)
 
 
 def _make_docstring(
-    text: str, names: Sequence[str], command: str, settings: Sequence[str]
+    text: str, names: Sequence[str], command: str, setting_lines: Sequence[str]
 ) -> str:
     """Complete the docstring of an experiment's function.
 
@@ -307,23 +324,21 @@ def _make_docstring(
             does not have.
         names: names of its own arguments.
         command: command of the experiment.
-        settings: a line for each setting.
+        setting_lines: a line for each setting.
     """
-    summary, _, own_arguments = inspect.cleandoc(text).partition("\n\nArgs:\n")
+    summary, _, argument_text = inspect.cleandoc(text).partition("\n\nArgs:\n")
     if "other arguments are the settings of" not in " ".join(summary.split()):
         summary += (
             "\n\nAll other arguments are the settings of `advsearch "
             f"{command}`. {RUN_STORED}"
         )
-    described = {
-        entry.partition(":")[0]: entry.rstrip()
-        for entry in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own_arguments))
-        if entry
-    }
+    # "NAME: text", which may go on in further lines
+    entries = re.split(r"(?m)^(?=\w+: )", textwrap.dedent(argument_text))
+    described = {entry.partition(":")[0]: entry.rstrip() for entry in entries if entry}
     lines = [
         described.get(name, f"{name}: {SHARED_ARGUMENTS.get(name)}") for name in names
     ]
-    arguments = textwrap.indent("\n".join([*lines, *settings]), "    ")
+    arguments = textwrap.indent("\n".join([*lines, *setting_lines]), "    ")
     return f"{summary}\n\nArgs:\n{arguments}\n\nRaises:\n    {SHARED_ERRORS}"
 
 
@@ -360,19 +375,32 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
         if scene.is_session_only:
             python_only.append(PythonOnly("scene"))
     for name in ("controls", "over"):
-        controls: Any = settings.get(name)
-        instances = loading.list_control_instances(controls)
-        if instances or isinstance(controls, Mapping):
-            if loading.list_session_only_controls(controls):
-                check_no_worker_settings(settings)
-            objects |= {(CONTROL, control.name): control for control in instances}
-            python_only += [
-                PythonOnly("control", kind)
-                for kind in loading.list_session_only_controls(instances)
-            ]
-            settings[name] = loading.controls_to_settings(controls)
+        instances = _name_controls(settings, name)
+        objects |= {(CONTROL, control.name): control for control in instances}
+        python_only += [
+            PythonOnly("control", kind)
+            for kind in loading.list_session_only_controls(instances)
+        ]
     return (
         config(**settings)
         .with_python_objects(objects)
         .with_python_only_parts(python_only)
     )
+
+
+def _name_controls(settings: dict[str, Any], name: str) -> Sequence[Any]:
+    """Replace the controls in a setting, which may be objects, by their names and
+    options, and return those that are objects.
+
+    Args:
+        settings: settings by name, which are changed.
+        name: name of the setting, "controls" or "over".
+    """
+    controls: Any = settings.get(name)
+    instances = loading.list_control_instances(controls)
+    if not instances and not isinstance(controls, Mapping):
+        return ()
+    if loading.list_session_only_controls(controls):
+        check_no_worker_settings(settings)
+    settings[name] = loading.controls_to_settings(controls)
+    return instances

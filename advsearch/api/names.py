@@ -41,7 +41,8 @@ def check_names(values: Mapping[str, Any]) -> None:
     """Check that names in settings are those of something that exists, so that a slip
     is found before anything is loaded.
 
-    `values` are those of the settings, by name.
+    Args:
+        values: values of the settings, by name.
 
     Raises:
         UnknownNameError: nothing has such a name.
@@ -53,19 +54,33 @@ def check_names(values: Mapping[str, Any]) -> None:
         value = values.get(setting) or ""
         name = str(value.get("name", "") if isinstance(value, Mapping) else value)
         names = name.split("+") if setting == "task" else [name]
-        _check_words(setting, names, group)
-    # a name that is like none of ours may be a file or code of the user
-    like_reference = [
+        _check_entries(setting, names, group)
+    _check_models(values)
+    _check_labels(values)
+    _check_runs(values)
+    if values.get("suite"):
+        _check_suite(values["suite"])
+
+
+def _check_models(values: Mapping[str, Any]) -> None:
+    """Check names of models that are like "reference", the only bundled one; others may
+    be files or code of the user.
+    """
+    names_like_reference = [
         name
         for name in split_names(values.get("model") or "")
         if find_similar_names(name, ["reference"])
     ]
     _check_words(
         "model",
-        like_reference,
+        names_like_reference,
         ["reference"],
         "A model of yours is a file or Python code.",
     )
+
+
+def _check_labels(values: Mapping[str, Any]) -> None:
+    """Check that labels are a bundled set, if they are neither a file nor a list."""
     labels = values.get("labels")
     if labels and WORD.fullmatch(labels) and not Path(labels).exists():
         _check_words(
@@ -74,18 +89,20 @@ def check_names(values: Mapping[str, Any]) -> None:
             LABEL_SETS,
             "Or give a file, or the names with commas between them.",
         )
+
+
+def _check_runs(values: Mapping[str, Any]) -> None:
+    """Check that the runs exist that are to be compared."""
+    compares_models = bool(values.get("object"))  # then the settings name models
     for setting in ("sweeps", "compared"):
-        # With an object, these settings name models to compare.
-        if values.get(setting) and not values.get("object"):
+        if values.get(setting) and not compares_models:
             for run in split_names(values[setting]):
                 find_run(run)
-    if values.get("suite"):
-        _check_suite(values["suite"])
 
 
 def _check_scene(values: Mapping[str, Any]) -> None:
     """Check the names of objects and environments, and that of the thing to judge."""
-    # OBJECT@OPTIONS; OBJECT@OPTIONS
+    # a text: "car@12,3.5,name=taxi; person@6,-2"
     things = [
         part.strip()
         for part in str(values.get("things") or "").split(";")
@@ -114,6 +131,7 @@ def _check_scene(values: Mapping[str, Any]) -> None:
         MAP_HINT,
     )
     judge = values.get("judge")
+    # a scene in a file may have further things, whose names are not known here
     if things and judge and objects[0] in list_objects():
         _check_judge(judge, things, thing_objects)
 
@@ -122,9 +140,9 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
     """Check that the thing to judge is one of the things in the scene.
 
     Args:
-        judge: its name, which ends in -2, -3 and so on where several things have one.
+        judge: its name; of several things with one name, the second ends in -2, ...
         things: as in the setting, ``car@12,3.5,name=taxi``.
-        objects: the objects of these things.
+        objects: the objects of these things, which are their names by default.
 
     Raises:
         UnknownNameError: it is none of them.
@@ -143,24 +161,25 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
 
 
 def _check_controls(values: Mapping[str, Any]) -> None:
-    """Check names of controls that are like that of a built-in one but none; others may
-    be code of the user.
+    """Check that names of controls that are like one of a built-in control are one;
+    others may be code of the user.
     """
     controls = {**(values.get("controls") or {}), **(values.get("over") or {})}
     names = []
     for name, options in controls.items():
         kind = str((options or {}).get("kind") or name)
-        is_class = re.search(r":[A-Z]", kind)
+        is_class = re.search(r":[A-Z]", kind)  # "package.module:Class"
         if not is_class:
+            # "light" of "light:Key", and "pose" of "pose.yaw"
             names.append(re.split(r"[:.]", kind)[0])
     built_in_controls = list_built_ins("control")
-    # The registry reports a parameter with the control that it belongs to.
+    # A parameter is no control: the registry reports it, with the control that has it.
     like_controls = [
         name
         for name in names
         if name not in PARAMETERS and find_similar_names(name, built_in_controls)
     ]
-    _check_words("control", like_controls, "controls")
+    _check_entries("control", like_controls, "controls")
 
 
 def _check_suite(suite: str) -> None:
@@ -176,10 +195,32 @@ def _check_suite(suite: str) -> None:
         for folder in {Path(suite).parent, Path("suites")}
         for file in sorted(folder.glob("*.y*ml"))
     ]
-    similar = find_similar_names(Path(suite).stem, [file.stem for file in files])[:1]
-    matches = [file for file in files if file.stem in similar]
-    hint = f"; did you mean {matches[0]}?" if matches else ""
+    similar = find_similar_names(Path(suite).stem, [file.stem for file in files])
+    hint = ""
+    if similar:
+        best = next(file for file in files if file.stem == similar[0])
+        hint = f"; did you mean {best}?"
     raise InputError(f"suite: there is no file {suite}{hint}")
+
+
+def _check_entries(kind: str, names: Iterable[str], group: str) -> None:
+    """Check words as `_check_words` does: they have to be built-in entries of a kind,
+    or those of other packages.
+
+    Args:
+        kind: kind of the entries, such as "policy".
+        names: names to check.
+        group: entry points of other packages: "policies" for "advsearch.policies".
+
+    Raises:
+        UnknownNameError: a word is none of them.
+    """
+    words = [name for name in names if _is_word(name)]
+    if not words:  # then no other packages are looked for
+        return
+    installed = entry_points(group=f"advsearch.{group}")
+    known = [*list_built_ins(kind), *(point.name for point in installed)]
+    _check_words(kind, words, known)
 
 
 def _check_words(
@@ -191,19 +232,20 @@ def _check_words(
     Args:
         kind: what is named, for messages.
         names: names to check.
-        known: the names that there are; or the suffix of a group of entry points, to
-            whose built-in names other packages add theirs.
+        known: the names that there are.
         hint: the end of the message.
 
     Raises:
         UnknownNameError: a word is none of them.
     """
+    known_names = list(known)
     for name in names:
-        if not WORD.fullmatch(name) or Path(name).exists():
-            continue
-        if isinstance(known, str):
-            installed = entry_points(group=f"advsearch.{known}")
-            known = [*list_built_ins(kind), *(point.name for point in installed)]
-        known = list(known)
-        if name not in known:
-            raise UnknownNameError(kind, name, known, hint)
+        if _is_word(name) and name not in known_names:
+            raise UnknownNameError(kind, name, known_names, hint)
+
+
+def _is_word(name: str) -> bool:
+    """Return whether a name can only be that of something known: it is a plain word,
+    and no file.
+    """
+    return WORD.fullmatch(name) is not None and not Path(name).exists()

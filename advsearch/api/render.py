@@ -78,8 +78,15 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
         )
     path = find_run(run)
     result = read_result(path)
-    if not isinstance(result, AttackSummary):
-        return SweepResult(result, path) if isinstance(result, SweepSummary) else result
+    if isinstance(result, AttackSummary):
+        return _load_attack(result, path)
+    if isinstance(result, SweepSummary):
+        return SweepResult(result, path)
+    return result
+
+
+def _load_attack(summary: AttackSummary, path: Path) -> AttackResult:
+    """Return the result of an attack with its pictures, from the folder of its run."""
     clean, adversarial = (
         read_png(path / IMAGES / f"{name}.png") for name in ("clean", "adversarial")
     )
@@ -90,13 +97,14 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
             np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1)
         )
     return AttackResult(
-        summary=result,
+        summary=summary,
         run=path,
         u=torch.from_numpy(read_configuration(path)),
         clean=torch.from_numpy(clean),
         adversarial=torch.from_numpy(adversarial),
         artifacts=artifacts,
         search=None,
+        # loaded when they are needed first
         parts=cache(partial(load_parts_of_run, path)),
     )
 
@@ -157,16 +165,7 @@ def render_picture_file(
     aovs = parse_aovs(config.aov)
     if aovs and config.around is not None:
         raise InputError("aov: is of one view; leave `around` out")
-    for spec in (config.object, config.environment, config.model, config.labels):
-        if (
-            spec is not None
-            and out.exists()
-            and os.path.exists(spec)
-            and out.samefile(spec)
-        ):
-            raise InputError(
-                f"out: would replace {spec}, which is read; choose another name"
-            )
+    _check_replaces_no_input(config, out)
     progress.stage("loading the scene and the model")
     check_run_settings(config)
     controls = make_configured_controls(config, config.controls)
@@ -194,3 +193,18 @@ def render_picture_file(
     return rendering.result(
         out, rendering.save(out), warnings, rendering.save_predictions(out)
     )
+
+
+def _check_replaces_no_input(config: RenderConfig, out: Path) -> None:
+    """Check that a file to write is none of those that the settings name.
+
+    Raises:
+        InputError: it is one.
+    """
+    if not out.exists():
+        return
+    for spec in (config.object, config.environment, config.model, config.labels):
+        if spec is not None and os.path.exists(spec) and out.samefile(spec):
+            raise InputError(
+                f"out: would replace {spec}, which is read; choose another name"
+            )

@@ -104,9 +104,9 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
     if command not in RENDERERS:
         raise InputError(
             f"{folder}: expected a run of {' or '.join(RENDERERS)}, or one with such "
-            "parts, "
-            f"got one of {command}"
+            f"parts, got one of {command}"
         )
+    # objects of the Python session, but for those that only a search needs
     missing = [
         part.text
         for part in read_python_only(folder)
@@ -123,7 +123,16 @@ def _render_run(folder: Path, every: bool, progress: Progress) -> Iterator[Rende
 def _render_sweep(
     folder: Path, every: bool, progress: Progress
 ) -> Iterator[RenderedRow]:
-    """Yield the rendered images of a sweep, one at a time."""
+    """Yield the rendered images of a sweep, one at a time.
+
+    Args:
+        folder: folder of the run.
+        every: render all images; otherwise only those about which a model is wrong.
+        progress: reports the number of images.
+
+    Raises:
+        FileFormatError: the run has rows of images that its settings do not make.
+    """
     config = SweepConfig.from_yaml(folder / CONFIG)
     # metrics are not computed again
     scenes = load_scenes_of_sweep(config.model_copy(update={"metrics": {}}))
@@ -134,12 +143,12 @@ def _render_sweep(
         for image, rows in rows_of_image.items()
         if every or not all(row.correct for row in rows)
     )
-    count = job.images_per_scene * len(job.scenes)
-    # checks the first and the last, since the numbers are sorted
-    if images and not 0 <= images[0] <= images[-1] < count:
+    n_images = job.images_per_scene * len(job.scenes)
+    # they are sorted, so that the first and the last one show it for all
+    if images and not 0 <= images[0] <= images[-1] < n_images:
         raise FileFormatError(
-            f"{folder / NAME}: expected rows of its {count} "
-            "pictures, got one of another"
+            f"{folder / NAME}: expected rows of its {n_images} pictures, got one of "
+            "another"
         )
     progress.stage("rendering pictures", len(images))
     for image in images:
@@ -159,12 +168,16 @@ def _render_sweep_image(
         rows: the predictions of all models for it.
     """
     job = scenes.job
-    view, (query, *_) = scenes.make_queries(image)
+    view, queries = scenes.make_queries(image)
+    query = queries[0]  # all models get the same image
     scene = job.scenes[view.number]
     picture = view.render_image(query)
-    # rows of one image are in the order of the models
-    first_model = [row.correct for row in rows if row.step % len(job.models) == 0]
-    stored = first_model[0] if first_model else None
+    # the steps of an image are in the order of the models
+    correct_of_first_model = [
+        row.correct for row in rows if row.step % len(job.models) == 0
+    ]
+    stored = correct_of_first_model[0] if correct_of_first_model else None
+    is_right = view.problems[0].judge(picture, query.u).right
     return RenderedRow(
         name=f"{image:06d}",
         picture=picture,
@@ -174,7 +187,8 @@ def _render_sweep_image(
         u=query.u,
         rows=rows,
         values=rows[0].values,
-        is_reproduced=stored in (None, view.problems[0].judge(picture, query.u).right),
+        # without a stored row nothing contradicts it
+        is_reproduced=stored in (None, is_right),
     )
 
 
@@ -194,6 +208,11 @@ def _render_attack(
 
     Where no condition varies, trials differ in noise alone, and only the first of each
     is rendered.
+
+    Args:
+        folder: folder of the run.
+        every: render all trials; otherwise only those in which the model is wrong.
+        progress: reports the number of images.
     """
     summary = load_attack_summary(folder)
     parts = load_parts_of_run(folder)
@@ -201,20 +220,21 @@ def _render_attack(
     # kinds of rows, each with the configuration that its trials have
     configuration_of_kind = dict.fromkeys(CLEAN_KINDS, problem.domain.start)
     if summary.adversarial is not None:
+        # with `answer_from` the answer is a baseline's, and not the search's
         kind = "baseline verification" if summary.answer_from else "verification"
         configuration_of_kind[kind] = read_stored_configuration(folder, problem)
     rows = list[Row]()
-    with Store(folder / NAME, read_only=True) as store:
-        for kind in configuration_of_kind:
-            trials = [row for row in store.rows(kind) if every or not row.correct]
-            rows += trials if problem.conditions else trials[:1]
+    for kind in configuration_of_kind:
+        trials = _read_trials(folder, kind, every)
+        rows += trials if problem.conditions else trials[:1]
     progress.stage("rendering pictures", len(rows))
     for row in rows:
         u = configuration_of_kind[row.kind]
-        seed = max(0, row.seed or 0)
+        seed = max(0, row.seed or 0)  # a row may lack it
         picture = problem.picture(u, seed, row.spp or problem.spp)
         # with the conditions that the seed draws
         full_u = problem.add_conditions(u, seed)
+        is_right = problem.judge(picture, full_u).right
         yield RenderedRow(
             name=f"{row.kind.replace(' ', '-')}-{row.step:02d}",
             picture=picture,
@@ -224,21 +244,32 @@ def _render_attack(
             u=full_u,
             rows=[row],
             values={**problem.describe(u, seed), **row.values},
-            is_reproduced=row.correct in (None, problem.judge(picture, full_u).right),
+            is_reproduced=row.correct in (None, is_right),
         )
         progress.advance(1)
 
 
-def make_object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
-    """Return the facts about the object, also where the run judges another thing.
+def _read_trials(folder: Path, kind: str, every: bool) -> list[Row]:
+    """Return the rows of a kind in the store of a run: all, or those in which the model
+    is wrong.
+    """
+    with Store(folder / NAME, read_only=True) as store:
+        return [row for row in store.rows(kind) if every or not row.correct]
 
-    A label in the settings is that of the judged thing, so it counts only where that is
-    the object.
+
+def make_object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
+    """Return the facts about the object of a scene, also where the run judges another
+    thing.
+
+    Args:
+        scene: the scene.
+        name: name of the object.
+        config: settings of the run. Their label is that of the judged thing, so it is
+            left out where that is not the object.
     """
     judges_object = config.judge not in scene.description.things
-    return make_facts(
-        scene.description, name, config.label if judges_object else None, dict
-    )
+    label = config.label if judges_object else None
+    return make_facts(scene.description, name, label, dict)
 
 
 RENDERERS = {SweepConfig.command: _render_sweep, AttackConfig.command: _render_attack}

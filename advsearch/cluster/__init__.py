@@ -56,7 +56,7 @@ class BatchResult:
     lost: str = ""  # why there is no value, of a single item only
 
     def require_value(self, title: str) -> Any:
-        """Return what the call returned.
+        """Return the value of the batch, which must have been computed.
 
         Args:
             title: what the batch was, for the message.
@@ -106,8 +106,8 @@ class Workers(Protocol):
     def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """Compute batches, and yield the result of each once, in any order.
 
-        No more batches are taken before their results are requested than there are
-        workers.
+        Batches are taken from the iterable as they are needed: never more than one for
+        each worker before a result is requested.
 
         Raises:
             AdvsearchError: if a batch raises it.

@@ -47,9 +47,8 @@ CONNECT_SECONDS = 30.0
 RECONNECT_SECONDS = 120.0
 LOOK_SECONDS = 0.5  # seconds between two looks at who is there, and between two tries
 MAX_TRIES = 10  # of a call that workers cannot begin
-# seconds that a worker may take to end, and that a scheduler may take to say who is
-# there
-RESTART = 20.0
+# seconds that a scheduler may take to say which workers there are, and a worker to end
+RESPONSE_SECONDS = 20.0
 
 SILENT = logging.CRITICAL + 1
 """Level of Dask's log: what matters of it is said in a user's words, and a worker that
@@ -148,7 +147,7 @@ class DaskExecutor(WorkerExecutor):
         """
         self.description = site.description
         self.stats = WorkerStats()
-        self.link = ""  # of a page that shows the workers; empty where there is none
+        self.link = ""  # address of a page that shows the workers; "" if there is none
         self._site = site
         self._contents = contents
         self._plugin_name = f"advsearch files {uuid.uuid4()}"
@@ -158,12 +157,13 @@ class DaskExecutor(WorkerExecutor):
         self._connection: Any = None
         self._sending: asyncio.Future[Any] | None = None  # of the files
         self._calls: set[Future[Any]] = set()
-        # addresses of workers that may be given calls
+        # addresses of workers that are given calls
         self._fit: frozenset[str] = frozenset()
-        # why others are given none, by their addresses
+        # why other workers are given none, by their addresses
         self._refused: dict[str, str] = {}
-        # never, so that the first count looks
+        # when the workers were last looked up: never, so that the first count does it
         self._looked_at = float("-inf")
+        # when workers were last counted, and since when there has been none that is fit
         self._counted_at = self._alone_since = time.monotonic()
         try:
             self._open(CONNECT_SECONDS)
@@ -183,31 +183,15 @@ class DaskExecutor(WorkerExecutor):
         import distributed
 
         untyped: Any = distributed
-        security = (
-            untyped.Security(**self._site.security) if self._site.security else None
-        )
+        security = None
+        if self._site.security:
+            security = untyped.Security(**self._site.security)
         deadline = time.monotonic() + seconds
         dask.config.set(CONFIG)
         logging.getLogger("distributed").setLevel(SILENT)
         while True:
             try:
-                # started once, however often the connection is tried
-                if self._site.start is not None and self._cluster is None:
-                    self._cluster = self._site.start(
-                        **({} if security is None else {"security": security})
-                    )
-                    if self._site.count is not None:
-                        self._cluster.scale(self._site.count)
-                seconds_left = max(
-                    1.0, min(CONNECT_SECONDS, deadline - time.monotonic())
-                )
-                target = self._cluster or self._site.address
-                self._client = untyped.Client(
-                    target,
-                    security=security,
-                    timeout=seconds_left,
-                    set_as_default=False,
-                )
+                self._client = self._connect(security, deadline)
                 break
             except (
                 OSError,
@@ -219,9 +203,9 @@ class DaskExecutor(WorkerExecutor):
                 if time.monotonic() >= deadline:
                     raise ClusterError(
                         f"{self.description}: there is no scheduler that answers "
-                        f"({error or type(error).__name__}); start "
-                        "one with dask scheduler, check address and certificates, and "
-                        "go on with advsearch resume"
+                        f"({error or type(error).__name__}); start one with dask "
+                        "scheduler, check address and certificates, and go on with "
+                        "advsearch resume"
                     ) from error
                 time.sleep(LOOK_SECONDS)
         self._connection = self._client.scheduler_comm
@@ -231,13 +215,39 @@ class DaskExecutor(WorkerExecutor):
         if self.link:
             self._tell(f"Dask shows its workers at {self.link}")
 
+    def _connect(self, security: Any, deadline: float) -> Any:
+        """Start the cluster, unless it runs or there is none to start, and return a client
+        of the scheduler.
+
+        Args:
+            security: Dask's `Security`, or None.
+            deadline: time (`time.monotonic`) until which the scheduler may answer; it has
+                one second at least.
+        """
+        import distributed
+
+        untyped: Any = distributed
+        # started once, however often the connection is tried
+        if self._site.start is not None and self._cluster is None:
+            keywords = {} if security is None else {"security": security}
+            self._cluster = self._site.start(**keywords)
+            if self._site.count is not None:
+                self._cluster.scale(self._site.count)
+        seconds_left = min(CONNECT_SECONDS, deadline - time.monotonic())
+        return untyped.Client(
+            self._cluster or self._site.address,
+            security=security,
+            timeout=max(1.0, seconds_left),
+            set_as_default=False,
+        )
+
     # ---- who is there
 
     def count_workers(self) -> int:
-        """Return how many workers may be given calls now.
+        """Return how many workers are given calls now.
 
-        Who is there is looked up every `LOOK_SECONDS`, and a lost connection is made
-        again.
+        The workers are looked up every `LOOK_SECONDS`; if the connection was lost, it is
+        made again first.
 
         Raises:
             ClusterError: there has been no such worker for too long.
@@ -245,20 +255,20 @@ class DaskExecutor(WorkerExecutor):
         now = time.monotonic()
         if now - self._looked_at >= LOOK_SECONDS:
             client = self._client
-            # A client that connects again does so by a connection of its own. What was
-            # under way is lost all the same.
-            if (
-                client.status != "running"
-                or client.scheduler_comm is not self._connection
-            ):
+            # A client that connects again by itself does so by another connection. The
+            # calls that were running are lost all the same.
+            is_connected = (
+                client.status == "running" and client.scheduler_comm is self._connection
+            )
+            if not is_connected:
                 self._reconnect()
             # a scheduler that is slow, or about to end: the next look will tell
             with suppress(OSError, TimeoutError, asyncio.TimeoutError):
                 self._look()
             self._looked_at = time.monotonic()
-        # the time without workers begins anew if there are some, or if nobody has asked
-        # for so long that nobody looked for them
-        if self._fit or now - self._counted_at > LESS_PATIENCE:
+        # Nobody looked for workers while nobody counted them: that time does not count.
+        was_long_ago = now - self._counted_at > LESS_PATIENCE
+        if self._fit or was_long_ago:
             self._alone_since = now
         self._check_hope(now)
         self._counted_at = time.monotonic()
@@ -272,7 +282,7 @@ class DaskExecutor(WorkerExecutor):
         """
         client = self._client
         connected = frozenset(
-            client.sync(client.scheduler.ncores, callback_timeout=RESTART)
+            client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
         )
         self.stats.lost += len(self._fit - connected)
         self._refused = {
@@ -282,39 +292,49 @@ class DaskExecutor(WorkerExecutor):
         }
         fit = self._fit & connected
         new = connected - fit - set(self._refused)
-        versions = (
-            client.sync(self._versions, sorted(new), callback_timeout=RESTART)
-            if new
-            else {}
-        )
+        versions = {}
+        if new:
+            versions = client.sync(
+                self._versions, sorted(new), callback_timeout=RESPONSE_SECONDS
+            )
         for address, its_version in versions.items():
             if its_version == compute_version():
                 fit |= {address}
-            elif isinstance(its_version, str):
-                self._refuse(
-                    address,
-                    f"it has advsearch {its_version}, and "
-                    f"{compute_version()} asks; install the same on both",
-                )
-            elif isinstance(its_version, (ImportError, AttributeError)):
-                self._refuse(
-                    address,
-                    f"it cannot begin ({its_version}); install the "
-                    "same advsearch there",
-                )
-            # or else it is going, or does not answer yet: the next look will tell
+            else:
+                self._refuse_version(address, its_version)
         self._fit = fit - set(self._refused)
 
-    async def _versions(self, workers: list[str]) -> dict[str, Any]:
-        """Return the version of advsearch of each worker, or the error of those that
-        fail.
+    def _refuse_version(self, address: str, version: Any) -> None:
+        """Refuse a worker that has another advsearch, or none.
+
+        Args:
+            address: address of the worker.
+            version: its version, or the error that it had instead. By any other error it
+                is about to end, or does not answer yet: the next look will tell.
         """
-        found: dict[str, Any] = await self._client.run(
+        if isinstance(version, str):
+            self._refuse(
+                address,
+                f"it has advsearch {version}, and {compute_version()} asks; install "
+                "the same on both",
+            )
+        elif isinstance(version, (ImportError, AttributeError)):
+            self._refuse(
+                address,
+                f"it cannot begin ({version}); install the same advsearch there",
+            )
+
+    async def _versions(self, workers: list[str]) -> dict[str, Any]:
+        """Return the version of advsearch of each worker by address, or the error of a
+        worker that fails.
+        """
+        versions: dict[str, Any] = await self._client.run(
             compute_version, workers=workers, on_error="return"
         )
-        return found
+        return versions
 
     def _refuse(self, address: str, reason: str) -> None:
+        """Give a worker no more calls, and report why, once."""
         self._fit -= {address}
         if address not in self._refused:
             self._refused[address] = reason
@@ -322,24 +342,22 @@ class DaskExecutor(WorkerExecutor):
             self._tell(f"{address} is given nothing: {reason}")
 
     def _check_hope(self, now: float) -> None:
-        """Raise ClusterError if no worker that suits the task has been there for too
-        long.
+        """Raise ClusterError if there has been no worker that is fit for too long.
 
-        Where there are workers, but all were refused, that is sooner.
+        That is sooner where there are workers, but all were refused.
         """
         patience = LESS_PATIENCE if self._refused else PATIENCE
         if now - self._alone_since > patience:
             reasons = "; ".join(dict.fromkeys(self._refused.values()))
+            remark = f" ({reasons})" if reasons else ""
             raise ClusterError(
                 f"{self.description}: there was no worker that can do it for "
-                f"{patience:.0f} s"
-                f"{f' ({reasons})' if reasons else ''}; what was stored is kept, so "
-                "that the run can go on with "
-                "advsearch resume"
+                f"{patience:.0f} s{remark}; what was stored is kept, so that the run can "
+                "go on with advsearch resume"
             )
 
     def _reconnect(self) -> None:
-        """Connect to the scheduler again, as at first; what is known of the workers is
+        """Connect to the scheduler again, as at first; what was known of the workers is
         forgotten.
         """
         self._tell(
@@ -382,7 +400,7 @@ class DaskExecutor(WorkerExecutor):
         # comes with the extra `dask`
         from distributed import KilledWorker
 
-        tries = 0
+        failed_starts = 0
         while client.status == "running":
             workers = sorted(self._fit)
             future = client.submit(
@@ -396,8 +414,10 @@ class DaskExecutor(WorkerExecutor):
             )
             try:
                 result = await self._wait(future, workers)
-                if result is not None and not await self._is_refused(client, *result):
-                    return result[1]
+                if result is not None:
+                    address, value = result
+                    if not await self._is_refused(client, address, value):
+                        return value
             except asyncio.CancelledError:
                 # Dask cancels the future of a lost worker, and asyncio this call where
                 # nobody wants it any more: only the latter ends it
@@ -410,18 +430,20 @@ class DaskExecutor(WorkerExecutor):
             except Exception as error:
                 # nothing of ours raises, so the worker could not even begin
                 if future.status == "error" and type(error).__name__ not in NO_WORKER:
-                    tries += 1
-                    if tries == MAX_TRIES:
-                        text = f"{type(error).__name__}: {error}"
-                        raise ClusterError(
-                            f"{self.description}: a worker cannot begin ({text})"
-                        ) from error
+                    failed_starts += 1
+                    if failed_starts == MAX_TRIES:
+                        raise self._make_start_error(error) from error
             finally:
                 if client.status == "running":
                     future.release()
             self.stats.retried += 1
             await asyncio.sleep(LOOK_SECONDS)
         raise BrokenExecutor(f"{self.description}: the scheduler has gone")
+
+    def _make_start_error(self, error: Exception) -> ClusterError:
+        """Return the error for a call that workers cannot begin."""
+        text = f"{type(error).__name__}: {error}"
+        return ClusterError(f"{self.description}: a worker cannot begin ({text})")
 
     async def _wait(self, future: Any, workers: list[str]) -> tuple[str, Any] | None:
         """Return the address and the value that a future of Dask ends with; None if
@@ -434,17 +456,18 @@ class DaskExecutor(WorkerExecutor):
 
         fetching = asyncio.ensure_future(fetch())
         try:
-            # the first of the two sets that wait returns: what is done
-            while not (await asyncio.wait([fetching], timeout=LOOK_SECONDS))[0]:
+            while True:
+                done, _ = await asyncio.wait([fetching], timeout=LOOK_SECONDS)
+                if done:
+                    return fetching.result()
                 if not self._fit.intersection(workers):
                     return None
-            return fetching.result()
         finally:
             fetching.cancel()
 
     async def _is_refused(self, client: Any, address: str, value: Any) -> bool:
-        """Return whether a call has to be run again, on another worker or once files
-        were sent.
+        """Return whether a call has to be run again: on another worker, or after its files
+        were sent, which is done here.
 
         Args:
             client: client of the connection that was used.
@@ -452,18 +475,9 @@ class DaskExecutor(WorkerExecutor):
             value: what it returned, a `Reply` for batches.
         """
         failure = value.failure if isinstance(value, Reply) else None
-        # files are sent to all workers at once, for the first one that lacks them
-        if failure is Failure.MISSING_FILES and (
-            self._sending is None or not self._sending.done()
-        ):
-            if self._sending is None:
-                sending = client.register_plugin(
-                    make_file_plugin(self._contents), name=self._plugin_name
-                )
-                self._sending = asyncio.ensure_future(sending)
-            # a worker that cannot write says so with its next call
-            with suppress(Exception):
-                await asyncio.shield(self._sending)
+        were_files_sent = self._sending is not None and self._sending.done()
+        if failure is Failure.MISSING_FILES and not were_files_sent:
+            await self._send_files(client)
             return True
         # unfit, or without files although they were sent
         if failure in (Failure.UNFIT, Failure.MISSING_FILES):
@@ -471,7 +485,19 @@ class DaskExecutor(WorkerExecutor):
             return True
         return False
 
+    async def _send_files(self, client: Any) -> None:
+        """Send the files to all workers, or wait until another call has sent them."""
+        if self._sending is None:
+            sending = client.register_plugin(
+                make_file_plugin(self._contents), name=self._plugin_name
+            )
+            self._sending = asyncio.ensure_future(sending)
+        # a worker that cannot write says so with its next call
+        with suppress(Exception):
+            await asyncio.shield(self._sending)
+
     async def _forget_files(self, client: Any) -> None:
+        """Tell the scheduler not to send the files to further workers."""
         await client.unregister_worker_plugin(name=self._plugin_name)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
@@ -482,18 +508,17 @@ class DaskExecutor(WorkerExecutor):
             call.cancel()
         client = self._client
         cluster = self._cluster
-        if (
-            client is not None
-            and client.status == "running"
-            and self._sending is not None
-        ):
+        is_connected = client is not None and client.status == "running"
+        if is_connected and self._sending is not None:
             with suppress(Exception):
-                client.sync(self._forget_files, client, callback_timeout=RESTART)
+                client.sync(
+                    self._forget_files, client, callback_timeout=RESPONSE_SECONDS
+                )
         self._client = self._cluster = None
-        for end in (client, cluster):
-            if end is not None:
-                with suppress(Exception):  # whether or not its other end is there
-                    end.close(timeout=RESTART)
+        for opened in (client, cluster):
+            if opened is not None:
+                with suppress(Exception):  # its other end may have gone
+                    opened.close(timeout=RESPONSE_SECONDS)
 
 
 ADDRESS_SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
@@ -521,6 +546,12 @@ def open_dask(
 ) -> tuple[DaskExecutor, WorkerTask]:
     """Return an executor on a cluster, and the task with the digests of its files, by
     which workers check that they have the same.
+
+    Args:
+        task: what the workers do.
+        workers: how many to start; None for the default.
+        cluster: the address of a scheduler, or the path of a YAML file.
+        tell: takes messages for the user.
     """
     site = parse_site(workers, cluster)
     if importlib.util.find_spec("distributed") is None:
@@ -551,9 +582,8 @@ def parse_site(workers: int | None, cluster: str) -> ClusterSite:
         site = _read_site(Path(cluster), workers)
     else:
         raise InputError(
-            "cluster: expected the address of a scheduler such as "
-            "tcp://10.0.0.1:8786, local, or a .yaml file, got "
-            f"{cluster!r}"
+            "cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, "
+            f"local, or a .yaml file, got {cluster!r}"
         )
     if site.address and workers is not None:
         raise InputError(
@@ -566,12 +596,35 @@ def parse_site(workers: int | None, cluster: str) -> ClusterSite:
 def _read_site(path: Path, workers: int | None) -> ClusterSite:
     """Read where workers run from a YAML file.
 
+    Args:
+        path: path of the file.
+        workers: how many to start; None for what the file says.
+
     Raises:
         FileFormatError: if it has wrong or contradictory entries.
         InputError: if a package for the cluster is not installed.
     """
     entries: dict[str, Any] = read_yaml(path)
     _check_entries(path, entries)
+    security = _read_security(path, entries)
+    count = entries.get("workers") if workers is None else workers
+    is_count = isinstance(count, int) and not isinstance(count, bool) and count >= 1
+    if count is not None and not is_count:
+        raise FileFormatError(
+            f"{path}: workers: expected a whole number of at least 1, got {count!r}"
+        )
+    if "address" in entries:
+        return _read_scheduler(path, entries, security)
+    name = str(entries["class"])
+    start = partial(_import_cluster(path, name), **(entries.get("arguments") or {}))
+    n_workers = 1 if count is None else count
+    return ClusterSite(name, start=start, security=security, count=n_workers)
+
+
+def _read_security(path: Path, entries: dict[str, Any]) -> dict[str, object] | None:
+    """Return the keywords of Dask's `Security` that a cluster file has, None if it has
+    none; the paths in them are relative to the file.
+    """
     security = {**(entries.get("security") or {})}
     for name in (
         "tls_ca_file",
@@ -581,28 +634,28 @@ def _read_site(path: Path, workers: int | None) -> ClusterSite:
         "tls_scheduler_key",
     ):
         if isinstance(security.get(name), str):
-            # paths are relative to the YAML file
             security[name] = str(path.parent / security[name])
-    count = entries.get("workers") if workers is None else workers
-    is_count = isinstance(count, int) and not isinstance(count, bool) and count >= 1
-    if count is not None and not is_count:
+    return security or None
+
+
+def _read_scheduler(
+    path: Path, entries: dict[str, Any], security: dict[str, object] | None
+) -> ClusterSite:
+    """Return the scheduler that a cluster file names by its address.
+
+    Raises:
+        FileFormatError: it is no address, or the file has a number of workers, too.
+    """
+    address = str(entries["address"])
+    if not address.startswith(ADDRESS_SCHEMES):
         raise FileFormatError(
-            f"{path}: workers: expected a whole number of at least 1, got {count!r}"
+            f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT"
         )
-    if "address" in entries:
-        address = str(entries["address"])
-        if not address.startswith(ADDRESS_SCHEMES):
-            raise FileFormatError(
-                f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT"
-            )
-        if "workers" in entries:
-            raise FileFormatError(
-                f"{path}: workers: the scheduler says how many there are; leave it out"
-            )
-        return ClusterSite(address, address=address, security=security or None)
-    name = str(entries["class"])
-    start = partial(_import_cluster(path, name), **(entries.get("arguments") or {}))
-    return ClusterSite(name, start=start, security=security or None, count=count or 1)
+    if "workers" in entries:
+        raise FileFormatError(
+            f"{path}: workers: the scheduler says how many there are; leave it out"
+        )
+    return ClusterSite(address, address=address, security=security)
 
 
 def _check_entries(path: Path, entries: dict[str, Any]) -> None:
@@ -614,8 +667,8 @@ def _check_entries(path: Path, entries: dict[str, Any]) -> None:
     """
     known = {"address", "class", "arguments", "workers", "security"}
     unknown = sorted(set(entries) - known)
-    # exactly one of the two must be there
-    if unknown or ("address" in entries) == ("class" in entries):
+    has_both_or_neither = ("address" in entries) == ("class" in entries)
+    if unknown or has_both_or_neither:
         got = "got both or neither"
         if unknown:
             got = f"got {', '.join(map(str, unknown))}"

@@ -25,11 +25,13 @@ from advsearch.cluster import MAX_DEATHS, WorkerDiedError, WorkerExecutor, Worke
 from advsearch.cluster.worker import SERVE_VARIABLE
 from advsearch.errors import InputError
 
-START_SECONDS = (
+START_CODE = (
     "import sys; sys.path[:] = sys.argv[1:]; from advsearch.cluster.worker import "
     "serve; serve()"
 )
-"""The path first, or a file in the current folder could stand for a module."""
+"""What a worker process runs; its arguments are the path on which Python looks for
+modules. The path is set first, or a file in the current folder could stand for a module.
+"""
 
 
 class WorkerProcess:
@@ -41,13 +43,13 @@ class WorkerProcess:
         """
         # one thread each, since the processes share the cores
         environ = {**os.environ, "OMP_NUM_THREADS": "1", SERVE_VARIABLE: "1"}
-        command = [sys.executable, "-c", START_SECONDS, *sys.path]
+        command = [sys.executable, "-c", START_CODE, *sys.path]
         self._popen = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=environ,
-            # the interrupt of the terminal reaches this process only
+            # so that Ctrl-C in the terminal does not reach it
             start_new_session=True,
         )
 
@@ -93,7 +95,8 @@ class LocalExecutor(WorkerExecutor):
         Raises:
             InputError: this process is a worker itself.
         """
-        if SERVE_VARIABLE in os.environ:
+        is_worker = SERVE_VARIABLE in os.environ
+        if is_worker:
             raise InputError(
                 "workers: a module that a worker imports asks for workers itself; put "
                 "what it asks under "
@@ -102,7 +105,7 @@ class LocalExecutor(WorkerExecutor):
         self.description = f"{count} workers on this machine"
         self.stats = WorkerStats()
         self._count = count
-        # one thread waits for the answers of each process
+        # a thread for each process, which waits for its results
         self._threads = ThreadPoolExecutor(count, "worker")
         self._lock = Lock()
         self._idle: list[WorkerProcess] = []
@@ -121,8 +124,8 @@ class LocalExecutor(WorkerExecutor):
         return self._threads.submit(self._call, function, args)
 
     def _call(self, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-        """Run a function in a process and return its result, in a new process if one
-        dies of it.
+        """Run a function in a process and return its result; if the process dies, run it
+        again in another one.
 
         Raises:
             WorkerDiedError: `MAX_DEATHS` processes died of it.
@@ -141,6 +144,11 @@ class LocalExecutor(WorkerExecutor):
         raise WorkerDiedError(f"no answer: {MAX_DEATHS} workers died of it")
 
     def _take_process(self) -> WorkerProcess:
+        """Return a process that is idle, or a new one; it counts as busy then.
+
+        Raises:
+            WorkerDiedError: the executor was shut down.
+        """
         with self._lock:
             if self._closed:
                 raise WorkerDiedError("the workers were let go")
@@ -149,6 +157,7 @@ class LocalExecutor(WorkerExecutor):
             return process
 
     def _count_death(self, process: WorkerProcess) -> None:
+        """Release a process that has died, and count the death and the new try."""
         process.close()
         with self._lock:
             self._busy.discard(process)

@@ -51,6 +51,12 @@ MachineInfo = dict[str, str]
 
 @cache
 def describe_machine() -> MachineInfo:
+    """Return what the last bits of renders and predictions depend on: the processor,
+    LLVM and the versions of `PACKAGES`.
+
+    Raises:
+        EnvironmentSetupError: there is no libLLVM.
+    """
     llvm = ".".join(map(str, ensure_llvm().version))
     return {
         "processor": threads.read_processor_name(),
@@ -79,6 +85,7 @@ def compute_version() -> str:
 
 
 def _version(package: str) -> str:
+    """Return the version of an installed package; "unknown" if it is none."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -125,14 +132,19 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
     if size > MAX_SENT_BYTES:
         raise InputError(
             f"cluster: the files of the scene and the model have {size >> 20} MiB, and "
-            f"{MAX_SENT_BYTES >> 20} can be "
-            "sent; put them in a folder that all workers see, each under the same path"
+            f"{MAX_SENT_BYTES >> 20} can be sent; put them in a folder that all "
+            "workers see, each under the same path"
         )
     return contents
 
 
 def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
-    """Read a file, and the files in its directory that it may refer to, by path."""
+    """Read a file, and the files in its directory that it may refer to; by path.
+
+    Args:
+        setting: name of the setting that names the file.
+        path: path of the file.
+    """
     suffix = path.suffix.lower()
     suffixes: tuple[str, ...] = REFERRED_SUFFIXES.get(suffix, ())
     # a YAML file refers to other files only where it is an environment
@@ -142,13 +154,9 @@ def _read_with_neighbors(setting: str, path: Path) -> dict[str, bytes]:
     if not suffixes:
         return contents
     for file in sorted(path.parent.rglob("*")):
-        if (
-            file.suffix.lower() not in (*suffixes, *PICTURE_SUFFIXES)
-            or not file.is_file()
-        ):
-            continue
-        # no link leads out of the directory
-        if is_inside(file, path.parent):
+        may_be_named = file.suffix.lower() in (*suffixes, *PICTURE_SUFFIXES)
+        # a link may lead out of the directory
+        if may_be_named and file.is_file() and is_inside(file, path.parent):
             contents[str(file)] = file.read_bytes()
     return contents
 
@@ -204,6 +212,7 @@ def resolve_files(task: WorkerTask, folder: Path) -> WorkerTask:
     for name in task.files:
         value = settings.get(name)
         if isinstance(value, str):
+            # what is no path, such as a comma, stays
             parts = [str(local_paths.get(part, part)) for part in _split_paths(value)]
             settings[name] = "".join(parts)
     return replace(task, settings=settings)
@@ -215,15 +224,15 @@ def _has_digest(path: Path, digest: str) -> bool:
 
 
 def _split_paths(value: str) -> Iterator[str]:
-    """Split the value of a setting into paths and what stands between them, which join
-    to the value again.
+    """Split the value of a setting into paths and what stands between them; all parts
+    together are the value again.
 
     ``/a.glb#NODE,/b.obj`` gives ``/a.glb``, ``#NODE``, ``,`` and ``/b.obj``. Another
     example is ``/camera.csv+/object.csv``.
     """
     for part in re.split("(,)", value):
         path, mark, node = part.strip().partition("#")
-        first, *second = split_paths(path)
+        first, *second = split_paths(path)  # a pair of paths, or a single one
         yield first
         if second:
             yield "+"
@@ -285,28 +294,30 @@ def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
                 value = call(items)
             seconds = time.perf_counter() - start - loading
         return Reply(value, seconds, loading, describe_machine(), worker)
-    except MissingFilesError as error:
-        return Reply(
-            worker=worker, failure=Failure.MISSING_FILES, error=f"it lacks {error}"
-        )
-    except (EnvironmentSetupError, StorageError) as error:
-        return Reply(worker=worker, failure=Failure.UNFIT, error=str(error))
-    except AdvsearchError as error:
-        return Reply(worker=worker, failure=Failure.INPUT, error=str(error))
-    except (OSError, ImportError) as error:
-        return Reply(
-            worker=worker,
-            failure=Failure.UNFIT,
-            error=f"{type(error).__name__}: {error}",
-        )
-    except Exception:
-        return Reply(worker=worker, failure=Failure.BUG, error=traceback.format_exc())
+    except Exception as error:
+        failure, text = _describe_failure(error)
+        return Reply(worker=worker, failure=failure, error=text)
+
+
+def _describe_failure(error: Exception) -> tuple[Failure, str]:
+    """Return the kind of a failure by its error, and the text for the user; call it
+    where the error is handled.
+    """
+    if isinstance(error, MissingFilesError):
+        return Failure.MISSING_FILES, f"it lacks {error}"
+    if isinstance(error, (EnvironmentSetupError, StorageError)):
+        return Failure.UNFIT, str(error)
+    if isinstance(error, AdvsearchError):
+        return Failure.INPUT, str(error)
+    if isinstance(error, (OSError, ImportError)):
+        return Failure.UNFIT, f"{type(error).__name__}: {error}"
+    return Failure.BUG, traceback.format_exc()
 
 
 @contextmanager
 def kill_after(seconds: float) -> Iterator[None]:
-    """End this process if the block takes longer."""
-    faulthandler.dump_traceback_later(seconds, exit=True, file=2)
+    """End this process, with a traceback, if the block takes longer."""
+    faulthandler.dump_traceback_later(seconds, exit=True, file=2)  # the error output
     try:
         yield
     finally:
@@ -319,26 +330,28 @@ def load_task(task: WorkerTask) -> BatchFunction:
     Raises:
         MissingFilesError: if this machine lacks files of the task.
     """
-    key = task_key(task)
+    key = _make_task_key(task)
     if key in _loaded:
         _loaded.move_to_end(key)
         return _loaded[key]
     folder = make_private_directory()
+    # compiled kernels are shared by all workers of the user, unless the user says where
     if "DRJIT_CACHE_DIR" not in os.environ:
         (folder / KERNELS).mkdir(exist_ok=True)
         os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)
-    describe_machine()  # without libLLVM nothing is loaded
+    describe_machine()  # raises without libLLVM, before anything is loaded
     allow_code(*task.code)
     task = resolve_files(task, folder / INPUTS)
     threads.configure(task.threads)
-    make: Callable[[Any], BatchFunction] = load_attribute(task.function)
+    make_function: Callable[[Any], BatchFunction] = load_attribute(task.function)
+    # the least recently used one goes before another is loaded, for the memory's sake
     while len(_loaded) >= MAX_LOADED:
         _loaded.popitem(last=False)
-    _loaded[key] = make(task.settings)
+    _loaded[key] = make_function(task.settings)
     return _loaded[key]
 
 
-def task_key(task: WorkerTask) -> str:
+def _make_task_key(task: WorkerTask) -> str:
     """Return a digest of all that decides what a loaded task computes."""
     described = [
         task.function,
@@ -379,18 +392,19 @@ def serve() -> None:
     goes to standard output. Other code here sees an empty input, and what it prints
     goes to the error output.
     """
-    # copies of the pipes for the calls, before 0 and 1 become something else
+    # the pipes of the calls; then other code gets an empty input (0), and what it
+    # prints (1) goes to the error output (2)
     calls = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    os.dup2(2, 1)  # what other code prints is no result
+    os.dup2(2, 1)
     received: SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]] = SimpleQueue()
 
     def listen() -> None:
         try:
             while True:
                 received.put(pickle.load(calls))
-        except (EOFError, OSError):
+        except (EOFError, OSError):  # the parent process has gone
             os._exit(0)  # also in the middle of a batch: its result has no reader
 
     threading.Thread(target=listen, name="calls", daemon=True).start()

@@ -82,9 +82,7 @@ class PoolWorkers:
         A batch whose workers die is split into its items, and a single item whose
         workers die gives a result without a value.
         """
-        source = iter(batches)
-        # batches that are taken from `batches`, but not given out
-        waiting = deque[Sequence[Any]]()
+        queued = _BatchQueue(batches)
         running = dict[Future[Reply], Sequence[Any]]()
         ended: queue.SimpleQueue[Future[Reply]] = queue.SimpleQueue()
         # of the last batches, for the deadline of the next
@@ -98,8 +96,8 @@ class PoolWorkers:
                 self.stats.workers = n_workers
                 self.stats.alive += n_workers * (now - counted_at)
                 counted_at = now
-                while len(running) < n_workers and self._take_next(waiting, source):
-                    items = waiting.popleft()
+                while len(running) < n_workers and queued.has_next():
+                    items = queued.take()
                     deadline = self._deadline(len(items), item_seconds)
                     future = self._executor.submit(
                         run_batch, self._task, items, deadline
@@ -107,32 +105,49 @@ class PoolWorkers:
                     running[future] = items
                     future.add_done_callback(ended.put)
                 self.stats.most = max(self.stats.most, len(running))
-                if not running and not self._take_next(waiting, source):
+                if not running and not queued.has_next():
                     return
                 ended_future = self._wait(ended)
                 if ended_future is None:
                     continue
                 items = running.pop(ended_future)
-                error = _error_of(ended_future)
-                if error is None:
-                    reply = ended_future.result()
-                    item_seconds.append(reply.seconds / max(1, len(items)))
-                    yield self._read_reply(items, reply)
-                # the executor was lost, not the batch: do it again
-                elif isinstance(error, BrokenExecutor):
-                    self.stats.retried += 1
-                    waiting.appendleft(items)
-                elif not isinstance(error, WorkerDiedError):
-                    raise error
-                elif len(items) > 1:
-                    self._count_dead_start()
-                    _requeue_singly(items, waiting)
-                else:
-                    self._count_dead_start()
-                    yield BatchResult(items, None, lost=str(error))
+                error = _get_error(ended_future)
+                if error is not None:
+                    yield from self._handle_loss(items, error, queued)
+                    continue
+                reply = ended_future.result()
+                item_seconds.append(reply.seconds / max(1, len(items)))
+                yield self._read_reply(items, reply)
         finally:
             for future in running:
                 future.cancel()
+
+    def _handle_loss(
+        self, items: Sequence[Any], error: BaseException, queued: _BatchQueue
+    ) -> Iterator[BatchResult]:
+        """Put a batch without a reply back into the queue; yield a result without a value
+        for a single item of which its workers died.
+
+        Args:
+            items: items of the batch.
+            error: why there is no reply.
+            queued: the batches to be given out.
+
+        Raises:
+            BaseException: `error`, if neither the executor nor a worker was lost.
+        """
+        if isinstance(error, BrokenExecutor):
+            # the executor was lost, not the batch: do it again
+            self.stats.retried += 1
+            queued.put_back(items)
+            return
+        if not isinstance(error, WorkerDiedError):
+            raise error
+        self._count_dead_start()
+        if len(items) > 1:
+            queued.put_back_singly(items)
+        else:
+            yield BatchResult(items, None, lost=str(error))
 
     def _wait(self, ended: queue.SimpleQueue[Future[Reply]]) -> Future[Reply] | None:
         """Return a future that has ended, None if none ends for a moment."""
@@ -151,8 +166,8 @@ class PoolWorkers:
         return bool(waiting)
 
     def _deadline(self, n_items: int, item_seconds: Sequence[float]) -> float:
-        """Return after how many seconds a batch counts as hanging, so that its worker
-        ends itself.
+        """Return after how many seconds a batch counts as hanging: then its worker ends
+        itself.
 
         Args:
             n_items: number of items of the batch.
@@ -183,21 +198,31 @@ class PoolWorkers:
         self.stats.batches += 1
         self.stats.busy += reply.seconds
         self.stats.loading += reply.loading
-        # alive counts without loading
+        # `alive` counts the connected seconds without those of loading
         self.stats.alive -= reply.loading
         machine: str | None = digest_machine(reply.machine)
         if machine == self._this_machine:
             machine = None
-        elif machine is not None and machine not in self.stats.machines:
-            self.stats.machines = {**self.stats.machines, machine: reply.machine}
-            description = ", ".join(
-                f"{key} {text}" for key, text in reply.machine.items()
-            )
-            self._tell(
-                f"{reply.worker} is another machine than this ({description}): "
-                "last bits of rows may differ"
-            )
+        elif machine is not None:
+            self._note_machine(machine, reply)
         return BatchResult(items, reply.value, reply.worker, machine)
+
+    def _note_machine(self, machine: str, reply: Reply) -> None:
+        """Remember and report a machine that differs from this one, the first time that it
+        replies.
+
+        Args:
+            machine: its digest.
+            reply: the reply, which describes it.
+        """
+        if machine in self.stats.machines:
+            return
+        self.stats.machines = {**self.stats.machines, machine: reply.machine}
+        description = ", ".join(f"{key} {text}" for key, text in reply.machine.items())
+        self._tell(
+            f"{reply.worker} is another machine than this ({description}): "
+            "last bits of rows may differ"
+        )
 
     def _count_dead_start(self) -> None:
         """Count a death of a worker, and give up if all die from the beginning, for
@@ -210,21 +235,45 @@ class PoolWorkers:
         if self._dead_starts >= MAX_DEAD_STARTS and not self.stats.batches:
             raise ClusterError(
                 f"{self._executor.description}: workers died of the first "
-                f"{self._dead_starts} batches, and none was done; "
-                "try it with workers=null, or see whether a worker has enough memory "
-                "for the scene and the model"
+                f"{self._dead_starts} batches, and none was done; try it with "
+                "workers=null, or see whether a worker has enough memory for the scene "
+                "and the model"
             )
 
 
-def _requeue_singly(items: Sequence[Any], waiting: deque[Sequence[Any]]) -> None:
-    """Put the items of a batch back to the front of a queue, each by itself."""
-    # item by item, in the same order
-    for index in range(len(items) - 1, -1, -1):
-        waiting.appendleft(items[index : index + 1])
+class _BatchQueue:
+    """The batches that have not been given out: first those that were put back, then
+    those of an iterable, which are taken when they are needed.
+    """
+
+    def __init__(self, batches: Iterable[Sequence[Any]]) -> None:
+        self._source = iter(batches)
+        self._waiting = deque[Sequence[Any]]()
+
+    def has_next(self) -> bool:
+        """Return whether there is a batch; it is taken from the iterable for that."""
+        if not self._waiting:
+            self._waiting.extend(islice(self._source, 1))
+        return bool(self._waiting)
+
+    def take(self) -> Sequence[Any]:
+        """Return the next batch, which `has_next` has found, and remove it."""
+        return self._waiting.popleft()
+
+    def put_back(self, items: Sequence[Any]) -> None:
+        """Make a batch the next one again."""
+        self._waiting.appendleft(items)
+
+    def put_back_singly(self, items: Sequence[Any]) -> None:
+        """Make the items of a batch the next ones, in order, each a batch by itself."""
+        for index in reversed(range(len(items))):
+            self._waiting.appendleft(items[index : index + 1])
 
 
-def _error_of(future: Future[Reply]) -> BaseException | None:
-    """Return the error of a future that has ended; cancelled ones are broken."""
+def _get_error(future: Future[Reply]) -> BaseException | None:
+    """Return the error of a future that has ended, None without one; a future is only
+    cancelled when the executor is lost.
+    """
     if future.cancelled():
         return BrokenExecutor()
     return future.exception()
@@ -248,8 +297,8 @@ def open_workers(
         tell: takes messages for the user.
 
     Yields:
-        The workers; None if `workers` and `cluster` are both None: then this process
-        does all.
+        The workers; None if neither `workers` nor `cluster` is set: then this process
+        computes all.
     """
     if workers is None and cluster is None:
         yield None

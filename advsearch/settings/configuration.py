@@ -84,14 +84,18 @@ class Setting:
 
     @property
     def text(self) -> str:
-        """The description, the values with range and unit, and the default."""
+        """The description, the values with range and unit, and the default, on one
+        line.
+        """
         unit = f", in {self.unit}" if self.unit else ""
         if isinstance(self.default, dict):
             default = ",".join(self.default)
         elif isinstance(self.default, float):
             default = f"{self.default:g}"
+        elif self.default is None:
+            default = self.otherwise  # what it means that there is no value
         else:
-            default = self.otherwise if self.default is None else str(self.default)
+            default = str(self.default)
         suffix = f" (default: {default})" if default else ""
         return f"{self.description}: {self.expects}{unit}{suffix}"
 
@@ -112,8 +116,13 @@ def setting(
     power: Power = no_power,
     **constraints: Any,
 ) -> Any:
-    """Create a pydantic field from a `Setting`, with constraints of
-    `pydantic.Field`.
+    """Create a pydantic field with the declaration of a setting.
+
+    Args:
+        default: the default value, or a function that creates it.
+        constraints: constraints of `pydantic.Field`, such as `ge`.
+        group, description, expects, unit, otherwise, flag, metavar, repeats,
+            read_texts, switched, power: see `Setting`.
     """
     declared = Setting(
         default,
@@ -130,9 +139,12 @@ def setting(
         power,
     )
     extra: Any = {"declared": declared, "constraints": constraints}
-    make = {"default_factory": default} if callable(default) else {"default": default}
+    default_name = "default_factory" if callable(default) else "default"
     return Field(
-        **make, description=description, json_schema_extra=extra, **constraints
+        **{default_name: default},
+        description=description,
+        json_schema_extra=extra,
+        **constraints,
     )
 
 
@@ -141,11 +153,11 @@ DERIVED_FIELDS = ("field", "name", "required", "is_switch", "is_mapping")
 
 
 def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
-    """Return a setting of a configuration as another one declares it.
+    """Create a field for a setting (`setting`) that another configuration declares.
 
     Args:
-        config: the other configuration.
-        field: field of the setting.
+        config: the configuration that declares it.
+        field: field of the setting there.
         changes: arguments of `setting` that differ.
     """
     extra: Any = config.model_fields[field].json_schema_extra
@@ -172,7 +184,11 @@ class Clash(NamedTuple):
 
 
 def settings(config: type[Config]) -> tuple[Setting, ...]:
-    """Return every setting of a configuration, in the order of the help."""
+    """Return every setting of a configuration, in the order of the help.
+
+    What their declarations leave empty is completed from fields, types and
+    constraints.
+    """
     completed = []
     for field, info in config.model_fields.items():
         if field in config.without:
@@ -192,6 +208,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 default=default,
                 flag=declared.flag or "--" + field.replace("_", "-"),
                 expects=declared.expects or _describe_expected(info),
+                # the last word of the name
                 metavar=declared.metavar or field.rpartition("_")[2].upper(),
                 repeats=declared.repeats or is_mapping,
                 is_switch=info.annotation is bool,
@@ -212,9 +229,10 @@ def _describe_expected(info: FieldInfo) -> str:
         return "true or false"
     if get_origin(info.annotation) is Literal:
         return _join_choices(types)
-    # a Literal or None
-    if get_origin(types[0]) is Literal:
+    is_optional_literal = get_origin(types[0]) is Literal  # a Literal or None
+    if is_optional_literal:
         return _join_choices(get_args(types[0]))
+    # of pydantic's constraints: at least, greater than, at most
     limits = {
         name: getattr(constraint, name)
         for constraint in info.metadata
@@ -312,7 +330,7 @@ class Config(BaseModel):
             InputError: a value is wrong; the message names the setting.
         """
         _check_shallow(type(self), data)
-        # checked twice: reading turns texts into nested values
+        # checked again afterwards: texts are read as values, which may be nested
         values = _read_mappings(type(self), written.to_python(data))
         _check_shallow(type(self), values)
         try:
@@ -328,32 +346,31 @@ class Config(BaseModel):
         """Refuse true and false where a setting is no switch; pydantic would take them
         for 1 and 0.
         """
+        is_switch = cls.model_fields[info.field_name].annotation is bool
         # YAML's `epsilon: yes` is a slip, not 1
-        if (
-            isinstance(value, bool)
-            and cls.model_fields[info.field_name].annotation is not bool
-        ):
+        if isinstance(value, bool) and not is_switch:
             raise ValueError("a truth value is not accepted here")
         return value
 
     @field_validator("*")
     @classmethod
     def _finite(cls, value: Any) -> Any:
+        """Refuse NaN and infinity, and integers of more than 64 bits."""
         if not written.are_all_finite(value):
             raise ValueError("not finite")
         return value
 
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
-        """Check that no setting is given that the command does not have, or that
-        contradicts others.
+        """Check that no setting is set that the command does not have (`without`), or that
+        contradicts others (`clashes`).
         """
         for name in self.without:
             field = type(self).model_fields[name]
             if getattr(self, name) != field.get_default(call_default_factory=True):
                 raise InputError(
-                    f"{name}: `advsearch {self.command}` has no such "
-                    "setting; leave it out"
+                    f"{name}: `advsearch {self.command}` has no such setting; leave it "
+                    "out"
                 )
         defaults = {setting.field: setting.default for setting in settings(type(self))}
         for clash in self.clashes:
@@ -371,8 +388,9 @@ class Config(BaseModel):
         """Load the configuration that a YAML file describes.
 
         The file has one mapping from settings to values; `schema`, `command` and `base`
-        may stand next to them (see `read_yaml`). A setting of the file with power over
-        more than the run counts as not set, and is listed by `left_out`.
+        may stand next to them (see `read_yaml`). A setting in the file that does more than
+        decide what happens in the run, such as where it connects (`powers`), is not taken
+        over; `left_out` lists it.
 
         Args:
             path: path of the file.
@@ -406,7 +424,7 @@ class Config(BaseModel):
     @property
     def powers(self) -> tuple[OmittedSetting, ...]:
         """The settings whose values do more than decide what happens in the run
-        (`trust.powers`).
+        (`trust.powers`), each with what it does.
         """
         powers = []
         for setting in settings(type(self)):
@@ -415,22 +433,29 @@ class Config(BaseModel):
             if effect:
                 powers.append(
                     OmittedSetting(
-                        setting.name, setting.field, value, effect, setting.default
+                        name=setting.name,
+                        field=setting.field,
+                        value=value,
+                        effect=effect,
+                        default=setting.default,
                     )
                 )
         return tuple(powers)
 
     @property
     def left_out(self) -> tuple[OmittedSetting, ...]:
-        """The settings of the file with power over more than the run, which count as
-        not set.
+        """The settings of the file that were not taken over, since they do more than
+        decide what happens in the run.
         """
         return self._left_out
 
     @property
     def session_settings(self) -> dict[str, Any]:
-        """The settings that parts of a run take over from this session: those that may
-        do more than decide the run, and decide none of its numbers.
+        """The settings that the parts of a run (the attacks of a study) get from this
+        session, and not from their own files, by name.
+
+        They are those that affect more than the run, such as where it connects, if they
+        affect none of its numbers (`free`).
         """
         return {
             setting.name: getattr(self, setting.field)
@@ -441,18 +466,19 @@ class Config(BaseModel):
         }
 
     def check_powers(self, where: str) -> None:
-        """Check that no setting does more than decide the run, for a file that nobody
-        can be asked about.
+        """Check that no setting does more than decide what happens in the run, for a file
+        about which no person can be asked.
 
         Args:
             where: the file, for messages.
 
         Raises:
-            InputError: one does.
+            InputError: a setting does; the message names the first one.
         """
-        for name, _, _, effect, _ in self.powers:
+        if self.powers:
+            power = self.powers[0]
             raise InputError(
-                f"{where}: {name}: {effect}, which such a file can't ask "
+                f"{where}: {power.name}: {power.effect}, which such a file can't ask "
                 "for; leave it out"
             )
 
@@ -461,9 +487,9 @@ class Config(BaseModel):
         """Return the settings of another configuration that this command has, too.
 
         They are those of the nearest common class, but for where the run is stored and
-        who shares its work.
+        which workers compute it.
         """
-        # the first, since the order of bases has the nearest first
+        # the first one that fits: `__mro__` has the nearest class first
         common_class = next(
             base
             for base in cls.__mro__
@@ -478,12 +504,11 @@ class Config(BaseModel):
 
     @classmethod
     def from_config(cls, other: Config, **changes: object) -> Self:
-        """Create a configuration of this command from that of another: the settings
-        that are `shared`, and the changes.
+        """Create a configuration of this command from that of another: with the settings
+        that both have (`get_shared_settings`), and with changes.
         """
-        return cls(
-            **{**cls.get_shared_settings(other), **changes}
-        ).with_python_parts_of(other)
+        values = {**cls.get_shared_settings(other), **changes}
+        return cls(**values).with_python_parts_of(other)
 
     @property
     def python_only_parts(self) -> tuple[PythonOnly, ...]:
@@ -530,6 +555,7 @@ class Config(BaseModel):
         data = {"schema": written.SCHEMA, "command": self.command, **self.to_json()}
         note = ""
         if self._python_only_parts:
+            # after the header, which says how to repeat the run
             note = f"# But it can't be: {format_python_only(self.python_only)}\n"
         return written.HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
 
@@ -550,8 +576,8 @@ class Config(BaseModel):
         return (self.command,)
 
     def make_repeatable(self) -> Self:
-        """Return what `run.yaml` stores: with absolute paths of files, and without the
-        place of the run, since a repetition gets its own.
+        """Return the settings that `run.yaml` stores: with absolute paths of files, and
+        without where the run is stored, which a repetition decides for itself.
         """
         absolute = {}
         for name in FILES:
@@ -577,10 +603,10 @@ class Config(BaseModel):
         return [part.text for part in self._python_only_parts]
 
     def get_deciding_settings(self) -> JsonObject:
-        """Return the settings that decide the numbers of a run, as JSON values: all
+        """Return the settings that the numbers of a run depend on, as JSON values: all
         that are not `free`.
 
-        Of a file only the name counts, since it may have been moved.
+        Of a file only the name is returned, since it may have been moved.
         """
         values = {
             name: value
@@ -601,11 +627,10 @@ def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
     """Check that no value is nested too deeply.
 
     Raises:
-        SettingsError: one is.
+        SettingsError: a value is.
     """
     problems = [
-        # in the form of pydantic's errors
-        {"loc": (name,), "input": value, "type": ""}
+        _make_problem(name, value)
         for name, value in data.items()
         if not is_shallow(value)
     ]
@@ -624,20 +649,27 @@ def _read_mappings(config: type[Config], data: Mapping[str, Any]) -> dict[str, A
     for setting in settings(config):
         if not setting.is_mapping:
             continue
+        # a setting may be given by either name
         for name in {setting.name, setting.field} & values.keys():
             value = values[name]
             texts = [value] if isinstance(value, str) else value
-            if not isinstance(texts, (list, tuple)):
-                continue
-            if not all(isinstance(text, str) for text in texts):
+            are_texts = isinstance(texts, (list, tuple)) and all(
+                isinstance(text, str) for text in texts
+            )
+            if not are_texts:
                 continue
             try:
                 values[name] = setting.read_texts(texts, setting.name)
             except ValueError:
                 got = texts[0] if len(texts) == 1 else texts
-                problem = {"loc": (name,), "input": got, "type": ""}
+                problem = _make_problem(name, got)
                 raise _make_settings_error(config, [problem]) from None
     return values
+
+
+def _make_problem(name: str, value: Any) -> dict[str, Any]:
+    """Return the problem of a setting in the form of pydantic's errors."""
+    return {"loc": (name,), "input": value, "type": ""}
 
 
 def format_python_only(parts: Sequence[str]) -> str:
@@ -652,26 +684,30 @@ def format_python_only(parts: Sequence[str]) -> str:
 
 def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
     """Return one error for pydantic's errors, in the words of the settings; of each
-    setting the first is told.
+    setting it has the first one only.
+
+    Args:
+        config: the class with the settings.
+        errors: pydantic's errors. "loc" is the name of the setting, perhaps with that
+            of an entry of its mapping; "input" the value.
     """
     declared = settings(config)
     known = {setting.name: setting for setting in declared}
     known |= {setting.field: setting for setting in declared}
     problems: dict[str, str] = {}
     for error in errors:
-        name = str(error["loc"][0])
+        location = error["loc"]
+        name = str(location[0])
         if name not in known:
             names = {setting.name for setting in declared}
             return UnknownNameError("setting", name, names)
         setting = known[name]
-        got = (
-            "nothing"
-            if error["type"] == "missing"
-            else written.format_value(error["input"])
-        )
-        # an entry of the mapping is wrong, not all of it
-        if setting.is_mapping and len(error["loc"]) > 1:
-            got = f"{error['loc'][1]}={got}"
+        got = "nothing"
+        if error["type"] != "missing":
+            got = written.format_value(error["input"])
+        is_entry_wrong = setting.is_mapping and len(location) > 1  # not all of it
+        if is_entry_wrong:
+            got = f"{location[1]}={got}"
         problems.setdefault(setting.name, f"expected {setting.expects}, got {got}")
     return SettingsError(tuple(problems.items()))
 
@@ -687,14 +723,14 @@ def _make_absolute(name: str) -> str:
     if len(paths) > 1:
         return "+".join(map(_make_absolute, paths))
     path = name
-    suffix = ""
-    # else # is a part of the file's name
-    if not os.path.isfile(name):
-        path, mark, part = name.partition("#")
-        suffix = f"{mark}{part}"
+    node = ""
+    is_file = os.path.isfile(name)
+    if not is_file:  # else a # belongs to the name of the file
+        path, mark, node_name = name.partition("#")
+        node = f"{mark}{node_name}"
     looks_like_path = "/" in path or Path(path).suffix != ""
     if looks_like_path and os.path.isfile(path):
-        return f"{Path(path).resolve()}{suffix}"
+        return f"{Path(path).resolve()}{node}"
     return name
 
 

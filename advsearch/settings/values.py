@@ -29,7 +29,7 @@ def to_python(value: Any) -> Any:
 
     It must not be nested too deeply (`is_shallow`).
     """
-    # a mapping that also holds a function
+    # a mapping that also holds a function, which a plain one would lose
     if isinstance(value, PythonQuantiles):
         return value
     if isinstance(value, Mapping):
@@ -42,10 +42,10 @@ def to_python(value: Any) -> Any:
 
 
 def to_text(value: Any, *, several: bool = False) -> Any:
-    """Return a name as a text.
+    """Return a name, a path or a number as a text.
 
-    It may be a path or a number; where there may be `several`, a list of names becomes
-    a text with commas. What is none of these is returned as it is.
+    With `several`, a list of these becomes a text with commas between them. Any other
+    value is returned as it is.
 
     Raises:
         ValueError: it is empty, or there are several where one is expected.
@@ -80,7 +80,9 @@ def text_validator(*names: str, several: Sequence[str] = ()) -> Any:
 
 
 def unique_names_validator(*names: str) -> Any:
-    """Return a validator that rejects duplicate names in settings."""
+    """Return a pydantic validator that rejects duplicate names in each of some
+    settings, the fields `names`.
+    """
 
     def check(value: str | None, info: ValidationInfo) -> str | None:
         check_no_duplicates(split_names(value or ""), str(info.field_name))
@@ -101,10 +103,13 @@ def are_all_finite(value: Any) -> bool:
         return all(are_all_finite(inner) for inner in value)
     if isinstance(value, int):
         return abs(value) <= MAX_INTEGER
-    return not isinstance(value, float) or math.isfinite(value)
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return True  # no number
 
 
 def parse_number_or_text(value: Any) -> Any:
+    """Return a text that is a number as a float; any other value as it is."""
     if not isinstance(value, str):
         return value
     try:
@@ -135,9 +140,10 @@ def parse_assignments(texts: Iterable[str], setting: str) -> dict[str, object]:
 
     Raises:
         ValueError: a text is no assignment.
-        InputError: a name comes twice.
+        InputError: there are two values for one name; it names the setting.
     """
     texts = list(texts)
+    # checked here for all of them, since `parse_assignment` raises another error
     for text in texts:
         name, equals, _ = text.partition("=")
         if not name.strip() or not equals:
@@ -155,7 +161,7 @@ def parse_choices(texts: Iterable[str], setting: str) -> dict[str, object]:
     value of `FOR_ALL`.
 
     Raises:
-        InputError: a name comes twice.
+        InputError: there are two values for one name; it names the setting.
     """
     pairs = [
         parse_assignment(text, setting) if "=" in text else (FOR_ALL, text)
@@ -169,26 +175,29 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
     """Parse controls with their settings: ``texture,pose``, ``texture={resolution:
     64}``, ``pose={...},x={...}``.
 
+    Args:
+        texts: the texts; several controls in one have commas between them.
+        where: the setting or flag, for errors.
+
     Raises:
-        InputError: settings are no mapping, or a control comes twice; it names `where`.
+        InputError: settings are no mapping, or a control comes twice.
     """
     controls: list[tuple[str, Any]] = []
     for text in texts:
         for entry in _split_outside_brackets(text):
             if not entry.strip():
                 continue
-            if "=" in entry:
-                name, settings = parse_assignment(entry, where)
-            else:
-                name = entry.strip()
-                settings = {}
+            if "=" not in entry:
+                controls.append((entry.strip(), {}))
+                continue
+            name, settings = parse_assignment(entry, where)
             # braces that YAML could not read were left as text
             if isinstance(settings, str) and settings.startswith("{"):
                 raise InputError(
                     f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for "
-                    f"{name}, got {format_value(settings)}; write "
-                    "a colon and a space behind each parameter, close every bracket, "
-                    "and put a comma before the next control"
+                    f"{name}, got {format_value(settings)}; write a colon and a space "
+                    "behind each parameter, close every bracket, and put a comma "
+                    "before the next control"
                 )
             controls.append((name, settings))
     check_no_duplicates((name for name, _ in controls), where)
@@ -196,12 +205,13 @@ def parse_controls(texts: Iterable[str], where: str) -> dict[str, object]:
 
 
 def _split_outside_brackets(text: str) -> list[str]:
-    """Split a text at its commas, but not at those in brackets; inside brackets a
-    bracket in quotes does not count.
+    """Split a text at its commas, but not at those inside of brackets.
+
+    A bracket that is quoted inside of brackets is none.
     """
     entries = [""]
-    depth = 0
-    quote = ""
+    depth = 0  # how many brackets are open
+    quote = ""  # the quote that is open, if any
     for char in text:
         if quote:
             if char == quote:
@@ -212,7 +222,7 @@ def _split_outside_brackets(text: str) -> list[str]:
             depth += 1
         elif char in "}]":
             depth -= 1
-        if char == "," and depth <= 0:
+        if char == "," and depth <= 0:  # below 0 if there are brackets too many
             entries.append("")
         else:
             entries[-1] += char
@@ -243,9 +253,10 @@ def format_value(value: Any) -> str:
     try:
         is_plain = isinstance(value, str) and value.strip() and value.isprintable()
         text = value if is_plain else repr(value)
-    # Nested too deeply, or an integer of thousands of digits.
+    # nested too deeply, or an integer of thousands of digits
     except (RecursionError, ValueError):
         text = f"a {type(value).__name__} that is too long to show"
+    # 80 characters with the dots
     return text if len(text) <= 80 else text[:77] + "..."
 
 
@@ -291,19 +302,7 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
         raise FileFormatError(
             f"{path}: expected schema {SCHEMA}, got {got}; it is of another advsearch"
         )
-    bases = data.pop("base", None) or []
-    if isinstance(bases, str):
-        bases = [bases]
-    if not isinstance(bases, list) or not all(isinstance(base, str) for base in bases):
-        raise FileFormatError(
-            f"{path}: base: expected a file or a list of files, got "
-            f"{format_value(bases)}"
-        )
-    if len(above) >= MAX_BASES or len(bases) > MAX_BASES:
-        raise FileFormatError(
-            f"{path}: base: expected at most {MAX_BASES} files, one "
-            "over the other, got more"
-        )
+    bases = _read_bases(path, data.pop("base", None), len(above))
     resolved_path = Path(path).resolve()
     if bases and resolved_path in above:
         raise FileFormatError(
@@ -314,6 +313,33 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
         base_path = Path(path).parent / base
         result = merge_mappings(result, read_yaml(base_path, (*above, resolved_path)))
     return merge_mappings(result, data)
+
+
+def _read_bases(path: str | Path, value: Any, depth: int) -> list[str]:
+    """Return the files that the `base` of a file names.
+
+    Args:
+        path: path of the file, for errors.
+        value: the value of `base`; None or empty for no file.
+        depth: how many files name this one as their base, directly or not.
+
+    Raises:
+        FileFormatError: it is something else, or there are too many files.
+    """
+    bases = value or []
+    if isinstance(bases, str):
+        bases = [bases]
+    if not isinstance(bases, list) or not all(isinstance(base, str) for base in bases):
+        raise FileFormatError(
+            f"{path}: base: expected a file or a list of files, got "
+            f"{format_value(bases)}"
+        )
+    if depth >= MAX_BASES or len(bases) > MAX_BASES:
+        raise FileFormatError(
+            f"{path}: base: expected at most {MAX_BASES} files, one over the other, "
+            "got more"
+        )
+    return bases
 
 
 def merge_mappings(
@@ -337,7 +363,12 @@ def set_dotted(data: dict[str, object], name: str, value: object) -> None:
     ``data["controls"]["pose"]["yaw"]``.
 
     A text or a list on the way becomes a mapping first. What follows ``set.`` or
-    ``grid.`` is one name, since names of parameters have dots.
+    ``grid.`` is a single name, since names of parameters have dots.
+
+    Args:
+        data: the mapping, which is changed.
+        name: the dotted name.
+        value: the value.
     """
     first, _, rest = name.partition(".")
     if not rest:

@@ -49,18 +49,22 @@ def compute_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
     expected = first_rate * second_rate + (1.0 - first_rate) * (1.0 - second_rate)
     if expected >= 1.0:
         return math.nan
-    return (float((first == second).mean()) - expected) / (1.0 - expected)
+    agreement = float((first == second).mean())
+    return (agreement - expected) / (1.0 - expected)
 
 
 def compute_rank_correlation(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
-    """Compute Spearman's rank correlation of two numbers (n,), ties by mean ranks.
+    """Compute Spearman's rank correlation of two measurements (n,), ties by mean ranks.
 
     Spearman 1904, "The proof and measurement of association between two things". NaN
-    with fewer than three rows, or where one of them is constant.
+    with fewer than three rows, or if one of the measurements is constant.
     """
     first_rank = rankdata(first)
     second_rank = rankdata(second)
-    if len(first_rank) < 3 or not np.ptp(first_rank) or not np.ptp(second_rank):
+    if len(first_rank) < 3:
+        return math.nan
+    is_constant = not np.ptp(first_rank) or not np.ptp(second_rank)
+    if is_constant:
         return math.nan
     return float(np.corrcoef(first_rank, second_rank)[0, 1])
 
@@ -71,17 +75,22 @@ def correlation_interval(
     second: npt.ArrayLike,
     units: IntArray,
 ) -> tuple[float, float] | None:
-    """Return the 95 % interval of a coefficient in [-1, 1], by units.
+    """Return the 95 % interval of a coefficient of two measurements of the same rows.
+
+    Rows come in units, such as the drives that frames are from: rows of one unit may
+    depend on each other, units do not. The interval is that of the jackknife, which
+    leaves out one unit at a time, on the scale of Fisher's z (atanh), on which the
+    coefficient is nearly normally distributed.
 
     Args:
-        statistic: statistic of both measurements of some rows: `compute_kappa` or
-            `compute_rank_correlation`.
+        statistic: returns the coefficient, in [-1, 1], of both measurements of some
+            rows: `compute_kappa` or `compute_rank_correlation`.
         first, second: (n,) measurements.
         units: (n,) unit of each row.
 
     Returns:
-        None with fewer than `MIN_UNITS` units, or where the coefficient is not defined
-        without one of them.
+        Lower and upper bound; None with fewer than `MIN_UNITS` units, or if the
+        coefficient is not defined without one of them.
     """
     first = np.asarray(first)
     second = np.asarray(second)
@@ -99,12 +108,12 @@ def correlation_interval(
     value = statistic(first, second)
     if not math.isfinite(value) or not np.isfinite(values_without_unit).all():
         return None
-    # The jackknife on the scale of Fisher's z, from which the bounds are turned back.
     z = _to_fisher_z(values_without_unit)
     variance = (n_units - 1) / n_units * float(((z - z.mean()) ** 2).sum())
     probability = (1.0 + CONFIDENCE) / 2.0  # below the upper end of the interval
     half_width = float(stdtrit(n_units - 1, probability)) * math.sqrt(variance)
     center = float(_to_fisher_z(np.array(value)))
+    # tanh turns Fisher's z into a coefficient again
     return math.tanh(center - half_width), math.tanh(center + half_width)
 
 
@@ -124,10 +133,11 @@ def estimate_rate(
 ) -> tuple[float, tuple[float, float]]:
     """Return the rate of an event over all rows, and its 95 % interval over units.
 
-    The interval is Clopper and Pearson's of as many independent rows as would have the
-    variance over units (Korn and Graubard 1998, "Confidence intervals for proportions
-    with small expected number of positive counts estimated from survey data"). Where
-    the event happens in all rows or in none, each unit counts as one row.
+    Rows of one unit may depend on each other, units do not. The interval is Clopper and
+    Pearson's of as many independent rows as would have the variance over units (Korn
+    and Graubard 1998, "Confidence intervals for proportions with small expected number
+    of positive counts estimated from survey data"). If the event happens in all rows or
+    in none, each unit counts as one row.
 
     Args:
         happens: (n,) bool, n > 0.
@@ -144,25 +154,37 @@ def estimate_rate(
     n_units = len(np.unique(units))
     if n_units == n_rows:
         return rate, clopper_pearson(int(event.sum()), n_rows)
-    # of the rate, by the residuals of independent units
+    # the variance of the rate, by the residuals of independent units
     unit_residual = sum_per_unit(event - rate, units)
     variance = float((unit_residual**2).sum()) / n_rows**2
     variance *= n_units / max(n_units - 1, 1)
     n_effective = float(n_units)
     if variance > 0.0 and n_units > 1:
-        # n independent rows would have the variance rate (1 - rate) / n. The ratio of
-        # the quantiles makes up for the variance being estimated from few units.
-        probability = (1.0 + CONFIDENCE) / 2.0
-        quantile_ratio = float(
-            stdtrit(n_rows - 1, probability) / stdtrit(n_units - 1, probability)
-        )
-        n_effective = rate * (1.0 - rate) / variance * quantile_ratio**2
-        n_effective = min(n_effective, float(n_rows))
+        n_effective = _count_effective_rows(rate, variance, n_rows, n_units)
     return rate, _make_beta_interval(rate * n_effective, n_effective)
 
 
+def _count_effective_rows(
+    rate: float, variance: float, n_rows: int, n_units: int
+) -> float:
+    """Return how many independent rows would have the variance of a rate over units, no
+    more than there are rows.
+
+    n independent rows have the variance rate (1 - rate) / n. The ratio of the quantiles
+    makes up for the variance being estimated from few units.
+    """
+    probability = (1.0 + CONFIDENCE) / 2.0  # below the upper end of the interval
+    quantile_ratio = float(
+        stdtrit(n_rows - 1, probability) / stdtrit(n_units - 1, probability)
+    )
+    n_effective = rate * (1.0 - rate) / variance * quantile_ratio**2
+    return min(n_effective, float(n_rows))
+
+
 def _make_beta_interval(successes: float, trials: float) -> tuple[float, float]:
-    """Return Clopper and Pearson's 95 % interval, also between whole numbers."""
+    """Return Clopper and Pearson's 95 % interval of a rate (`clopper_pearson`) for
+    numbers of successes and trials that need not be whole.
+    """
     tail = (1.0 - CONFIDENCE) / 2.0
     failures = trials - successes
     low = 0.0

@@ -37,21 +37,25 @@ IntArray = npt.NDArray[np.int64]
 
 
 def sum_per_unit(values: npt.ArrayLike, units: IntArray) -> FloatArray:
-    """Return the sum (m,) of the values of the rows (n,) of each unit.
+    """Return the sum of the values of each unit (a group of rows), (m,).
 
-    `units` (n,) names the unit of each row; sums are in ascending order of these names.
+    Args:
+        values: (n,) of each row.
+        units: (n,) the unit of each row. Sums are in their ascending order.
     """
     _, unit_index = np.unique(units, return_inverse=True)
     weights = np.asarray(values, dtype=np.float64)
+    # the sum of the weights with each index
     return np.bincount(unit_index.reshape(-1), weights).astype(np.float64)
 
 
 def mean_rate(counted: npt.ArrayLike, rows: npt.ArrayLike) -> float:
-    """Return the mean rate over units; NaN if none has a row.
+    """Return the mean over units (groups of rows) of the rate of an event in each; NaN
+    if none has a row.
 
     Args:
-        counted: (n,) rows of each unit that count.
-        rows: (n,) rows of each unit; units without any are left out.
+        counted: (n,) number of rows of each unit in which the event happens.
+        rows: (n,) number of rows of each unit; units without any are left out.
     """
     n_counted = np.asarray(counted, dtype=np.float64)
     n_rows = np.asarray(rows, dtype=np.float64)
@@ -59,7 +63,8 @@ def mean_rate(counted: npt.ArrayLike, rows: npt.ArrayLike) -> float:
     n_rows = n_rows[n_rows > 0.0]
     if not len(n_rows):
         return math.nan
-    if n_rows.min() == n_rows.max():  # the same, with less rounding
+    has_equal_units = n_rows.min() == n_rows.max()
+    if has_equal_units:  # the same mean, with less rounding
         return float(n_counted.sum() / n_rows.sum())
     return float((n_counted / n_rows).mean())
 
@@ -67,11 +72,14 @@ def mean_rate(counted: npt.ArrayLike, rows: npt.ArrayLike) -> float:
 def rate_interval(
     counted: npt.ArrayLike, rows: npt.ArrayLike, confidence: float = CONFIDENCE
 ) -> tuple[float, float]:
-    """Return the interval of the mean rate over units, for any number of units.
+    """Return the interval of the mean rate over units (`mean_rate`).
+
+    It holds for any number of units. Where each has a single row, it is Clopper and
+    Pearson's.
 
     Args:
-        counted: (n,) rows of each unit that count, from 0 to `rows`.
-        rows: (n,) rows of each unit, from 0; at least one has rows.
+        counted: (n,) number of rows of each unit in which the event happens.
+        rows: (n,) number of rows of each unit; at least one has rows.
         confidence: between 0 and 1.
 
     Raises:
@@ -82,10 +90,11 @@ def rate_interval(
     has_rows = n_counted.shape == n_rows.shape and n_rows.size and n_rows.max() > 0
     if not has_rows or (n_counted < 0).any() or (n_counted > n_rows).any():
         raise InputError(
-            "share: expected counts from 0 to the predictions of each "
-            "unit, and one prediction at least"
+            "share: expected counts from 0 to the predictions of each unit, and one "
+            "prediction at least"
         )
-    if n_rows.max() == 1.0:  # independent rows
+    are_rows_independent = n_rows.max() == 1.0
+    if are_rows_independent:
         return clopper_pearson(round(n_counted.sum()), round(n_rows.sum()), confidence)
     is_used = n_rows > 0.0
     return _betting_interval(n_counted[is_used] / n_rows[is_used], confidence)
@@ -98,18 +107,22 @@ def _betting_interval(samples: FloatArray, confidence: float) -> tuple[float, fl
     made more than is likely by chance (`ConfidenceSequence`).
     """
     values, counts = np.unique(samples, return_counts=True)
-    # of the capital; 2, since there are two sides
-    threshold = np.log(2.0 / (1.0 - confidence))
+    # The capital of each side begins with 1. By chance it reaches 2 / (1 - confidence)
+    # with a probability of (1 - confidence) / 2 at most (Markov), for both sides
+    # together with 1 - confidence.
+    winning_log_capital = np.log(2.0 / (1.0 - confidence))
 
-    def may_be_mean(mean: float) -> bool:
+    def is_not_too_small(mean: float) -> bool:
         """Return whether bets on "more than the mean" have not won."""
-        return bool(log_capital(mean, values, counts) < threshold)
+        return bool(log_capital(mean, values, counts) < winning_log_capital)
 
     def is_too_large(mean: float) -> bool:
         """Return whether bets on "less than the mean" have won."""
-        return bool(log_capital(1.0 - mean, 1.0 - values, counts) >= threshold)
+        return bool(
+            log_capital(1.0 - mean, 1.0 - values, counts) >= winning_log_capital
+        )
 
-    return find_threshold(may_be_mean), find_threshold(is_too_large)
+    return find_threshold(is_not_too_small), find_threshold(is_too_large)
 
 
 def mean_interval(
@@ -117,7 +130,10 @@ def mean_interval(
 ) -> tuple[float, float]:
     """Return the 95 % interval of the mean of independent values (n,) in a range.
 
-    The range has to be known from the plan, and not from the values.
+    Args:
+        values: the values.
+        low, high: bounds of the range. They have to be known before the values are:
+            the smallest and the largest value are none.
     """
     samples = np.asarray(values, dtype=np.float64)
     if high <= low:
@@ -158,21 +174,33 @@ def compare_paired(
     if len(np.unique(units)) == n_rows:
         return _compare_independent_rows(first, second)
     unit_rows = sum_per_unit(np.ones(n_rows), units)
-    # 0 where only the first happens, 1 where only the second does, else 1/2
-    unit_advantage = sum_per_unit((1.0 + second - 1.0 * first) / 2.0, units) / unit_rows
+    # of each row: 0 where only the first happens, 1 where only the second does, else 1/2
+    advantage = (1.0 + second - 1.0 * first) / 2.0
+    unit_advantage = sum_per_unit(advantage, units) / unit_rows
     lower, upper = _betting_interval(unit_advantage, CONFIDENCE)
-    copies = np.ones(len(unit_rows))  # each value counts once
-    # bets that the second outcome happens more often, and that the first does
-    max_log_capital = max(
-        log_capital(0.5, unit_advantage, copies),
-        log_capital(0.5, 1.0 - unit_advantage, copies),
-    )
+    # the mean advantage a in [0, 1] is a difference 2 a - 1 of rates
+    interval = (2 * lower - 1, 2 * upper - 1)
     second_rate = mean_rate(sum_per_unit(second, units), unit_rows)
     first_rate = mean_rate(sum_per_unit(first, units), unit_rows)
+    return second_rate - first_rate, interval, _paired_p_value(unit_advantage)
+
+
+def _paired_p_value(unit_advantage: FloatArray) -> float:
+    """Return the p-value, in (0, 1], of the hypothesis that of two outcomes none
+    happens more often, by bets.
+
+    Args:
+        unit_advantage: (m,) of each unit, in [0, 1]: over 1/2 if the second outcome
+            happens more often in it.
+    """
+    counts = np.ones(len(unit_advantage))  # each value counts once
+    # bets that the second outcome happens more often, and that the first does
+    max_log_capital = max(
+        log_capital(0.5, unit_advantage, counts),
+        log_capital(0.5, 1.0 - unit_advantage, counts),
+    )
     # one over the capital (Markov), twice as there are two sides
-    p_value = float(min(1.0, 2.0 * np.exp(-max_log_capital)))
-    # the mean advantage a in [0, 1] is a difference 2 a - 1 of rates
-    return second_rate - first_rate, (2 * lower - 1, 2 * upper - 1), p_value
+    return float(min(1.0, 2.0 * np.exp(-max_log_capital)))
 
 
 def _compare_independent_rows(
@@ -208,11 +236,13 @@ def one_sided_p_value(
     """Return the one-sided p-value of fewer right predictions inside a rule.
 
     Predictions come in units, such as the frames of a drive, which are independent of
-    each other. The hypothesis is that as large a part of the predictions is right outside. Where
-    each unit has a single prediction, this is Fisher's exact test. Where all units have
-    equally many and lie inside or outside, units are permuted. Elsewhere, where the
-    rule cuts through units or some have more predictions than others, it is a bound by
-    bets (`_betting_p_value`). All units weigh the same (`mean_rate`).
+    each other and weigh the same. The hypothesis is that the rate of right predictions
+    is the same outside. The test is
+
+    - Fisher's exact one, where each unit has a single prediction;
+    - a permutation of units, where all have equally many and each lies inside or
+      outside;
+    - bets (`_betting_p_value`), which give a bound, elsewhere.
 
     Args:
         n_right_inside: (n,) right predictions of each unit inside.
@@ -269,8 +299,8 @@ def _fisher_p_value(
 ) -> float:
     """Return the one-sided p-value of Fisher's exact test.
 
-    It is the probability that at most `right_inside` of all right predictions are
-    inside if chance decides which `inside` predictions of all are there.
+    It is the probability that at most `right_inside` right predictions are inside, if
+    chance decides which predictions are.
 
     Args:
         right_inside, inside: right predictions inside, and all there.
@@ -279,8 +309,9 @@ def _fisher_p_value(
     # takes half a second, and a search needs none of it
     from scipy.stats import hypergeom
 
-    right = right_inside + right_outside
-    return float(hypergeom.cdf(right_inside, inside + outside, right, inside))
+    n_predictions = inside + outside
+    n_right = right_inside + right_outside
+    return float(hypergeom.cdf(right_inside, n_predictions, n_right, inside))
 
 
 def _permutation_p_value(
@@ -300,46 +331,48 @@ def _permutation_p_value(
     """
     values, n_units = np.unique(unit_right, return_counts=True)
     n_units = np.round(times * n_units).astype(np.int64)
+    # `n_inside` and the number of all units are rounded separately
+    n_sampled = min(n_inside, int(n_units.sum()))
     rng = np.random.default_rng(0)
+    # (permutations, values): how many units with each value come inside
     sampled_units = rng.multivariate_hypergeometric(
-        n_units, min(n_inside, int(n_units.sum())), N_PERMUTATIONS, method="marginals"
+        n_units, n_sampled, N_PERMUTATIONS, method="marginals"
     )
-    # how often chance has at most as many inside, but for rounding; what was observed is
-    # one more
-    n_as_few = (sampled_units @ values <= n_right_inside + 1e-9).sum()
-    return float((1 + n_as_few) / (1 + N_PERMUTATIONS))
+    is_as_few = sampled_units @ values <= n_right_inside + 1e-9  # but for rounding
+    # what was observed counts as one of the permutations
+    return float((1 + is_as_few.sum()) / (1 + N_PERMUTATIONS))
 
 
 def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
-    """Return a bound of the p-value: one over the capital of bets.
+    """Return a bound of the p-value of fewer right predictions inside: one over the
+    capital of bets (Markov).
 
-    The bets are on "fewer inside than m, more outside", and the smallest capital of all
-    m counts. It is a bound also where units differ. Half is staked inside and half
-    outside where a unit can have both.
+    For every rate m that may be the same inside and outside (`NULL_RATES`), a gambler
+    bets on "less than m inside, more than m outside"; the smallest capital counts. It
+    is a bound also where units differ.
 
     Args:
         rates: (n, 4) of each unit: the rate of wrong predictions inside, 1 if it has
             any inside, the rate of right ones outside, 1 if it has any outside.
-        is_cut: whether a unit has predictions both inside and outside.
+        is_cut: whether a unit has predictions both inside and outside: then half is
+            staked on either.
         times: copies of each unit.
     """
     distinct_rates, n_units = np.unique(rates, axis=0, return_counts=True)
     wrong_inside, is_inside, right_outside, is_outside = (
         column[:, None] for column in distinct_rates.T
     )
+    # What a stake of 1 gains, (distinct rates, m). On average 0, if the rate of right
+    # predictions is m on both sides: that of wrong ones is 1 - m then.
+    gain_inside = wrong_inside / (1.0 - NULL_RATES) - is_inside
+    gains = gain_inside + right_outside / NULL_RATES - is_outside
     stake_fraction = 0.5 if is_cut else 1.0
-    # (distinct rates, m): what a stake of 1 gains; 0 on average where the rate is m on
-    # both sides
-    gains = stake_fraction * (
-        wrong_inside / (1.0 - NULL_RATES)
-        - is_inside
-        + right_outside / NULL_RATES
-        - is_outside
-    )
+    gains = stake_fraction * gains
     with np.errstate(divide="ignore"):
         log_capitals = []
         for stake in STAKES:
             log_factors = np.log(np.maximum(1.0 + stake * gains, 0.0))
             log_capitals.append(times * (n_units[:, None] * log_factors).sum(axis=0))
+    # the capital is the mean over stakes
     mean_log_capital = np.logaddexp.reduce(log_capitals, axis=0) - np.log(len(STAKES))
     return float(min(1.0, np.exp(-mean_log_capital.min())))

@@ -17,11 +17,17 @@ def clopper_pearson(
 ) -> tuple[float, float]:
     """Return the exact two-sided binomial interval of a success rate.
 
-    Of k successes, from 0 to n, in n trials, at least 1, with a = 1 - confidence in (0,
-    1): low solves P(X >= k | low) = a/2 and high P(X <= k | high) = a/2, quantiles of
-    beta distributions: B(a/2; k, n - k + 1), exactly 0 for k = 0, and B(1 - a/2; k + 1,
-    n - k), exactly 1 for k = n. The interval covers the true rate at least as often as
-    it says, at every n (Clopper and Pearson 1934).
+    It covers the true rate at least as often as its confidence says, for any number of
+    trials (Clopper and Pearson 1934). With k successes in n trials and a = 1 -
+    confidence, the lower bound is the rate at which k successes or more have the
+    probability a/2, the upper bound that at which k or fewer have it. Both are
+    quantiles of beta distributions: B(a/2; k, n - k + 1), or 0 for k = 0, and B(1 -
+    a/2; k + 1, n - k), or 1 for k = n.
+
+    Args:
+        successes: k, from 0 to n.
+        trials: n, at least 1.
+        confidence: between 0 and 1.
 
     Raises:
         InputError: an argument is out of range.
@@ -50,9 +56,14 @@ def clopper_pearson(
 def wilson_interval(rate: Any, n: Any) -> tuple[Any, Any]:
     """Return Wilson's 95 % score interval (1927) of rates of n trials.
 
-    Both are numbers or arrays, and so are the lower and upper bounds.
+    Args:
+        rate: the fractions of successes, a number or an array.
+        n: numbers of trials, likewise.
+
+    Returns:
+        The lower and the upper bounds, likewise.
     """
-    # quantile of the normal distribution, one side of the interval
+    # 1.96: the normal distribution has 2.5 % above it
     z = float(ndtri(0.5 + CONFIDENCE / 2.0))
     center = rate + z * z / (2 * n)
     half_width = z * np.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))

@@ -40,9 +40,11 @@ class Dip:
 def _fit_falling(
     right: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Fit rates (m,) that do not rise, by isotonic regression.
+    """Fit rates (m,) that do not rise with the distance, by isotonic regression.
 
-    `right` (m,) of `counts` (m,) images are right at each distance, in ascending order.
+    Args:
+        right: (m,) images that are right at each distance, the nearest first.
+        counts: (m,) images at each distance.
     """
     from scipy.optimize import isotonic_regression  # takes a quarter of a second
 
@@ -55,15 +57,14 @@ def _fit_falling(
 def find_dips(
     distances: Sequence[float], right: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[Dip, ...]:
-    """Find distances, the nearest first, at which an object is seen less than beyond.
+    """Find dips: distances, the nearest first, at which an object is recognised less
+    often than beyond.
 
     Each distance is compared with each run of distances right behind it by Fisher's
-    exact test (one-sided), and the p-values are multiplied by how many comparisons
-    there are (Bonferroni). Where the rates fall, those beyond are at most the nearer
-    one, which makes large differences only rarer: so one falling curve in twenty has a
-    significant dip, at most (`benchmarks/first_seen.py --simulated`). Listed are
-    significant dips, and those that bring the estimate's line below the rates beyond,
-    which may be chance.
+    exact one-sided test, and the p-values are multiplied by the number of comparisons
+    (Bonferroni). If the true rate falls with the distance, at most one curve in twenty
+    has a significant dip (`benchmarks/first_seen.py --simulated`). Other dips are
+    listed too, and may be chance.
 
     Args:
         distances: m distances, ascending.
@@ -83,8 +84,8 @@ def find_dips(
         end = np.arange(near + 2, n_distances + 1)
         right_beyond = right_before[end] - right_before[near + 1]
         counts_beyond = counts_before[end] - counts_before[near + 1]
-        # probability of as few right images at the nearer distance, if chance decides
-        # which of all images of both are right: Fisher's exact test
+        # the probability of as few right images here, if chance decides which of the
+        # images here and beyond are right
         p_values = hypergeom.cdf(
             right[near],
             counts_beyond + counts[near],

@@ -35,14 +35,18 @@ def paired_difference(
     first_rate = (both + first) / n
     second_low, second_high = map(float, wilson_interval(second_rate, n))
     first_low, first_high = map(float, wilson_interval(first_rate, n))
-    phi = _phi_coefficient(both, first, second, neither)
+    correlation = _phi_coefficient(both, first, second, neither)
 
-    def combine(a: float, b: float) -> float:
-        """Return how far a bound is from the difference, by how far the bounds of both
-        rates are from these, with the correlation phi.
+    def combine(second_distance: float, first_distance: float) -> float:
+        """Return how far a bound of the difference is from the difference, by how far
+        the bounds of both rates are from the rates.
         """
-        # not below 0 by rounding
-        return math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b))
+        squared = (
+            second_distance * second_distance
+            - 2 * correlation * second_distance * first_distance
+            + first_distance * first_distance
+        )
+        return math.sqrt(max(0.0, squared))  # not below 0 by rounding
 
     difference = second_rate - first_rate
     # the difference is smallest where the second rate is low and the first high
@@ -52,9 +56,13 @@ def paired_difference(
 
 
 def _phi_coefficient(both: int, first: int, second: int, neither: int) -> float:
-    """Return the correlation of two outcomes, with Newcombe's continuity correction."""
+    """Return the correlation of two outcomes, with Newcombe's continuity correction.
+
+    Args:
+        both, first, second, neither: counts of pairs, as for `paired_difference`.
+    """
     product = (both + first) * (second + neither) * (both + second) * (first + neither)
-    if not product:
+    if not product:  # an outcome that happens always or never
         return 0.0
     # n^2 times the covariance; a positive one is made smaller by the correction
     covariance = float(both * neither - first * second)
@@ -65,13 +73,18 @@ def _phi_coefficient(both: int, first: int, second: int, neither: int) -> float:
 
 
 def mcnemar(first: int, second: int) -> float:
-    """Return the p-value, in (0, 1], of McNemar's exact two-sided test.
+    """Return the p-value, in (0, 1], of McNemar's exact two-sided test of two paired
+    outcomes.
 
-    Of pairs in which one outcome alone happens, it is the probability that chance
-    splits them so unevenly (McNemar 1947, "Note on the sampling error of the difference
-    between correlated proportions or percentages"): twice the smaller tail of the
-    binomial distribution, as these pairs are throws of a fair coin where neither
-    outcome happens more often.
+    The hypothesis is that neither happens more often. Then the pairs in which only one
+    of them happens are throws of a fair coin, and the p-value is the probability that
+    these fall so unevenly: twice the smaller tail of the binomial distribution (McNemar
+    1947, "Note on the sampling error of the difference between correlated proportions
+    or percentages").
+
+    Args:
+        first: number of pairs in which only the first outcome happens.
+        second: number of those in which only the second does.
     """
     if min(first, second) < 0:
         raise InputError(f"pairs: expected numbers from 0, got {first} and {second}")

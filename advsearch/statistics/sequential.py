@@ -17,9 +17,12 @@ from advsearch.statistics.intervals import CONFIDENCE
 
 
 def find_threshold(is_beyond: Callable[[float], bool]) -> float:
-    """Return where in (0, 1) a monotone condition begins to hold, by bisection.
+    """Return the number in (0, 1) from which on a condition holds, by bisection.
 
     0 if it holds everywhere, 1 if it holds nowhere.
+
+    Args:
+        is_beyond: the condition; below some number it is false, and true above.
     """
     low = 1e-9
     high = 1.0 - 1e-9
@@ -107,18 +110,19 @@ class ConfidenceSequence:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Lower and upper bound of the means that are not excluded.
-
-        `is_over` and `is_under` are monotone in the mean.
+        """Lower and upper bound of the true mean: the numbers of which it is shown neither
+        that the mean is over them, nor that it is under them.
         """
+        # Both conditions are monotone: a mean over a number is over every smaller one.
         lower = find_threshold(lambda mean: not self.is_over(mean))
-        return lower, find_threshold(self.is_under)
+        upper = find_threshold(self.is_under)
+        return lower, upper
 
     def _has_won(self, mean: float, counts: Mapping[float, int]) -> bool:
-        """Return whether bets on "more than `mean`" have won against samples.
+        """Return whether bets on "more than `mean`" have made more of samples than is
+        likely by chance.
 
-        They have as long as the capital is above the threshold; further samples may
-        bring it down again.
+        Further samples may bring the capital below the threshold again.
 
         Args:
             mean: mean that the bets are on, in (0, 1).
@@ -129,33 +133,37 @@ class ConfidenceSequence:
 
 
 def count_needed_samples(mean: float, *, confidence: float, value: float = 1.0) -> int:
-    """Return how many equal samples show that the true mean is over a number.
+    """Return how many samples, all of one value, show that the true mean is over a
+    number.
 
-    One side of a `ConfidenceSequence` shows it. With the value 1 it is the minimum: no
-    other samples show it sooner.
+    It is shown by a one-sided `ConfidenceSequence`. With the value 1 it is the minimum:
+    no other samples show it sooner.
 
     Args:
         mean: the number, in (0, 1).
         confidence: confidence of the sequence.
         value: value of all samples, over `mean`.
     """
+    threshold = math.log(1.0 / (1.0 - confidence))
 
     def is_enough(count: int) -> bool:
-        return log_capital_of_counts(mean, {value: count}) >= math.log(
-            1.0 / (1.0 - confidence)
-        )
+        return log_capital_of_counts(mean, {value: count}) >= threshold
 
     upper = 1
     while not is_enough(upper):
         upper *= 2
-    # the first count from 1 on that is enough, by bisection; an index from 0
-    return bisect_left(range(1, upper + 1), True, key=is_enough) + 1
+    # bisection for the first count that is enough; its index is one less than it
+    index = bisect_left(range(1, upper + 1), True, key=is_enough)
+    return index + 1
 
 
 def log_capital_of_counts(mean: float, counts: Mapping[float, int]) -> float:
-    """Return the logarithm of the capital that bets on "more than `mean`" have made.
+    """Return the logarithm of the capital that bets on "more than `mean`" have made
+    (`log_capital`).
 
-    It starts with 1; -inf where all is lost. `counts` has the samples in [0, 1].
+    Args:
+        mean: mean that the bets are on, in (0, 1).
+        counts: counts of the samples in [0, 1], by their value.
     """
     values = np.array(list(counts), dtype=np.float64)
     return log_capital(mean, values, np.array(list(counts.values())))
@@ -164,10 +172,15 @@ def log_capital_of_counts(mean: float, counts: Mapping[float, int]) -> float:
 def log_capital(
     mean: float, values: npt.NDArray[Any], counts: npt.NDArray[Any]
 ) -> float:
-    """Return the logarithm of the capital; see `log_capital_of_counts`.
+    """Return the logarithm of the capital that bets on "more than `mean`" have made.
+
+    The capital begins with 1, of which each of `STAKES` gets an equal part. A stake s
+    puts the fraction s of its capital on every sample x, which multiplies that capital
+    by 1 - s + s x / mean: by 1 on average if the mean is true. It is -inf if all is
+    lost.
 
     Args:
-        mean: mean that the bets are on.
+        mean: mean that the bets are on, in (0, 1).
         values: (n,) distinct samples in [0, 1].
         counts: (n,) how often each occurs.
     """

@@ -82,24 +82,26 @@ class FunctionTask(Task):
         return facts
 
     def loss(self, output: Any, truth: Facts) -> Tensor:
-        """Return the function's values, (N,). Raises InputError if they are not
-        that.
+        """Return what the function returns for the N outputs: how wrong each is, (N,).
+
+        Raises:
+            InputError: it is something else than a floating-point number for each output.
         """
         losses = self.function(copy_value(output), truth)
-        count = len(output)
+        n_outputs = len(output)
         is_tensor = isinstance(losses, Tensor)
-        # of any shape: () of one image, or (N, 1)
-        if is_tensor and losses.is_floating_point() and losses.numel() == count:
-            return losses.reshape(count)
+        # any shape with N numbers will do: () for one output, or (N, 1)
+        if is_tensor and losses.is_floating_point() and losses.numel() == n_outputs:
+            return losses.reshape(n_outputs)
         got = type(losses).__name__
         if is_tensor:
             got = f"{losses.dtype} {tuple(losses.shape)}"
+        plural = "" if n_outputs == 1 else "s"
         raise InputError(
-            f"task {self.name}: expected how wrong each output is, a tensor of {count} "
-            "floating-point number"
-            f"{'s' * (count != 1)}, over 0 where it is wrong, got {got}; a distance "
-            "less what is allowed does, or a "
-            "wrong logit less the right one"
+            f"task {self.name}: expected how wrong each output is, a tensor of "
+            f"{n_outputs} floating-point number{plural}, over 0 where it is wrong, got "
+            f"{got}; a distance less what is allowed does, or a wrong logit less the "
+            "right one"
         )
 
     def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
@@ -108,13 +110,14 @@ class FunctionTask(Task):
         """
         predictions_of_images: list[tuple[Prediction, ...]] = []
         for values in output.detach():
-            if values.ndim == 1 and len(values) == len(self.labels):
+            has_number_per_label = values.ndim == 1 and len(values) == len(self.labels)
+            if has_number_per_label:
                 index = int(values.argmax())
                 prediction = Prediction(self.labels[index], index)
             elif values.numel() <= MAX_LISTED_NUMBERS:
                 numbers = [f"{value:.3g}" for value in values.flatten().tolist()]
                 prediction = Prediction(", ".join(numbers))
-            else:
+            else:  # too many numbers to list
                 shape = " x ".join(map(str, values.shape))
                 mean = float(values.double().mean())
                 prediction = Prediction(f"{shape} numbers, mean {mean:.3g}")
@@ -197,16 +200,26 @@ def make_task(task: AnyTask) -> Task:
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)
-    build: Callable[..., Any] = TASKS[name]
-    result: Any = build(**options)
-    if result.judges_rig:  # the task of each image is one of its options
-        result = replace(result, part=make_task(result.task))
-    created: Task = result
-    return created
+    task_class: Callable[..., Any] = TASKS[name]
+    created: Any = task_class(**options)
+    if created.judges_rig:
+        # Its option `task` names the task of each image.
+        created = replace(created, part=make_task(created.task))
+    result: Task = created
+    return result
 
 
 def _make_joint_task(name: str, options: Mapping[str, Any]) -> EnsembleTask:
-    """Create the joint task of several names; each has its options under its name."""
+    """Create the joint task of several names, such as "detection+depth".
+
+    Args:
+        name: the names, with `TASK_SEPARATOR` between them.
+        options: a mapping of options for each name; a name may be left out.
+
+    Raises:
+        UnknownNameError: there are options for a name that the joint task does not have.
+        InputError: options are no mapping.
+    """
     names = [part.strip() for part in name.split(TASK_SEPARATOR)]
     for task_name, task_options in options.items():
         if task_name not in names:

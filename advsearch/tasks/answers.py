@@ -114,8 +114,8 @@ class FreeAnswer(Task):
         if isinstance(returned, (list, tuple)) and all(map(_is_answer, returned)):
             return list(returned)
         raise ValueError(
-            "expected a mapping with text, logits and begins for each "
-            "picture, as answers in words have"
+            "expected a mapping with text, logits and begins for each picture, as "
+            "answers in words have"
         )
 
     def check(self, facts: tasks.Facts) -> None:
@@ -150,22 +150,26 @@ class FreeAnswer(Task):
         """Compute the loss of each answer, (N,).
 
         Without logits it is 1 - 2 s, where s is the fraction of right texts about the
-        image. With logits and the probability p that the lead of right tokens stands
-        for, it is log(1 - p) for a right answer and -log(p) for a wrong one.
+        image. With logits, p is the sigmoid of the lead of the tokens that begin a right
+        word (`_compute_token_margin`): the loss is log(1 - p) for a right answer and
+        -log(p) for a wrong one.
         """
         losses = []
         for answer in output:
             if "texts" in answer:  # without logits
-                is_right = [float(has_word(text, truth)) for text in _texts(answer)]
+                is_right = [
+                    float(has_word(text, truth)) for text in _list_texts(answer)
+                ]
                 losses.append(1.0 - 2.0 * torch.tensor(is_right).mean())
                 continue
             margin = _compute_token_margin(answer["logits"], answer["begins"], truth)
             # The text decides the sign, the margin only the size: below 0 if the answer
             # has a right word, over 0 if not.
             if has_word(answer["text"], truth):
-                losses.append(functional.logsigmoid(-margin))
+                loss = functional.logsigmoid(-margin)  # log(1 - p)
             else:
-                losses.append(-functional.logsigmoid(margin))
+                loss = -functional.logsigmoid(margin)  # -log(p)
+            losses.append(loss)
         return torch.stack(losses)
 
     def predictions(
@@ -176,8 +180,10 @@ class FreeAnswer(Task):
         """
         predictions_of_images = []
         for answer in output:
-            texts = Counter(_texts(answer)).most_common(count)
-            predictions_of_images.append(tuple(_prediction(text) for text, _ in texts))
+            texts = Counter(_list_texts(answer)).most_common(count)
+            predictions_of_images.append(
+                tuple(_make_prediction(text) for text, _ in texts)
+            )
         return predictions_of_images
 
     def describe(
@@ -186,19 +192,19 @@ class FreeAnswer(Task):
         truth: Words,
         margins: Sequence[float],
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.describe`: of several texts about an image, the most frequent among
-        those that decided: the right ones if the prediction is right, else the wrong.
+        """See `Task.describe`: the most frequent of the texts about each image.
 
-        The payload has all of them.
+        If the prediction is right, only right texts are compared, else only wrong ones.
+        The payload has all texts, if there are several.
         """
         results = list[tasks.PredictionWithPayload]()
         for answer, margin in zip(output, margins, strict=True):
-            texts = _texts(answer)
+            texts = _list_texts(answer)
             is_right = margin >= 0.0
-            deciding = [text for text in texts if has_word(text, truth) == is_right]
-            most_frequent = Counter(deciding or texts).most_common(1)[0][0]
+            compared = [text for text in texts if has_word(text, truth) == is_right]
+            [(most_frequent, _)] = Counter(compared or texts).most_common(1)
             payload: tasks.JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
-            results.append((_prediction(most_frequent), payload))
+            results.append((_make_prediction(most_frequent), payload))
         return results
 
 
@@ -213,8 +219,8 @@ def _is_answer(value: Any) -> bool:
 def _compute_token_margin(
     logits: Tensor, begins: Callable[[str], Sequence[int]], words: Words
 ) -> Tensor:
-    """Compute by how much the tokens that begin one of the words lead over all others,
-    at the step of an answer at which they do best.
+    """Compute the lead of the tokens that begin one of the words over all others, at
+    the step of an answer at which it is largest.
 
     Args:
         logits: (T, tokens) of each step of the answer.
@@ -241,14 +247,14 @@ def _compute_token_margin(
     return (begin_logit - other_logit).max()
 
 
-def _texts(answer: AnswerWithLogits | AnswersWithoutLogits) -> list[str]:
+def _list_texts(answer: AnswerWithLogits | AnswersWithoutLogits) -> list[str]:
     """Return all texts about an image: several requests' or the only one."""
     if "texts" in answer:
         return answer["texts"]  # type: ignore[typeddict-item]
     return [answer["text"]]
 
 
-def _prediction(text: str) -> tasks.Prediction:
+def _make_prediction(text: str) -> tasks.Prediction:
     """Return a text as a prediction: on one line, without control characters."""
     printable = "".join(char if char.isprintable() else " " for char in text)
     return tasks.Prediction(" ".join(printable.split()) or EMPTY_ANSWER)

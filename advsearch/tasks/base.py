@@ -296,11 +296,12 @@ class Task(ABC):
     minimise: bool = field(default=False, metadata=FROM_RUN)
     target: Truth = field(default=None, metadata=FROM_RUN)
 
-    def __init_subclass__(cls, **more: Any) -> None:
-        """Give methods of a user's class copies of what they are passed, as they may
-        change it.
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Make methods of a user's class get copies of their arguments.
+
+        So they may change what they get, and nothing else changes with it.
         """
-        super().__init_subclass__(**more)
+        super().__init_subclass__(**keywords)
         receive_copies: tuple[Callable[..., Any], ...] = (
             Task.truth_names,
             Task.loss,
@@ -315,7 +316,8 @@ class Task(ABC):
             Task.as_logits,
         )
         method_names = [method.__name__ for method in receive_copies]
-        hand_copies(cls, **dict.fromkeys(method_names, slice(None)))
+        all_arguments = slice(None)
+        hand_copies(cls, **dict.fromkeys(method_names, all_arguments))
 
     def check_numbers(
         self, fits: Callable[[float], bool], expected: str, *names: str
@@ -463,8 +465,10 @@ class Task(ABC):
         It is over 0 exactly if the output is a success.
         """
         if self.target is not None:
+            # A target is a truth as well: the loss is over 0 where it is not reached.
             return -self.loss(output, self.target)
         loss = self.loss(output, truth)
+        # With `minimise`, a right prediction is a success.
         return -loss if self.minimise else loss
 
     def as_logits(self, output: Output, truth: Truth) -> Output:
@@ -532,11 +536,11 @@ class Task(ABC):
             scores = self.score(output, truth).tolist()
             # not `-loss`, which would be -0.0 for a loss of 0
             margins = (0.0 - self.loss(output, truth)).tolist()
-            described = self.describe(output, truth, margins)
+            predictions = self.describe(output, truth, margins)
             return [
                 Judgement.of(score, margin, prediction, payload)
                 for score, margin, (prediction, payload) in zip(
-                    scores, margins, described, strict=True
+                    scores, margins, predictions, strict=True
                 )
             ]
 
@@ -545,17 +549,23 @@ class Task(ABC):
     ) -> list[PredictionWithPayload]:
         """Return the prediction about each of N images and its payload.
 
-        `margins` are those of the N judgements.
+        Args:
+            output: output for N images.
+            truth: truth of the scene.
+            margins: margin of each of the N judgements (`Judgement.margin`).
         """
         first_predictions = [predictions[0] for predictions in self.predictions(output)]
         return list(zip(first_predictions, self.payloads(output), strict=True))
 
 
 def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
-    """Return the most frequent prediction of at least one judgement, as a judgement.
+    """Return a judgement with the most frequent of several predictions.
 
     Of equally frequent ones it is that with the lowest class index. Score, margin and
     probability are the means of the judgements with this prediction.
+
+    Args:
+        judgements: at least one.
     """
     label_and_index = [(x.prediction.label, x.prediction.index) for x in judgements]
     counts = Counter(label_and_index)
@@ -566,7 +576,6 @@ def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
         return -counts[candidate], class_index or 0  # None if there are no classes
 
     most_frequent = min(counts, key=sort_key)
-    label, index = most_frequent
     matching = [
         judgement
         for judgement, candidate in zip(judgements, label_and_index, strict=True)
@@ -577,13 +586,15 @@ def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
         for judgement in matching
         if judgement.prediction.probability is not None
     ]
-    probability = mean(probabilities) if probabilities else None
+    label, index = most_frequent
     return Judgement(
-        mean([judgement.score for judgement in matching]),
-        mean([judgement.margin for judgement in matching]),
-        matching[0].right,
-        Prediction(label, index, probability),
-        matching[0].payload,
+        score=mean([judgement.score for judgement in matching]),
+        margin=mean([judgement.margin for judgement in matching]),
+        right=matching[0].right,
+        prediction=Prediction(
+            label, index, mean(probabilities) if probabilities else None
+        ),
+        payload=matching[0].payload,
     )
 
 

@@ -47,7 +47,7 @@ def compute_iou(boxes: Tensor, box: Tensor) -> Tensor:
     """
     intersection = _intersection_area(boxes, box)
     union = _area(boxes) + _area(box) - intersection
-    return intersection / union.clamp_min(1e-12)
+    return intersection / union.clamp_min(1e-12)  # 0 for boxes without an area
 
 
 def compute_fraction_inside(boxes: Tensor, box: Tensor) -> Tensor:
@@ -74,9 +74,10 @@ def to_corners(boxes: Tensor, form: str) -> Tensor:
         return boxes[..., [1, 0, 3, 2]]
     if form == "xyxy":
         return boxes
-    anchor = boxes[..., :2]
     size = boxes[..., 2:]
-    top_left = anchor - size / 2.0 if form == "cxcywh" else anchor
+    top_left = boxes[..., :2]
+    if form == "cxcywh":  # then these two are the center
+        top_left = top_left - size / 2.0
     return torch.cat([top_left, top_left + size], dim=-1)
 
 
@@ -105,12 +106,13 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     # Row i, column j: whether box j, which is better (j < i), overlaps box i.
     is_overlapped = torch.cat(overlap_chunks).tril(-1)
     undecided = torch.ones(len(sorted_boxes), dtype=torch.bool, device=boxes.device)
-    survives = ~undecided
+    survives = torch.zeros_like(undecided)
     while bool(undecided.any()):
-        # no undecided box that is better overlaps it
-        survives = survives | (undecided & ~(is_overlapped & undecided).any(dim=1))
+        has_better_rival = (is_overlapped & undecided).any(dim=1)
+        survives = survives | (undecided & ~has_better_rival)
         is_suppressed = (is_overlapped & survives).any(dim=1)
         undecided = undecided & ~survives & ~is_suppressed
+    # back into the order of the arguments
     result = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
     result[order] = survives
     return result
@@ -255,8 +257,8 @@ def are_counted(detections: Detections) -> Tensor:
 
 def get_box_numbers(detections: Detections) -> Tensor:
     """Return the numbers of each box that are scores, or may be, detached, (D, K)."""
-    if "either" in detections:
-        values = detections["either"].detach()
+    if "score_or_label" in detections:
+        values = detections["score_or_label"].detach()
     else:
         values = detections["scores"].detach()
     return values if values.ndim == 2 else values[:, None]
@@ -319,23 +321,28 @@ class BoxFormat:
         return to_corners(boxes, self.form) / boxes.new_tensor([width, height] * 2)
 
     def find_faults(self, boxes: Tensor) -> dict[str, Tensor]:
-        """Find which of boxes (D, 4) are implausible in this format, (D,) bool by
-        fault.
+        """Find which of boxes (D, 4) are implausible in this format.
+
+        Returns:
+            For each fault, described by a verb phrase, whether each box has it, (D,) bool.
         """
         fractions = self.to_fractions(boxes)
         height, width = self.input_size
         center = (fractions[:, :2] + fractions[:, 2:]) / 2.0
         box_size = fractions[:, 2:] - fractions[:, :2]
+        size_in_pixels = box_size.abs() * box_size.new_tensor([width, height])
+        # A comparison with NaN is false: a box of NaN has every fault.
         is_near_image = (center >= -MAX_CENTER_OVERSHOOT) & (
             center <= 1.0 + MAX_CENTER_OVERSHOOT
         )
-        size_in_pixels = box_size.abs() * box_size.new_tensor([width, height])
+        has_positive_size = (box_size > 0.0).all(dim=1)
+        has_a_pixel = (size_in_pixels > 1.0).any(dim=1)
         return {
             "lie far outside the picture": ~is_near_image.all(dim=1),
-            "have a right edge left of the left one, or a bottom above the top": ~(
-                box_size > 0.0
-            ).all(dim=1),
-            "are smaller than a pixel": ~(size_in_pixels > 1.0).any(dim=1),
+            "have a right edge left of the left one, or a bottom above the top": (
+                ~has_positive_size
+            ),
+            "are smaller than a pixel": ~has_a_pixel,
         }
 
     def compute_plausible_fraction(self, boxes: Tensor) -> float:
@@ -344,47 +351,52 @@ class BoxFormat:
         return float((~has_fault).all(dim=0).float().mean())
 
     def describe_fault(self, boxes: Tensor) -> str:
-        """Describe what is implausible about boxes (D, 4); empty if most are
-        plausible.
+        """Describe the most frequent fault of boxes (D, 4); empty if most boxes are
+        plausible, or there are none.
         """
         if (
             not len(boxes)
             or self.compute_plausible_fraction(boxes) >= DOUBTFUL_FRACTION
         ):
             return ""
-        fraction_by_fault = {
-            fault: 1.0 - float((~is_faulty).float().mean())
-            for fault, is_faulty in self.find_faults(boxes).items()
-        }
+        fraction_by_fault = {}
+        for fault, is_faulty in self.find_faults(boxes).items():
+            fraction_without = float((~is_faulty).float().mean())
+            fraction_by_fault[fault] = 1.0 - fraction_without
         worst = max(fraction_by_fault, key=fraction_by_fault.__getitem__)
         return f"{100.0 * fraction_by_fault[worst]:.0f} % of them {worst}"
 
     def suggest_plausible_formats(self, boxes: Tensor) -> str:
-        """Suggest the formats in which boxes (D, 4) are plausible; empty if there is
-        none.
+        """Return the end of a message about implausible boxes (D, 4): the options that
+        make them plausible; empty if no format does.
 
-        Of several, those that differ least from this one.
+        If several formats do, only those that differ from this one in the fewest options
+        are suggested.
         """
-        # without yxyx: with swapped axes a box is as plausible as before
         alternatives = [
             BoxFormat(form, unit, self.input_size)
             for unit in UNITS
             for form in FORMS
-            if form != "yxyx"
+            if form != "yxyx"  # with swapped axes a box is as plausible as before
         ]
-        changes = [
-            self.format_change_to(alternative)
+        plausible = [
+            alternative
             for alternative in alternatives
             if alternative.compute_plausible_fraction(boxes) >= PLAUSIBLE_FRACTION
         ]
-        if not changes:
+        if not plausible:
             return ""
-        # A change has one colon per option that differs.
-        min_options = min(change.count(":") for change in changes)
-        smallest_changes = [
-            change for change in changes if change.count(":") == min_options
+        min_changes = min(map(self._count_different_options, plausible))
+        suggestions = [
+            self.format_change_to(alternative)
+            for alternative in plausible
+            if self._count_different_options(alternative) == min_changes
         ]
-        return f"; {' or '.join(smallest_changes)} would mend that"
+        return f"; {' or '.join(suggestions)} would mend that"
+
+    def _count_different_options(self, other: BoxFormat) -> int:
+        """Count the options in which another format differs from this one."""
+        return (other.form != self.form) + (other.unit != self.unit)
 
     def format_change_to(self, other: BoxFormat) -> str:
         """Return the options that select another format, such as ``boxes: xywh``."""
@@ -398,8 +410,8 @@ class BoxFormat:
     def suggest_better_format(
         self, boxes: Tensor, true_box: Tensor, min_iou: float
     ) -> str:
-        """Suggest the format in which one of the boxes fits the true box much better
-        than in this format; empty if there is none.
+        """Return the options of a format in which one of the boxes fits the true box much
+        better than in this format; empty if there is no such format.
 
         Args:
             boxes: (D, 4), with a right class.
@@ -409,6 +421,7 @@ class BoxFormat:
         """
         if not len(boxes):
             return ""
+        # this format first: `max` returns the first of equally good ones
         candidates = [self]
         candidates += [
             BoxFormat(form, unit, self.input_size) for unit in UNITS for form in FORMS
@@ -424,16 +437,17 @@ class BoxFormat:
 
 
 def select_best_boxes(images: Sequence[Detections]) -> Tensor:
-    """Return the boxes with the best scores of each image, as they came, (D, 4).
+    """Return the boxes with the best scores of each image, in the format of the
+    output, (D, 4).
 
-    Rows that do not count are left out, see `are_counted`.
+    Invalid boxes and those without a score over 0 are left out (`are_counted`).
     """
     boxes_of_images = []
     for detections in images:
         rows = are_counted(detections).nonzero().flatten()
-        numbers = get_box_numbers(detections)
-        # A box without numbers has a score of 0.
-        score = numbers.amax(dim=1) if numbers.shape[1] else numbers.sum(dim=1)
+        scores = get_box_numbers(detections)
+        # `amax` needs a column; without any, the sum gives each box a score of 0
+        score = scores.amax(dim=1) if scores.shape[1] else scores.sum(dim=1)
         best_rows = rows[score[rows].argsort(descending=True)[:MAX_FORMAT_BOXES]]
         boxes_of_images.append(detections["boxes"].detach()[best_rows])
     return torch.cat(boxes_of_images) if boxes_of_images else torch.zeros(0, 4)
@@ -443,7 +457,7 @@ def infer_unit(boxes: Tensor) -> str:
     """Infer which of `UNITS` boxes (D, 4) of any format have; "" if it is open."""
     if not len(boxes):
         return ""
-    largest = float(boxes.abs().amax(dim=1).median())
-    if largest <= MAX_FRACTION:
+    typical_coordinate = float(boxes.abs().amax(dim=1).median())
+    if typical_coordinate <= MAX_FRACTION:
         return "fractions"
-    return "pixels" if largest >= MIN_PIXELS else ""
+    return "pixels" if typical_coordinate >= MIN_PIXELS else ""

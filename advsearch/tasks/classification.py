@@ -60,20 +60,10 @@ class ClassTask(Task):
             InputError: there is no such class, or the model's outputs are not what the
                 task reads.
         """
-        model_returns_logits = model.read is None
-        if self.reads_logits != model_returns_logits:
-            if self.reads_logits:
-                advice = (
-                    "it was loaded for another task than classification; give the "
-                    "same `task` here"
-                )
-            else:
-                advice = (
-                    f'it was loaded for its logits; load it with task="{self.name}"'
-                )
-            raise InputError(f"model {model.name}: {advice}")
+        self._check_output_kind(model)
         if self.reads_logits:
-            labels, named = model.labels, model.named
+            labels = model.labels
+            named = model.named
         else:
             labels, named = self._get_model_labels(model)
         target_classes = None
@@ -85,6 +75,24 @@ class ClassTask(Task):
         return replace(
             self, labels=labels, named=named, target=target_classes, minimise=minimise
         )
+
+    def _check_output_kind(self, model: Model) -> None:
+        """Check that a model returns logits if this task reads them, and only then.
+
+        Raises:
+            InputError: it was loaded for a task of the other kind.
+        """
+        returns_logits = model.read is None  # nothing reads them for a task
+        if returns_logits == self.reads_logits:
+            return
+        if self.reads_logits:
+            advice = (
+                "it was loaded for another task than classification; give the same "
+                "`task` here"
+            )
+        else:
+            advice = f'it was loaded for its logits; load it with task="{self.name}"'
+        raise InputError(f"model {model.name}: {advice}")
 
     def _get_model_labels(self, model: Model) -> tuple[tuple[str, ...], bool]:
         """Return the names of the classes that a model predicts, and whether they are
@@ -124,7 +132,7 @@ class ClassTask(Task):
         try:
             right_classes = find_label_set(text, self.labels, named=self.named).indices
         except InputError as error:
-            if facts.label is not None:
+            if facts.label is not None:  # the user's own
                 raise InputError(f"label: {error}") from None
             raise InputError(
                 f"label: the label of {facts.object} itself does not fit "
@@ -145,7 +153,7 @@ class ClassTask(Task):
     def nothing_classes(self) -> Labels:
         """Indices of classes that stand for no thing, such as "background".
 
-        They are no predictions, unless they are targets.
+        They do not count as predictions. Targets are left out: these count.
         """
         if not self.named:
             return ()
@@ -188,13 +196,13 @@ class Classification(ClassTask):
         """See `Task.as_logits`: a class that stands for no thing gets a logit of minus
         infinity, unless it is right or there is no other wrong class.
         """
-        nothing = set(self.nothing_classes) - set(truth)
+        excluded = set(self.nothing_classes) - set(truth)
         n_classes = output.shape[1]
-        n_right = max(1, len(truth))  # one at least, if it is not known yet
-        has_other_wrong_class = len(nothing) + n_right < n_classes
-        if not nothing or not has_other_wrong_class:
+        n_right = max(1, len(truth))  # `truth` is empty where it is not known
+        has_other_wrong_class = len(excluded) + n_right < n_classes
+        if not excluded or not has_other_wrong_class:
             return output
-        indices = torch.tensor(sorted(nothing), device=output.device)
+        indices = torch.tensor(sorted(excluded), device=output.device)
         return output.index_fill(1, indices, -math.inf)
 
     def loss(self, output: Tensor, truth: Labels) -> Tensor:
@@ -226,7 +234,8 @@ class Classification(ClassTask):
         for classes, class_probabilities in zip(
             top_classes.tolist(), top_probabilities.tolist(), strict=True
         ):
-            if not math.isfinite(class_probabilities[0]):
+            has_nan_logits = not math.isfinite(class_probabilities[0])
+            if has_nan_logits:
                 predictions_of_images.append((Prediction(NOT_A_NUMBER),))
                 continue
             predictions = tuple(
@@ -234,16 +243,17 @@ class Classification(ClassTask):
                 for class_id, probability in zip(
                     classes, class_probabilities, strict=True
                 )
-                # classes that stand for no thing have a probability of 0
+                # excluded classes (`as_logits`) have a probability of 0
                 if probability > 0.0 or count == 1
             )
             predictions_of_images.append(predictions)
         return predictions_of_images
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
-        """See `Task.judge`; the logits are computed once for all that needs them.
+        """See `Task.judge`; the logits are computed only once.
 
-        Loss and score are computed from these logits, unless a subclass defines them.
+        A subclass that defines `loss` or `score` computes logits for itself: its methods
+        are called as they are.
         """
         logits = self.as_logits(output, truth)
         defines_loss = type(self).loss is not Classification.loss
@@ -254,17 +264,16 @@ class Classification(ClassTask):
         defines_score = type(self).score is not Classification.score
         if defines_score or self.target is not None:
             scores = self.score(output, truth)
-        else:
+        else:  # as `Task.score`
             scores = -losses if self.minimise else losses
-        judgements = []
-        for score, margin, predictions in zip(
-            scores.tolist(),
-            (0.0 - losses).tolist(),  # not `-losses`, which would be -0.0 for 0
-            self._rank_classes(logits, count=1),
-            strict=True,
-        ):
-            judgements.append(Judgement.of(score, margin, predictions[0]))
-        return judgements
+        margins = 0.0 - losses  # not `-losses`, which would be -0.0 for 0
+        top_predictions = [top for (top,) in self._rank_classes(logits, count=1)]
+        return [
+            Judgement.of(score, margin, prediction)
+            for score, margin, prediction in zip(
+                scores.tolist(), margins.tolist(), top_predictions, strict=True
+            )
+        ]
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
         return self.get_class_names(truth)

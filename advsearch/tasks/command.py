@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -89,8 +90,8 @@ class Command(Task):
             set_field(self, "envelope", _parse_numbers("envelope", self.envelope))
             if min(self.envelope) <= 0.0:
                 raise InputError(
-                    "task command: envelope: expected numbers over 0, "
-                    f"got {min(self.envelope):g}"
+                    "task command: envelope: expected numbers over 0, got "
+                    f"{min(self.envelope):g}"
                 )
 
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
@@ -100,26 +101,29 @@ class Command(Task):
         LeRobot's policies, `select_action`, which `WithState` calls.
         """
         if isinstance(network, models.AllAtOnce):
-            # of all cameras' images at once: what it holds is wrapped
-            inner: Any = self.wrap_network(network.network)
-            return models.AllAtOnce(inner, network.cameras, network.layout)
+            # It passes the images of all cameras to a policy, which is what is wrapped.
+            policy_with_state: Any = self.wrap_network(network.network)
+            return models.AllAtOnce(policy_with_state, network.cameras, network.layout)
         policy = network
-        if isinstance(network, models.WithState):  # the state of another task
+        if isinstance(network, models.WithState):
+            # wrapped for another task already, whose state is replaced
             policy = network.network
         if self.state or hasattr(policy, "select_action"):
             return models.WithState(policy, self.state)
         return network
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Read actions (count, A) from (count, A) or (count,).
+        """Read actions (count, A) from what a policy returned.
 
-        They may be the first of a tuple, or `action` of a mapping.
+        This is (count, A), or (count,) for actions of one element: a tensor, the first
+        item of a tuple or list, or `action` of a mapping.
 
         Raises:
             ValueError: there are none, or their size differs from that of the options.
         """
         actions = returned.get("action") if isinstance(returned, Mapping) else returned
-        if type(actions) in (tuple, list) and actions:  # no named tuple
+        # A named tuple has the type of its class, and is none of the forms.
+        if type(actions) in (tuple, list) and actions:
             actions = actions[0]
         if (
             not isinstance(actions, Tensor)
@@ -127,8 +131,8 @@ class Command(Task):
             or actions.shape[:1] != (count,)
         ):
             raise ValueError(
-                "expected an action for each picture, (N, A), or a "
-                "mapping with these under action"
+                "expected an action for each picture, (N, A), or a mapping with these "
+                "under action"
             )
         if actions.ndim == 1:
             actions = actions[:, None]
@@ -137,15 +141,25 @@ class Command(Task):
                 "expected one action for each picture, (N, A), with A from 1 to "
                 f"{MAX_NUMBERS}"
             )
-        for option in ("envelope", "names", "units"):
-            size = len(getattr(self, option) or ())
-            # One envelope or unit is for all elements.
-            is_for_all = size == 1 and option != "names"
-            if size and not is_for_all and size != actions.shape[1]:
-                raise ValueError(
-                    f"expected actions of {size} elements, as task command has {option}"
-                )
+        self._check_element_count(actions.shape[1])
         return actions.float()
+
+    def _check_element_count(self, n_elements: int) -> None:
+        """Check that options with a value for each element have as many as an action.
+
+        Raises:
+            ValueError: an option has more or fewer.
+        """
+        for option in ("envelope", "names", "units"):
+            n_values = len(getattr(self, option) or ())
+            if not n_values:
+                continue
+            # One envelope or unit is for all elements.
+            is_shared = n_values == 1 and option != "names"
+            if n_values != n_elements and not is_shared:
+                raise ValueError(
+                    f"expected actions of {n_values} elements, as task command has {option}"
+                )
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
@@ -158,33 +172,36 @@ class Command(Task):
                 with names of classes, the target is no action, or the clean action is
                 sought.
         """
-        if model.read is None:
+        if model.read is None:  # its outputs are logits, as of a classifier
             raise InputError(
                 f"model {model.name}: it was loaded for its logits; load "
                 'it with task="command"'
             )
         if model.labels:
             raise InputError(
-                "labels: task command has no classes; this is a "
-                "classifier: give a policy as `model`"
+                "labels: task command has no classes; this is a classifier: give a "
+                "policy as `model`"
             )
         if self.envelope is None:
             raise InputError(
                 "task command: envelope: expected how far an action may be off, in its "
-                "unit, or a list with a number "
-                "for each element, got none; write `task='command={envelope: 0.2}'`"
+                "unit, or a list with a number for each element, got none; write "
+                "`task='command={envelope: 0.2}'`"
             )
         if minimise:
             raise InputError(
-                "minimise: the clean action is within its envelope "
-                "already; leave it out"
+                "minimise: the clean action is within its envelope already; leave it "
+                "out"
             )
-        return replace(self, target=None if target is None else self._target(target))
+        return replace(
+            self, target=None if target is None else self._parse_target(target)
+        )
 
-    def _target(self, text: str) -> Tensor:
+    def _parse_target(self, text: str) -> Tensor:
         """Parse a target action (A,): numbers of all elements ("0.1,-0.3"), or named
         ones ("yaw rate=-0.3"); elements that are not named are NaN.
         """
+        # ("yaw rate", "=", "-0.3"), or ("", "", "0.1") without a name
         assignments = [part.rpartition("=") for part in str(text).split(",")]
         numbers = [number.strip() for _, _, number in assignments]
         values = torch.tensor(_parse_numbers("target", numbers))
@@ -231,11 +248,11 @@ class Command(Task):
         """
         if len(self.target) != len(clean_action):
             raise InputError(
-                f"target: expected an action of {len(clean_action)} "
-                f"elements, got {len(self.target)}"
+                f"target: expected an action of {len(clean_action)} elements, got "
+                f"{len(self.target)}"
             )
-        # A loss of 1 is a distance of 2 envelopes. Nearer to each other, an action could
-        # be in both envelopes, right and a success at once.
+        # The loss is the distance in envelopes, minus 1. Within a distance of 2, an action
+        # could be in both envelopes: right, and a success.
         do_envelopes_overlap = float(self.loss(clean_action[None], self.target)) <= 1.0
         if do_envelopes_overlap:
             raise InputError(
@@ -248,14 +265,15 @@ class Command(Task):
         """State the clean action and its envelope, once they are known."""
         if self.clean is None:
             return ()
-        is_shared = len(self.envelope) == 1
-        envelope = [*self.envelope] * (len(self.clean) if is_shared else 1)
-        clean_action = self._format_action(self.clean.tolist())
+        clean_action = self.clean.tolist()
+        envelope = list(self.envelope)
+        if len(envelope) == 1:  # the same for all elements
+            envelope = envelope * len(clean_action)
         return (
-            f"The clean action is {clean_action}, from one picture "
-            "of the clean scene; its envelope "
-            f"is {self._format_action(envelope, sign='± ')}. An action is judged by "
-            "itself: nothing moves, and no later picture follows from it.",
+            f"The clean action is {self._format_action(clean_action)}, from one picture of "
+            f"the clean scene; its envelope is {self._format_action(envelope, sign='± ')}. "
+            "An action is judged by itself: nothing moves, and no later picture follows "
+            "from it.",
         )
 
     @property
@@ -278,23 +296,31 @@ class Command(Task):
     def truth_names(self, truth: Tensor | None) -> tuple[str, ...]:
         return () if truth is None else (self._format_action(truth.tolist()),)
 
-    def _deviation(self, output: Tensor, center: Tensor | None) -> Tensor:
-        """Compute the deviation (N, A) of each element from an action `center` (A,).
+    def _compute_deviation(self, output: Tensor, center: Tensor | None) -> Tensor:
+        """Compute the deviation (N, A) of each element of actions (N, A) from an action.
 
-        It is in envelopes: 1 is at the edge of what is allowed. An element that is NaN
-        in `center` is not judged, so that its deviation is 0.
+        It is in envelopes: 1 is at the edge of what is allowed.
+
+        Args:
+            output: the actions.
+            center: (A,), the clean action or the target; elements that are NaN are not
+                judged, so that their deviation is 0.
+
+        Raises:
+            InputError: there is no center, since no clean image came first.
         """
         if center is None:
             raise InputError(
                 "task command: expected a clean picture that it was shown first"
             )
         is_known = ~center.isnan().to(output.device)
-        center = center.to(output).where(is_known, output.detach())
-        return (output - center) / output.new_tensor(self.envelope)
+        # an element that is not judged is compared with itself
+        center_of_action = center.to(output).where(is_known, output.detach())
+        return (output - center_of_action) / output.new_tensor(self.envelope)
 
     def loss(self, output: Tensor, truth: Tensor | None) -> Tensor:
         """Compute the largest deviation of an element in envelopes, minus 1, (N,)."""
-        return self._deviation(output, truth).abs().amax(dim=1) - 1.0
+        return self._compute_deviation(output, truth).abs().amax(dim=1) - 1.0
 
     def predictions(
         self, output: Tensor, count: int = 1
@@ -317,8 +343,9 @@ class Command(Task):
         reaches_target = [False] * len(output)
         if self.target is not None:
             reaches_target = (self.loss(output, self.target) <= 0.0).tolist()
-        deviations = self._deviation(output, truth)
+        deviations = self._compute_deviation(output, truth)
         clean_action = truth.tolist()
+        clean_text = self._format_action(clean_action, with_names=False)
         for row, (action, margin) in enumerate(
             zip(output.tolist(), margins, strict=True)
         ):
@@ -327,8 +354,7 @@ class Command(Task):
             elif margin >= 0.0:
                 label = INSIDE
             else:
-                label = self._outside_label(deviations[row])
-            clean_text = self._format_action(clean_action, with_names=False)
+                label = self._make_outside_label(deviations[row])
             payload: tasks.JsonValue = {
                 "action": action,
                 "clean": clean_action,
@@ -339,26 +365,34 @@ class Command(Task):
             results.append((tasks.Prediction(label), payload))
         return results
 
-    def _outside_label(self, deviation: Tensor) -> str:
+    def _make_outside_label(self, deviation: Tensor) -> str:
         """Return the label of an action outside its envelope, with its deviation
         (A,).
         """
         furthest = int(deviation.abs().argmax())
         direction = "above" if deviation[furthest] > 0.0 else "below"
-        return f"action outside its envelope ({self._name(furthest)} {direction} it)"
+        return f"action outside its envelope ({self._get_element_name(furthest)} {direction} it)"
 
-    def _name(self, index: int) -> str:
+    def _get_element_name(self, index: int) -> str:
         """Return the name of an element."""
         return self.names[index] if self.names else f"action {index + 1}"
 
     def _format_action(
         self, action: Sequence[float], *, sign: str = "", with_names: bool = True
     ) -> str:
-        """Return the first elements of an action as text, with names and units."""
-        units = self.units if len(self.units) > 1 else [*self.units] * len(action)
+        """Return the first elements of an action as text, with names and units.
+
+        Args:
+            action: numbers (A,).
+            sign: a text before each number.
+            with_names: begin each element with its name.
+        """
+        units = list(self.units)
+        if len(units) == 1:  # the same for all elements
+            units = units * len(action)
         elements = []
         for index, number in enumerate(action[:MAX_FORMATTED_ELEMENTS]):
-            name = f"{self._name(index)} " if with_names else ""
+            name = f"{self._get_element_name(index)} " if with_names else ""
             unit = units[index] if units else ""
             elements.append(f"{name}{sign}{number:.3g} {unit}".rstrip())
         text = ", ".join(elements)
@@ -368,7 +402,11 @@ class Command(Task):
 
 
 def _parse_names(option: str, value: Any) -> tuple[str, ...]:
-    """Parse names from a list, or a string with commas between them."""
+    """Parse names from a list, or a string with commas between them.
+
+    Raises:
+        InputError: one is no text, or there are too many; it names `option`.
+    """
     if isinstance(value, str) and value:
         names = [part.strip() for part in value.split(",")]
     else:
@@ -385,20 +423,23 @@ def _parse_names(option: str, value: Any) -> tuple[str, ...]:
 
 
 def _parse_numbers(option: str, value: Any) -> Numbers:
-    """Parse finite numbers from a number, a string with one, or a list of such."""
+    """Parse finite numbers from a number, a string with a number, or a list of these.
+
+    Raises:
+        InputError: there are none or too many, or one is not finite; it names `option`.
+    """
     items = value.tolist() if hasattr(value, "tolist") else value
     items = list(items) if isinstance(items, (list, tuple)) else [items]
-    try:
-        if any(isinstance(item, bool) for item in items):
-            raise ValueError
-        numbers = tuple(float(item) for item in items)
-    except (TypeError, ValueError, OverflowError):
-        numbers = ()
+    numbers: Numbers = ()  # remains if an item is no number: then it is refused below
+    if not any(isinstance(item, bool) for item in items):
+        with suppress(TypeError, ValueError, OverflowError):
+            numbers = tuple(float(item) for item in items)
+    # well within the range of float32
     are_finite = all(math.isfinite(number) and abs(number) < 1e30 for number in numbers)
     if not 1 <= len(numbers) <= MAX_NUMBERS or not are_finite:
-        got = (
-            f"{len(items):,} of them" if len(items) > MAX_NUMBERS else f"{value!r:.80}"
-        )
+        got = f"{value!r:.80}"
+        if len(items) > MAX_NUMBERS:
+            got = f"{len(items):,} of them"
         raise InputError(
             f"task command: {option}: expected a finite number, or a list of 1 to "
             f"{MAX_NUMBERS} of them, got {got}"

@@ -114,9 +114,9 @@ class DepthTruth:
         height, width = self.mask.shape
         disparity = self.z.reciprocal()
         column = torch.arange(width).expand(height, width)
-        # Nearest columns outside the object; -1 and `width` if there are none.
-        # A running maximum (from the left) and minimum (from the right) carries the
-        # column of the last pixel outside on over the object.
+        # The nearest column outside the object to the left of each pixel, and to the
+        # right; -1 and `width` if there is none. A running maximum from the left, and a
+        # running minimum from the right, carry the last such column on over the object.
         left = torch.where(self.mask, -1, column).cummax(dim=1).values
         right_edges = torch.where(self.mask, width, column).flip(1)
         right = right_edges.cummin(dim=1).values.flip(1)
@@ -124,7 +124,7 @@ class DepthTruth:
         right_disparity = disparity.gather(1, right.clamp_max(width - 1))
         weight = (column - left) / (right - left).clamp_min(1)
         result = left_disparity + weight * (right_disparity - left_disparity)
-        # where the object reaches an edge of the image, the value of the other side
+        # where the object reaches an edge of the image, the value of its other side
         has_left = left >= 0
         has_right = right != width
         result = torch.where(has_right, result, left_disparity)
@@ -173,7 +173,7 @@ class Depth(Task):
             "a number over 0, under 100",
             "tolerance",
         )
-        # 0, the default, means that there is none
+        # 0, the default, means that there is none: the lower bound lets it pass
         self.check_numbers(
             lambda value: -1e-9 < value < 1e6, "a number over 0, under 1e+06", "size"
         )
@@ -204,8 +204,8 @@ class Depth(Task):
         ):
             raise ValueError(
                 "expected a number for each pixel, (N, height, width) or (N, 1, "
-                "height, width), or a mapping with "
-                f"these under predicted_depth or {', '.join(KINDS)}"
+                "height, width), or a mapping with these under predicted_depth or "
+                f"{', '.join(KINDS)}"
             )
         return [{kind: depth_map} for depth_map in maps.float()]
 
@@ -243,12 +243,20 @@ class Depth(Task):
         """See `Task.after_calibration`: find out what the values are, by the options or
         by what the network states in the map of a clean image.
         """
-        kind = self.kind or next(iter(output[0]))
-        return replace(self, resolved_kind=kind, missing=self._missing(kind, truth))
+        kind = self._get_kind(output[0])
+        missing = self._describe_missing_option(kind, truth)
+        return replace(self, resolved_kind=kind, missing=missing)
 
-    def _missing(self, kind: str, truth: DepthTruth | None) -> str:
-        """Return what the user has to state before predictions can be judged; "" if
-        nothing.
+    def _get_kind(self, depth_map: DepthMap) -> str:
+        """Return which of `KINDS` the values of a map are, by the option or else by the
+        network; "" if neither states it.
+        """
+        (stated_kind,) = depth_map  # its only key
+        return self.kind or stated_kind
+
+    def _describe_missing_option(self, kind: str, truth: DepthTruth | None) -> str:
+        """Return what the user has to state before predictions can be judged, as a
+        message; "" if nothing.
 
         Args:
             kind: kind of the model's values, one of `KINDS`, or "" if it is unknown.
@@ -257,35 +265,26 @@ class Depth(Task):
         if not kind:
             return (
                 f"kind: expected what its numbers are, one of {', '.join(KINDS)}, and "
-                "its network does not say it; "
-                f"give `task='depth={{kind: {DISPARITY}}}'`, say"
+                "its network does not say it; give `task='depth={kind: "
+                f"{DISPARITY}}}'`, say"
             )
-        if (
-            kind == METRIC
-            and not self.size
-            and (truth is None or truth.size_in_metres is None)
-        ):
+        if kind == METRIC:
+            has_scene_size = truth is not None and truth.size_in_metres is not None
+            if self.size or has_scene_size:
+                return ""
             return (
                 "size: it predicts metres, and how large the object is is not known; "
-                "give its longest side in metres, "
-                "such as `size=0.1`"
+                "give its longest side in metres, such as `size=0.1`"
             )
-        if (
-            kind != METRIC
-            and truth is not None
-            and truth.is_visible
-            and not truth.determines_scale
-        ):
-            return (
-                "it predicts up to a scale and a shift, which are found on what is "
-                "seen beside the object: expected "
-                f"{MIN_FIT_PIXELS} pixels at distances that differ by a factor of "
-                f"{MIN_DISTANCE_RATIO:g}, "
-                f"got {int(truth.outside_object.sum())}; "
-                "give a scene with a ground or a room, and a camera that sees it from "
-                "the side"
-            )
-        return ""
+        if truth is None or not truth.is_visible or truth.determines_scale:
+            return ""
+        return (
+            "it predicts up to a scale and a shift, which are found on what is seen "
+            f"beside the object: expected {MIN_FIT_PIXELS} pixels at distances that "
+            f"differ by a factor of {MIN_DISTANCE_RATIO:g}, got "
+            f"{int(truth.outside_object.sum())}; give a scene with a ground or a room, "
+            "and a camera that sees it from the side"
+        )
 
     @property
     def ambiguities(self) -> str:
@@ -320,13 +319,14 @@ class Depth(Task):
         Raises:
             InputError: the lens sees so far from its axis that z-depth is no distance.
         """
-        if bool((facts.z_depth < MIN_AXIS_COSINE * facts.depth).any()):
+        # z-depth is the distance times the cosine of the angle to the camera's axis
+        sees_far_from_axis = facts.z_depth < MIN_AXIS_COSINE * facts.depth
+        if bool(sees_far_from_axis.any()):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, "
-                "and this lens sees things more "
-                f"than {math.degrees(math.acos(MIN_AXIS_COSINE)):.0f} degrees from its "
-                "axis; "
-                "take a lens that sees less"
+                "and this lens sees things more than "
+                f"{math.degrees(math.acos(MIN_AXIS_COSINE)):.0f} degrees from its "
+                "axis; take a lens that sees less"
             )
         return DepthTruth(facts.mask, facts.z_depth, facts.sight.size_in_metres)
 
@@ -351,9 +351,9 @@ class Depth(Task):
         """Compute how near each of N outputs is to what is sought, (N,); over 0 if it
         is a success.
 
-        "nearer" and "farther" take the signed mean over pixels. "gone" is the lesser of
-        the loss, and of how far the remaining fraction of the object's relief is below
-        a half; see `_relief`.
+        For "nearer" and "farther" it is the signed mean over pixels, beyond the
+        tolerance. For "gone" it is the lesser of two: the loss, and how far the remaining
+        fraction of the object's relief (`_compute_relief_fraction`) is below a half.
         """
         if self.minimise or not self.seek:
             return super().score(output, truth)
@@ -361,7 +361,7 @@ class Depth(Task):
         def score_gone(log_factors: Tensor) -> Tensor:
             """Return by how much the object is as far as what is behind it, ()."""
             excess = log_factors.abs().mean() - self._log_limit
-            lost_relief = 0.5 - self._relief(log_factors, truth)
+            lost_relief = 0.5 - self._compute_relief_fraction(log_factors, truth)
             return torch.minimum(excess, lost_relief)
 
         def score_signed(log_factors: Tensor) -> Tensor:
@@ -383,30 +383,36 @@ class Depth(Task):
         truth: DepthTruth,
         function: Callable[[Tensor], Tensor],
     ) -> Tensor:
-        """Apply a function to the log factors of the object's pixels in each image,
-        (N,).
+        """Apply a function to each image, (N,); -1, a right prediction, if the object is
+        out of view.
 
-        The value is -1 if the object is out of view.
+        Args:
+            output: output for N images.
+            truth: truth of the scene.
+            function: function from log(predicted / true) of the object's pixels, (P,), to
+                the value of an image, ().
         """
         values = []
         for depth_map in output:
             if truth.is_visible:
-                values.append(function(self._log_factors(depth_map, truth)))
+                values.append(function(self._compute_log_factors(depth_map, truth)))
             else:
+                (distances,) = depth_map.values()  # the only map
                 # The product keeps the value attached to the graph.
-                values.append(next(iter(depth_map.values())).sum() * 0.0 - 1.0)
+                values.append(distances.sum() * 0.0 - 1.0)
         return torch.stack(values)
 
-    def _log_factors(self, depth_map: DepthMap, truth: DepthTruth) -> Tensor:
+    def _compute_log_factors(self, depth_map: DepthMap, truth: DepthTruth) -> Tensor:
         """Compute log(predicted / true) of each of the object's pixels, (P,).
 
         The factors are clamped to `MAX_FACTOR` and its inverse.
         """
-        predicted, is_inverse = self._align(depth_map, truth)
+        predicted, is_inverse = self._align_to_truth(depth_map, truth)
         mask = truth.mask.to(predicted.device)
         z = truth.z.to(predicted.device)
         # of predicted to true, both z-depth or both its inverse
         if is_inverse:
+            # divided by the true inverse, 1 / z
             ratio = predicted[mask] * z[mask]
         else:
             ratio = predicted[mask] / z[mask]
@@ -417,7 +423,9 @@ class Depth(Task):
         nan_or_zero = predicted.sum() * 0.0
         return log_factors + nan_or_zero
 
-    def _align(self, depth_map: DepthMap, truth: DepthTruth) -> tuple[Tensor, bool]:
+    def _align_to_truth(
+        self, depth_map: DepthMap, truth: DepthTruth
+    ) -> tuple[Tensor, bool]:
         """Return the predicted z-depth of every pixel in units of the truth, (H, W), or
         its inverse; and whether it is the inverse.
 
@@ -425,18 +433,17 @@ class Depth(Task):
         the truth by least squares, unless it is in metres. A map of another size is
         resized as transformers does it in `post_process_depth_estimation`.
         """
-        ((stated_kind, values),) = depth_map.items()  # the only entry
-        kind = self.kind or stated_kind
+        kind = self._get_kind(depth_map)
+        (values,) = depth_map.values()  # the only map
         size = (truth.mask.shape[0], truth.mask.shape[1])
         if values.shape != size:
             values = F.interpolate(
                 values[None, None], size=size, mode="bicubic", align_corners=False
             )[0, 0]
         if kind == METRIC:
-            # If the user states a size, metres of that object become those of the
-            # scene's, or object sizes.
             scale = 1.0
             if self.size:
+                # from metres of the real object to metres in the scene, or object sizes
                 scale = (truth.size_in_metres or 1.0) / self.size
             return values * scale, False
         z = truth.z.to(values.device)
@@ -445,13 +452,20 @@ class Depth(Task):
             return _fit_scale_and_shift(values, z.reciprocal(), fit_mask), True
         return _fit_scale_and_shift(values, z, fit_mask), False
 
-    def _relief(self, log_factors: Tensor, truth: DepthTruth) -> Tensor:
-        """Compute the remaining fraction of the object's relief, ().
+    def _compute_relief_fraction(
+        self, log_factors: Tensor, truth: DepthTruth
+    ) -> Tensor:
+        """Compute how much of the object's relief is left in a prediction, ().
 
-        The relief is the disparity of the object's pixels minus that of what is behind
-        them, and the fraction the least-squares coefficient of the predicted relief on
-        the true one: 1 if all distances are true, 0 if the object is as far as what is
-        behind it. It is 1 too if that is unknown, or the true relief is negligible.
+        The relief is how far the object stands out from what is behind it: the disparity
+        of each of its pixels minus that of the background there. The fraction is the
+        least-squares coefficient of the predicted relief on the true one: 1 if all
+        distances are true, 0 if the object is as far as the background. It is 1 as well
+        if the background is unknown, or the true relief is negligible.
+
+        Args:
+            log_factors: log(predicted / true) of the object's pixels, (P,).
+            truth: truth of the image.
         """
         mask = truth.mask
         disparity = truth.z[mask].reciprocal().to(log_factors)
@@ -459,7 +473,8 @@ class Depth(Task):
         is_known = behind.isfinite()
         true_relief = (disparity - behind)[is_known]
         squared_relief = true_relief.square().sum()
-        if float(squared_relief) <= 1e-6 * float(disparity.square().sum()):
+        is_negligible = float(squared_relief) <= 1e-6 * float(disparity.square().sum())
+        if is_negligible:
             # The product keeps the value attached to the graph.
             return log_factors.sum() * 0.0 + 1.0
         # A predicted distance is the true one times exp(log_factors).
@@ -475,9 +490,9 @@ class Depth(Task):
         """Return the range of the values of each map."""
         predictions_of_images: list[tuple[tasks.Prediction, ...]] = []
         for depth_map in output:
-            ((stated_kind, values),) = depth_map.items()  # the only entry
+            (values,) = depth_map.values()  # the only map
             lowest, highest = (float(limit) for limit in values.detach().aminmax())
-            kind = self.kind or stated_kind or "numbers"
+            kind = self._get_kind(depth_map) or "numbers"
             label = f"{kind} from {lowest:.3g} to {highest:.3g}"
             if not math.isfinite(lowest + highest):
                 label = tasks.NOT_A_NUMBER
@@ -487,51 +502,51 @@ class Depth(Task):
     def describe(
         self, output: Sequence[DepthMap], truth: DepthTruth, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.describe`; the payload has the factor by which the distance is off, the
-        remaining relief, and where scale and shift were fitted.
+        """See `Task.describe`; the payload has the true and the predicted distance, the
+        factor between them, the remaining relief, and where scale and shift were fitted.
         """
         if not truth.is_visible:
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
         results: list[tasks.PredictionWithPayload] = []
-        # geometric mean over the object's pixels, as of the factors
+        # the geometric mean over the object's pixels, since factors are averaged so
         distance = float(truth.z[truth.mask].double().log().mean().exp())
         for depth_map, margin in zip(output, margins, strict=True):
-            log_factors = self._log_factors(depth_map, truth)
+            log_factors = self._compute_log_factors(depth_map, truth)
             mean_log_factor = float(log_factors.mean())
-            relief = float(self._relief(log_factors, truth))
+            relief = float(self._compute_relief_fraction(log_factors, truth))
             payload: dict[str, tasks.JsonValue] = {
                 "distance": round(distance, 4),
                 "judged": round(distance * math.exp(mean_log_factor), 4),
                 "factor": round(math.exp(float(log_factors.abs().mean())), 4),
                 "relief": round(relief, 4),
             }
-            is_fitted = (self.kind or next(iter(depth_map))) != METRIC
+            is_fitted = self._get_kind(depth_map) != METRIC
             if is_fitted and truth.determines_scale:
                 payload["fitted"] = "beside the object"
             elif is_fitted:
                 payload["fitted"] = "in the whole picture"
             label = AS_FAR
             if margin < 0.0:
-                label = self._error_label(mean_log_factor, relief)
+                label = self._choose_error_label(mean_log_factor, relief)
             results.append((tasks.Prediction(label), payload))
         return results
 
-    def _error_label(self, mean_log_factor: float, relief: float) -> str:
-        """Return the label of a wrong distance; of several that hold, the one that the
+    def _choose_error_label(self, mean_log_factor: float, relief: float) -> str:
+        """Return the label of a wrong distance; of several that fit, the one that the
         search seeks.
 
         Args:
             mean_log_factor: mean of log(predicted / true) over the object's pixels.
-            relief: remaining fraction of the object's relief, see `_relief`.
+            relief: remaining fraction of the object's relief, see `_compute_relief_fraction`.
         """
-        holds = {
+        fits = {
             "gone": relief < 0.5,
             "nearer": -mean_log_factor > self._log_limit,
             "farther": mean_log_factor > self._log_limit,
         }
-        sought_first = sorted(holds, key=lambda goal: goal != self.seek)  # False first
+        sought_first = sorted(fits, key=lambda goal: goal != self.seek)  # False first
         for goal in sought_first:
-            if holds[goal]:
+            if fits[goal]:
                 return LABELS[goal]
         return OUT_OF_SHAPE
 
@@ -542,39 +557,47 @@ class Depth(Task):
         disparity of everything.
         """
         true_mark = tasks.Mark(
-            "disparity", True, mask=truth.mask, map=truth.z.reciprocal()
+            "disparity", true=True, mask=truth.mask, map=truth.z.reciprocal()
         )
         marks_of_images = []
         for depth_map in output:
             marks = [true_mark]
-            kind = self.kind or next(iter(depth_map))
-            # Without the truth `_missing` does not ask whether the fit of a relative map
-            # is reliable, which does not matter for what is drawn.
-            missing = self._missing(kind, truth if kind == METRIC else None)
+            kind = self._get_kind(depth_map)
+            # A map that is fitted to the truth is drawn even if the fit is unreliable:
+            # without the truth that is no reason.
+            truth_of_size = truth if kind == METRIC else None
+            missing = self._describe_missing_option(kind, truth_of_size)
             if truth.is_visible and not missing:
-                marks.append(self._predicted_mark(depth_map, truth))
+                marks.append(self._make_predicted_mark(depth_map, truth))
             marks_of_images.append(marks)
         return marks_of_images
 
-    def _predicted_mark(self, depth_map: DepthMap, truth: DepthTruth) -> tasks.Mark:
+    def _make_predicted_mark(
+        self, depth_map: DepthMap, truth: DepthTruth
+    ) -> tasks.Mark:
         """Return the predicted disparity, with the object's pixels that are right."""
-        log_factors = self._log_factors(depth_map, truth).detach()
-        is_right = torch.zeros_like(truth.mask)
-        is_right[truth.mask] = (log_factors.abs() <= self._log_limit).to(
-            is_right.device
-        )
-        predicted, is_inverse = self._align(depth_map, truth)
-        if is_inverse:
+        log_factors = self._compute_log_factors(depth_map, truth).detach()
+        is_right_pixel = log_factors.abs() <= self._log_limit  # (P,) of the object's
+        right_mask = torch.zeros_like(truth.mask)
+        right_mask[truth.mask] = is_right_pixel.to(right_mask.device)
+        predicted, is_inverse = self._align_to_truth(depth_map, truth)
+        if is_inverse:  # the inverse of a distance is the disparity
             disparity = predicted
         else:
+            # a predicted distance may be 0 or negative
             disparity = predicted.clamp_min(1.0 / MAX_FACTOR).reciprocal()
         return tasks.Mark(
-            "disparity", False, mask=is_right, map=disparity.detach().cpu()
+            "disparity", true=False, mask=right_mask, map=disparity.detach().cpu()
         )
 
 
 def _find_maps(returned: Any) -> tuple[str, Any]:
-    """Return what the network states its values are, "" if nothing, and its maps."""
+    """Find the maps in what a network returned.
+
+    Returns:
+        Which of `KINDS` the network states for its values, "" if it states none; and the
+        maps, unchecked: None or something else if there are none.
+    """
     if isinstance(returned, Mapping):
         kind = next((kind for kind in KINDS if kind in returned), "")
         if kind:
@@ -609,5 +632,6 @@ def _fit_scale_and_shift(values: Tensor, expected: Tensor, mask: Tensor) -> Tens
     y_mean = fit_expected.mean()
     x = fit_values - x_mean
     y = fit_expected - y_mean
+    # clamped for constant values, whose slope is then 0
     slope = (x * y).sum() / x.square().sum().clamp_min(1e-20)
     return y_mean + slope.clamp_min(0.0) * (values - x_mean)

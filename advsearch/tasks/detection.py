@@ -47,11 +47,12 @@ from advsearch.tasks.boxes import (
 )
 from advsearch.tasks.classification import MISSED_PREFIX, ClassTask, Labels
 from advsearch.tasks.detector_outputs import (
+    CHANNELS_FIRST,
     CLASS_COUNT_ORDERS,
     HEADS,
-    LAYOUTS,
     ORDER_ADVICE,
     QUERIES,
+    SOFTMAX_QUERIES,
 )
 
 GOALS = {
@@ -202,9 +203,8 @@ class Detection(ClassTask):
         with torch.no_grad():
             noise = torch.rand((1, *model.input_size, 3), generator=generator)
             output = model(noise)
-        # rows of NaN are counted as "blank"
-        fills_with_nan = any("blank" in detections for detections in output)
-        # the options count more than what the network declares
+        fills_with_nan = any("n_nan_rows" in detections for detections in output)
+        # options of the user override what the network declares
         has_format_options = bool(self.boxes or self.unit)
         is_declared = not has_format_options and getattr(
             model.module, DECLARED_FORMAT_ATTRIBUTE, False
@@ -226,11 +226,12 @@ class Detection(ClassTask):
     def after_calibration(
         self, output: Sequence[Detections], truth: DetectionTruth | None
     ) -> Detection:
-        """See `Task.after_calibration`: note what is odd about the boxes.
+        """See `Task.after_calibration`: infer the format of the boxes, and note in
+        `doubts` why it may be wrong.
 
-        If there are right boxes and a true one, the box format that fits best is
-        compared with the one in use. Otherwise the strongest boxes are checked for
-        plausibility.
+        If there are boxes of right classes and a true box, the format in which one of
+        them fits best is compared with the one in use. Otherwise the boxes with the best
+        scores are checked for plausibility.
         """
         task = self._infer_format(output)
         output = task._resolve_grids(output)
@@ -239,7 +240,6 @@ class Detection(ClassTask):
             if len(right_boxes):
                 doubts = task._compare_with_truth(right_boxes, truth.box_fractions)
                 return replace(task, doubts=doubts)
-        # no box of a right class, or no true box to compare with
         boxes = select_best_boxes(output)
         box_format = task._box_format
         doubts = box_format.describe_fault(boxes)
@@ -261,40 +261,39 @@ class Detection(ClassTask):
     def _find_boxes_of_classes(
         self, output: Sequence[Detections], classes: Labels
     ) -> Tensor:
-        """Return the boxes (D, 4), as they came, of all images with one of the
-        classes.
+        """Return the boxes (D, 4) of all images that have one of the classes, in the
+        format of the output.
         """
         selected = []
         for detections in self._resolve_labels(output):
-            scores = self._scores_of_classes(detections, classes)
+            scores = self._find_best_scores(detections, classes)
             selected.append(detections["boxes"][scores >= MIN_SCORE])
         return torch.cat(selected)
 
     def _infer_format(self, output: Sequence[Detections]) -> Detection:
         """Return the task with the order and unit that an output of its model shows.
 
-        What the output leaves open stays as it was inferred before. "raw" are grids of
-        a YOLO network, and "either" pairs of numbers of which it is open which one is
-        the score (see `detector_outputs`).
+        What this output leaves open stays as it was inferred from an earlier one.
         """
-        grids = [detections["raw"] for detections in output if "raw" in detections]
-        is_ambiguous = any("either" in detections for detections in output)
         order = self._infer_order(output)
+        grids = [detections["grid"] for detections in output if "grid" in detections]
+        has_pairs = any("score_or_label" in detections for detections in output)
         has_masks = self.ignores_masks or self._has_mask_coefficients(output, order)
         task = replace(
             self,
             inferred_order=order or self.inferred_order,
-            is_order_ambiguous=self.is_order_ambiguous or is_ambiguous,
+            is_order_ambiguous=self.is_order_ambiguous or has_pairs,
             head_shape=tuple(grids[0].shape) if grids else self.head_shape,
             ignores_masks=has_masks,
         )
         resolved = task._resolve_grids(output)
         if self.has_declared_format:
-            unit = "pixels"  # what the declaration says
+            unit = "pixels"  # as `DECLARED_FORMAT_ATTRIBUTE` says
         else:
             unit = infer_unit(select_best_boxes(resolved)) or self.inferred_unit
+        # rows of NaN beside boxes: with them the model fills its outputs up
         has_nan_rows = any(
-            "blank" in detections and len(detections["boxes"])
+            "n_nan_rows" in detections and len(detections["boxes"])
             for detections in resolved
         )
         return replace(
@@ -306,43 +305,46 @@ class Detection(ClassTask):
     def _infer_order(self, output: Sequence[Detections]) -> str:
         """Return the order that an output shows, "" if it leaves it open.
 
-        A DETR head that the user does not state has a last class for no object if the
-        name of the model's last class says so.
+        If the user states no order for a DETR output, and the name of the model's last
+        class means no object, it is the order with such a class.
 
         Raises:
             InputError: the output contradicts the options or the number of classes.
         """
-        grids = [detections["raw"] for detections in output if "raw" in detections]
+        stated_order = self._stated_network_order
         has_logits = any("logits" in detections for detections in output)
-        head = self._stated_class_count_order
-        if not head and has_logits and self.named and is_nothing_name(self.labels[-1]):
-            head = QUERIES[1]  # with a last class for no object
+        is_last_nothing = self.named and is_nothing_name(self.labels[-1])
+        if not stated_order and has_logits and is_last_nothing:
+            stated_order = SOFTMAX_QUERIES
         n_classes = len(self.labels) if self.named else None
         try:
-            return outputs.infer_order(output, n_classes, head)
+            return outputs.infer_order(output, n_classes, stated_order)
         except ValueError as error:
+            grids = [
+                detections["grid"] for detections in output if "grid" in detections
+            ]
             shape = f"the model's output is {tuple(grids[0].shape)}: " if grids else ""
-            is_ambiguous = any("either" in detections for detections in output)
-            hint = f"; {ORDER_ADVICE}" if is_ambiguous else ""
+            has_pairs = any("score_or_label" in detections for detections in output)
+            hint = f"; {ORDER_ADVICE}" if has_pairs else ""
             raise InputError(f"task detection: {shape}{error}{hint}") from None
 
     def _has_mask_coefficients(self, output: Sequence[Detections], order: str) -> bool:
-        """Return whether mask coefficients accompany the scores of boxes in an output.
+        """Return whether an output has mask coefficients beside the scores of its boxes.
 
-        They do if feature maps came with rows of boxes; or in a YOLO grid, if it has
-        more channels than the box and the scores take.
+        It has them if feature maps came with rows of boxes; or in a YOLO grid, if that
+        has more channels than the box and the scores take.
 
         Args:
             output: output of N images.
             order: one of `HEADS` with a layout, if there are grids.
         """
         for detections in output:
-            if "map_channels" in detections and "raw" not in detections:
+            if "map_channels" in detections and "grid" not in detections:
                 return True
-        grids = [detections["raw"] for detections in output if "raw" in detections]
+        grids = [detections["grid"] for detections in output if "grid" in detections]
         if not grids:
             return False
-        channel_axis = 0 if order.endswith(LAYOUTS[0]) else 1
+        channel_axis = 0 if order.endswith(CHANNELS_FIRST) else 1
         n_channels = grids[0].shape[channel_axis]
         first_score = next(
             start for head, start in HEADS.items() if order.startswith(head)
@@ -350,10 +352,10 @@ class Detection(ClassTask):
         return n_channels > len(self.labels) + first_score
 
     def _resolve_grids(self, output: Sequence[Detections]) -> Sequence[Detections]:
-        """Return an output with YOLO grids ("raw") split into boxes and scores, and DETR
+        """Return an output with YOLO grids ("grid") split into boxes and scores, and DETR
         logits turned into scores; any other as it is.
         """
-        if any("raw" in detections or "logits" in detections for detections in output):
+        if any("grid" in detections or "logits" in detections for detections in output):
             return self._resolve_labels(output)
         return output
 
@@ -368,10 +370,10 @@ class Detection(ClassTask):
         if not (self.unit or self.inferred_unit):
             return (
                 "unit: expected the unit of the model's boxes, and it finds nothing in "
-                "noise and in the clean scene "
-                f"that shows it; say {format_option('unit: fractions')} or "
-                f"{format_option('unit: pixels')}, and `boxes` too "
-                "unless they are x0, y0, x1, y1"
+                "noise and in the clean scene that shows it; say "
+                f"{format_option('unit: fractions')} or "
+                f"{format_option('unit: pixels')}, and `boxes` too unless they are x0, "
+                "y0, x1, y1"
             )
         return ""
 
@@ -380,19 +382,19 @@ class Detection(ClassTask):
         """Say how the model's output is read, where that was inferred."""
         remarks = []
         order = format_option(f"order: {self.inferred_order}")
-        is_order_inferred = not self.order
-        if self.head_shape and is_order_inferred:
-            remarks.append(
-                f"The detector's output of {self.head_shape} is read as a YOLO's: "
-                f"{order}."
-            )
-        if self.inferred_order in QUERIES and is_order_inferred:
-            remarks.append(f"The detector's output is read as a DETR's: {order}.")
+        if not self.order:
+            if self.head_shape:
+                remarks.append(
+                    f"The detector's output of {self.head_shape} is read as a YOLO's: "
+                    f"{order}."
+                )
+            if self.inferred_order in QUERIES:
+                remarks.append(f"The detector's output is read as a DETR's: {order}.")
         if self.ignores_masks:
             remarks.append(
                 "The detector's masks are left out: its boxes and scores are read."
             )
-        if self.is_order_ambiguous and self.inferred_order and is_order_inferred:
+        if not self.order and self.is_order_ambiguous and self.inferred_order:
             remarks.append(
                 "Scores and classes of the detector's boxes are told apart by their "
                 f"values: they are read as {order}."
@@ -404,19 +406,19 @@ class Detection(ClassTask):
     @property
     def _box_format(self) -> BoxFormat:
         """How the model's boxes are read: by the options, else as inferred."""
-        order = self._stated_class_count_order or self.inferred_order
+        order = self._stated_network_order or self.inferred_order
         # YOLO heads and DETR networks have centers and sizes
         default_form = "cxcywh" if order in CLASS_COUNT_ORDERS else "xyxy"
         unit = self.unit or self.inferred_unit or "pixels"
         return BoxFormat(self.boxes or default_form, unit, self.input_size)
 
     @property
-    def _stated_class_count_order(self) -> str:
-        """The option `order` in its normal form, with single blanks, if it is one of
-        `CLASS_COUNT_ORDERS`; else "".
+    def _stated_network_order(self) -> str:
+        """The option `order` with single blanks, if it names the output of a network
+        (`CLASS_COUNT_ORDERS`: a YOLO head, with or without a layout, or a DETR output);
+        else "".
 
-        These are a YOLO head, with or without a layout, and a DETR output. Other orders
-        name the components or columns of an output.
+        Other values of the option name the components or columns of an output.
         """
         if not self.order:
             return ""
@@ -460,6 +462,8 @@ class Detection(ClassTask):
     def loss(self, output: Sequence[Detections], truth: DetectionTruth) -> Tensor:
         """Compute by how much the best right box is below `confidence`, in log-odds.
 
+        Only boxes that survive suppression count.
+
         Returns:
             (N,), over 0 if the object is not found. If `seek` is `create`: by how much
             the best box where nothing is exceeds `confidence`.
@@ -477,7 +481,8 @@ class Detection(ClassTask):
     def score(self, output: Sequence[Detections], truth: DetectionTruth) -> Tensor:
         """Compute how near each output is to what is sought, (N,), in log-odds.
 
-        It is over 0 if the output is a success.
+        It is over 0 if the output is a success. Unlike for the loss, boxes count before
+        suppression, unless they make the output a success.
         """
         if self.minimise:
             return -self.loss(output, truth)
@@ -500,8 +505,9 @@ class Detection(ClassTask):
     ) -> Tensor:
         """Apply a function to the detections of each image, (N,).
 
-        The value is NaN if a number that counts is not finite, and -1 if the object is
-        out of view, unless boxes where nothing is are sought.
+        The value is NaN for detections that cannot be judged (`_is_broken`), and -1, a
+        right prediction, if the object is out of view, unless boxes where nothing is are
+        sought.
 
         Args:
             output: output of N images.
@@ -511,7 +517,7 @@ class Detection(ClassTask):
         is_out_of_view = truth.box is None and self.seek != "create"
         values = []
         for detections in self._read_boxes(output):
-            # Products keep values without a derivative attached to the graph.
+            # Constants are computed from the scores to be attached to the graph.
             if self._is_broken(detections):
                 value = detections["scores"].sum() * math.nan
             elif is_out_of_view:
@@ -525,7 +531,7 @@ class Detection(ClassTask):
         """Compute by how much the best right box at the object is below
         `confidence`.
         """
-        right_score = self._scores_of_classes(detections, truth.labels)
+        right_score = self._find_best_scores(detections, truth.labels)
         best_score = max_or_zero(right_score, self._is_at_object(detections, truth))
         return self._min_log_odds - compute_log_odds(best_score)
 
@@ -533,7 +539,7 @@ class Detection(ClassTask):
         """Compute the lesser of two: that the object vanishes, and that a box at it has
         a wrong class.
         """
-        wrong_score = self._scores_of_rivals(self._suppress(detections), truth.labels)
+        wrong_score = self._find_rival_scores(self._suppress(detections), truth.labels)
         best_score = max_or_zero(wrong_score, self._is_at_object(detections, truth))
         wrong_excess = compute_log_odds(best_score) - self._min_log_odds
         return torch.minimum(self._score_vanish(detections, truth), wrong_excess)
@@ -546,7 +552,7 @@ class Detection(ClassTask):
         scaled so that a small step from `iou` is as long as one in log-odds. The second
         is by how much the best score of a right class exceeds `confidence`.
         """
-        scores = self._scores_of_classes(detections, truth.labels)
+        scores = self._find_best_scores(detections, truth.labels)
         score_excess = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
         best_overlap = max_or_zero(
             compute_iou_with_truth(detections, truth), scores >= self.confidence
@@ -557,7 +563,7 @@ class Detection(ClassTask):
 
     def _score_create(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Compute by how much the best box where nothing is exceeds `confidence`."""
-        phantom_score = self._phantom_scores(self._suppress(detections), truth)
+        phantom_score = self._find_phantom_scores(self._suppress(detections), truth)
         return compute_log_odds(max_or_zero(phantom_score)) - self._min_log_odds
 
     def _is_at_object(self, detections: Detections, truth: DetectionTruth) -> Tensor:
@@ -572,7 +578,11 @@ class Detection(ClassTask):
     # ---- boxes and scores of one image ----
 
     def _resolve_labels(self, output: Sequence[Detections]) -> list[Detections]:
-        """Return an output with scores and classes identified, boxes as they came."""
+        """Return an output with scores and classes identified; boxes stay in its format.
+
+        Raises:
+            InputError: the values do not show which numbers are scores.
+        """
         n_classes = len(self.labels) or None
         try:
             return [
@@ -591,29 +601,33 @@ class Detection(ClassTask):
         """
         images = list[Detections]()
         box_format = self._box_format
-        nothing_classes = torch.tensor(self.nothing_classes, dtype=torch.long)
         for detections in self._resolve_labels(output):
             boxes = box_format.to_fractions(detections["boxes"])
-            scores = detections["scores"]
-            if "labels" in detections:
-                is_nothing = torch.isin(
-                    detections["labels"], nothing_classes.to(scores.device)
-                )
-                scores = scores.masked_fill(is_nothing, 0.0)
-            elif len(nothing_classes):
-                scores = scores.index_fill(1, nothing_classes.to(scores.device), 0.0)
+            scores = self._clear_nothing_classes(detections)
             resolved = {**detections, "boxes": boxes, "scores": scores}
             is_finite = boxes.detach().isfinite().all(dim=1)
             is_weak = (get_box_numbers(resolved) < self._min_score).all(dim=1)
-            counts = is_finite | ~is_weak
-            if not bool(counts.all()):
-                # "blank" is a single number; everything else has a row for each box
+            stays = is_finite | ~is_weak
+            if not bool(stays.all()):
                 resolved = {
-                    name: values if name == "blank" else values[counts]
+                    # a count, while everything else has a row for each box
+                    name: values if name == "n_nan_rows" else values[stays]
                     for name, values in resolved.items()
                 }
             images.append(resolved)
         return images
+
+    def _clear_nothing_classes(self, detections: Detections) -> Tensor:
+        """Return the scores of an image, with 0 for classes that stand for nothing."""
+        scores = detections["scores"]
+        classes = torch.tensor(self.nothing_classes, dtype=torch.long)
+        classes = classes.to(scores.device)
+        if "labels" in detections:
+            is_nothing = torch.isin(detections["labels"], classes)
+            return scores.masked_fill(is_nothing, 0.0)
+        if len(classes):
+            return scores.index_fill(1, classes, 0.0)
+        return scores
 
     @property
     def _min_score(self) -> float:
@@ -623,10 +637,10 @@ class Detection(ClassTask):
     def _is_broken(self, detections: Detections) -> bool:
         """Return whether the detections of an image cannot be judged.
 
-        A score or a box that counts is not finite; or all rows are NaN ("blank" counts
-        such rows), although the model does not fill its outputs with them.
+        Then a score or a box is not finite; or all rows of the output were NaN and were
+        removed, although the model does not fill its outputs up with such rows.
         """
-        has_only_nan_rows = "blank" in detections and not len(detections["boxes"])
+        has_only_nan_rows = "n_nan_rows" in detections and not len(detections["boxes"])
         if has_only_nan_rows and not self.fills_with_nan:
             return True
         return not all(
@@ -655,10 +669,9 @@ class Detection(ClassTask):
 
     @staticmethod
     def _are_on(boxes: Tensor, true_box: Tensor) -> Tensor:
-        """Return which boxes (D, 4) are on a thing with a true box (4,), however
-        loosely: (D,).
+        """Return which boxes (D, 4) are on a thing, however loosely, (D,) bool.
 
-        They overlap it a little, or lie mostly inside of it.
+        They overlap its true box (4,) a little, or lie mostly inside of it.
         """
         overlaps = compute_iou(boxes, true_box) >= MIN_OVERLAP
         lies_inside = compute_fraction_inside(boxes, true_box) >= MIN_FRACTION_INSIDE
@@ -669,8 +682,7 @@ class Detection(ClassTask):
     ) -> Tensor:
         """Return which boxes (D,) are on the object, however loosely.
 
-        A box that overlaps another thing of the right classes more than the object does
-        not count.
+        A box does not count if it overlaps another thing of the right classes more.
         """
         boxes = detections["boxes"]
         true_box = truth.box_fractions
@@ -683,8 +695,8 @@ class Detection(ClassTask):
         return is_on_object
 
     def _is_on_nothing(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Which boxes are on no thing of the right classes, the object included, (D,)
-        bool.
+        """Return which boxes (D,) are neither on the object nor on another thing of the
+        right classes.
         """
         boxes = detections["boxes"]
         true_boxes = list(truth.others)
@@ -696,7 +708,9 @@ class Detection(ClassTask):
             is_on_nothing = is_on_nothing & ~is_on_thing
         return is_on_nothing
 
-    def _phantom_scores(self, detections: Detections, truth: DetectionTruth) -> Tensor:
+    def _find_phantom_scores(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> Tensor:
         """Return the score (D,) of each box as a phantom: a box where nothing is.
 
         It is 0 if the box is none. A box of a right class is a phantom if it is on no
@@ -704,28 +718,29 @@ class Detection(ClassTask):
         elsewhere than the object. Only scores of target classes count, if there is a
         target.
         """
-        if self.target is not None:
+        if self.target is None:
+            right_score = self._find_best_scores(detections, truth.labels)
+            wrong_score = self._find_rival_scores(detections, truth.labels)
+        else:
             right_classes = set(truth.labels)
             right_targets = tuple(sorted(set(self.target) & right_classes))
             wrong_targets = tuple(sorted(set(self.target) - right_classes))
-            right_score = self._scores_of_classes(detections, right_targets)
-            wrong_score = self._scores_of_classes(detections, wrong_targets)
-        else:
-            right_score = self._scores_of_classes(detections, truth.labels)
-            wrong_score = self._scores_of_rivals(detections, truth.labels)
-        right_phantom = torch.where(
-            self._is_on_nothing(detections, truth), right_score, 0.0
+            right_score = self._find_best_scores(detections, right_targets)
+            wrong_score = self._find_best_scores(detections, wrong_targets)
+        is_on_nothing = self._is_on_nothing(detections, truth)
+        is_elsewhere = self._is_elsewhere(detections, truth)
+        return torch.maximum(
+            torch.where(is_on_nothing, right_score, 0.0),
+            torch.where(is_elsewhere, wrong_score, 0.0),
         )
-        wrong_phantom = torch.where(
-            self._is_elsewhere(detections, truth), wrong_score, 0.0
-        )
-        return torch.maximum(right_phantom, wrong_phantom)
 
     @staticmethod
-    def _scores_of_classes(detections: Detections, classes: Labels) -> Tensor:
-        """Return the largest score of one of the classes for each box, (D,)."""
+    def _find_best_scores(detections: Detections, classes: Labels) -> Tensor:
+        """Return the best score of each box for one of the classes, (D,); 0 for a box
+        that has none.
+        """
         scores = detections["scores"]
-        if "labels" in detections:
+        if "labels" in detections:  # each box has the score of its own class only
             class_ids = torch.tensor(classes, device=scores.device)
             return scores * torch.isin(detections["labels"], class_ids)
         if len(scores) and classes:
@@ -733,18 +748,18 @@ class Detection(ClassTask):
         # The product keeps the zeros attached to the graph.
         return scores.sum(dim=1) * 0.0
 
-    def _scores_of_rivals(self, detections: Detections, classes: Labels) -> Tensor:
-        """Return the largest score of a target for each box, (D,); without a target, of
-        a class other than these.
+    def _find_rival_scores(self, detections: Detections, classes: Labels) -> Tensor:
+        """Return the best score of each box for a target, (D,); without a target, for a
+        class other than `classes`.
         """
         if self.target is not None:
-            return self._scores_of_classes(detections, self.target)
+            return self._find_best_scores(detections, self.target)
         if "labels" in detections:
-            # a single score for each box: it remains if the class is another, else 0
-            return detections["scores"] - self._scores_of_classes(detections, classes)
+            # the score of the box's own class, or 0 if that is one of `classes`
+            return detections["scores"] - self._find_best_scores(detections, classes)
         n_classes = detections["scores"].shape[1]
         rivals = tuple(sorted(set(range(n_classes)) - set(classes)))
-        return self._scores_of_classes(detections, rivals)
+        return self._find_best_scores(detections, rivals)
 
     # ---- predictions ----
 
@@ -779,7 +794,7 @@ class Detection(ClassTask):
             match = self._match_object(self._suppress(detections), truth)
             payload: dict[str, JsonValue] = {
                 "box": None if truth.box is None else list(truth.box),
-                "found": self._boxes_in_pixels(detections, truth),
+                "found": self._list_stored_boxes(detections, truth),
             }
             if match.outcome is not None:
                 payload[OUTCOME] = match.outcome.value
@@ -788,7 +803,7 @@ class Detection(ClassTask):
             results.append((self._describe_match(match, truth), payload))
         return results
 
-    def _boxes_in_pixels(
+    def _list_stored_boxes(
         self, detections: Detections, truth: DetectionTruth
     ) -> list[JsonValue]:
         """Return the best boxes of an image as they are stored in rows."""
@@ -819,7 +834,7 @@ class Detection(ClassTask):
         Where phantoms (boxes where nothing is) are sought, they come before all others.
         """
         if self.seek == "create" and float(self._score_create(detections, truth)) > 0.0:
-            phantom_score = self._phantom_scores(detections, truth)
+            phantom_score = self._find_phantom_scores(detections, truth)
             is_phantom = phantom_score > 0.0
             return self._match_best_box(
                 Outcome.PHANTOM, detections, phantom_score, is_phantom, truth
@@ -833,10 +848,11 @@ class Detection(ClassTask):
     ) -> ObjectMatch:
         """Decide what is detected in an image in which the object is out of view.
 
-        It is a phantom if a box of a right class on nothing reaches `confidence`; no
-        outcome otherwise, or if phantoms are sought (and were looked for already).
+        It is a phantom if a box of a right class where nothing is reaches `confidence`.
+        Otherwise there is no outcome. There is none either if phantoms are sought:
+        `_match_object` has looked for them already.
         """
-        right_score = self._scores_of_classes(detections, truth.labels)
+        right_score = self._find_best_scores(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)
         best_phantom = float(max_or_zero(right_score, is_on_nothing))
         if self.seek != "create" and best_phantom >= self.confidence:
@@ -853,11 +869,11 @@ class Detection(ClassTask):
         The outcomes are tried in order, the best for the model first; the first one
         whose best box reaches `confidence` is returned with that box.
         """
-        right_score = self._scores_of_classes(detections, truth.labels)
+        right_score = self._find_best_scores(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)
         is_at_object = self._is_at_object(detections, truth)
         is_loose = self._is_loosely_on_object(detections, truth) & ~is_at_object
-        wrong_score = self._scores_of_rivals(detections, truth.labels)
+        wrong_score = self._find_rival_scores(detections, truth.labels)
         candidates = (
             (Outcome.FOUND, right_score, is_at_object),
             (Outcome.WRONG_CLASS, wrong_score, is_at_object),
@@ -873,7 +889,7 @@ class Detection(ClassTask):
         return ObjectMatch(
             Outcome.MISSED,
             truth.labels[0],
-            best_score if math.isfinite(best_score) else None,
+            best_score if math.isfinite(best_score) else None,  # JSON has no NaN
         )
 
     @staticmethod
@@ -898,7 +914,7 @@ class Detection(ClassTask):
         score = float(scores[row])
         if "labels" in detections:
             class_id = int(detections["labels"][row])
-        else:  # the class that has this score
+        else:  # the first class that has this score
             class_id = int((detections["scores"][row] == score).nonzero()[0])
         iou = None
         if truth.box is not None:
@@ -929,11 +945,11 @@ class Detection(ClassTask):
             true_name = " or ".join(self.get_class_names(truth.labels))
             true_marks.append(Mark(true_name, True, box=truth.box))
         return [
-            [*true_marks, *self._predicted_marks(detections, truth)]
+            [*true_marks, *self._make_predicted_marks(detections, truth)]
             for detections in self._read_boxes(output)
         ]
 
-    def _predicted_marks(
+    def _make_predicted_marks(
         self, detections: Detections, truth: DetectionTruth
     ) -> list[Mark]:
         """Return a mark for every box of an image with a score of `confidence`."""
@@ -946,6 +962,6 @@ class Detection(ClassTask):
         ):
             box = (x0 * width, y0 * height, x1 * width, y1 * height)
             marks.append(
-                Mark(f"{self.get_class_name(label)} {score:.2f}", False, box=box)
+                Mark(f"{self.get_class_name(label)} {score:.2f}", true=False, box=box)
             )
         return marks

@@ -8,19 +8,20 @@ The detections of one image are a mapping with
 
 Instead of these it may have, as long as the outputs leave it open:
 
-* `either` (D, 2) for scores and labels: two numbers per box, of which types, names and
-  shapes do not show which is the score and which the class;
-* `raw` (A, B) for everything: one tensor that only the number of classes explains, with
+* `score_or_label` (D, 2) for scores and labels: two numbers per box, of which types,
+  names and shapes do not show which is the score and which the class;
+* `grid` (A, B) for everything: one tensor that only the number of classes explains, with
   `map_channels` (K,), the channels of feature maps that came with it;
 * `logits` (D, K) for scores: only the number of classes explains them, see `QUERIES`.
 
-Rows of padding are removed. `blank` (1,) counts those that were NaN throughout, if any.
+Rows of padding are removed. `n_nan_rows` (1,) counts those that were NaN throughout, if
+there were any.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -33,16 +34,19 @@ from advsearch.tasks.boxes import Detections, are_counted, are_invalid, format_o
 
 EXPECTED = (
     "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, "
-    "D) and scores (N, D); rows "
-    "(N, D, 6) of a box, a score and a class; one tensor (N, 4 + classes, D) or (N, D, "
-    "5 + classes) as YOLO's; or for "
-    "each picture a mapping with boxes (D, 4), labels (D,) and scores (D,)"
+    "D) and scores (N, D); rows (N, D, 6) of a box, a score and a class; one tensor "
+    "(N, 4 + classes, D) or (N, D, 5 + classes) as YOLO's; or for each picture a "
+    "mapping with boxes (D, 4), labels (D,) and scores (D,)"
 )
 
 # What the two numbers beside a box may be.
-ORDERS = ("boxes scores labels", "boxes labels scores")
+SCORES_FIRST = "boxes scores labels"
+LABELS_FIRST = "boxes labels scores"
+ORDERS = (SCORES_FIRST, LABELS_FIRST)
 
-QUERIES = ("boxes logits", "boxes logits nothing")
+SIGMOID_QUERIES = "boxes logits"
+SOFTMAX_QUERIES = "boxes logits nothing"
+QUERIES = (SIGMOID_QUERIES, SOFTMAX_QUERIES)
 """What DETR networks return: logits of independent classes, for a sigmoid (Zhu et al.
 2021, section 4), or logits of exclusive classes, for a softmax, of which the last
 means no object (Carion et al. 2020, section 3.1).
@@ -51,10 +55,14 @@ means no object (Carion et al. 2020, section 3.1).
 # Names of the logits in an output whose boxes are named `pred_boxes`.
 QUERY_LOGITS = ("pred_logits", "logits")
 
-HEADS = {"boxes scores": 4, "boxes objectness scores": 5}
+PLAIN_HEAD = "boxes scores"
+OBJECTNESS_HEAD = "boxes objectness scores"
+HEADS = {PLAIN_HEAD: 4, OBJECTNESS_HEAD: 5}
 """Channels of a YOLO head, and the index of the first score among them."""
 
-LAYOUTS = ("channels first", "channels last")
+CHANNELS_FIRST = "channels first"
+CHANNELS_LAST = "channels last"
+LAYOUTS = (CHANNELS_FIRST, CHANNELS_LAST)
 HEAD_ORDERS = frozenset(
     [*HEADS, *(f"{head} {layout}" for head in HEADS for layout in LAYOUTS)]
 )
@@ -62,7 +70,7 @@ CLASS_COUNT_ORDERS = HEAD_ORDERS | frozenset(QUERIES)
 """Orders that the number of classes explains; their boxes are center, width, height."""
 
 TOLERANCE = 1e-3  # how far outside [0, 1] a score may lie
-_WITH_ANGLE = f"boxes objectness scores {LAYOUTS[0]}"
+_WITH_ANGLE = f"{OBJECTNESS_HEAD} {CHANNELS_FIRST}"
 """Order that an oriented-box (OBB) head looks like: an angle after the scores makes as
 many channels as objectness before them.
 """
@@ -113,15 +121,18 @@ ORDER_ADVICE = (
 )
 """Advice of messages if scores and classes cannot be distinguished."""
 
-NO_DETECTIONS: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
+NO_DETECTIONS: Detections = {
+    "boxes": torch.zeros(0, 4),
+    "score_or_label": torch.zeros(0, 2),
+}
 
 
 def parse_order(text: str) -> tuple[str, ...]:
-    """Parse the names in an order and check them.
+    """Split the option `order` into its names and check them.
 
-    They are boxes, scores and labels, and optionally "batch" for the index of the
-    image; or the words of one of `HEADS`, optionally with a layout; or those of one of
-    `QUERIES`.
+    They are boxes, scores and labels in any order, and optionally "batch" for the
+    index of the image; or the words of one of `HEADS`, optionally with one of
+    `LAYOUTS`; or those of one of `QUERIES`.
 
     Raises:
         ValueError: it is none of these.
@@ -132,9 +143,8 @@ def parse_order(text: str) -> tuple[str, ...]:
     if sorted(names) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
         raise ValueError(
             f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', "
-            "of a YOLO's head "
-            f"{' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or '{LAYOUTS[1]}' "
-            "after it, or of a DETR's "
+            f"of a YOLO's head {' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or "
+            f"'{LAYOUTS[1]}' after it, or of a DETR's "
             f"{' or '.join(map(repr, QUERIES))}, got {text!r}"
         )
     return names
@@ -167,22 +177,23 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
         and predictions.shape[2] != 4  # boxes alone
     )
     has_mask_rows = is_batch and _has_mask_rows(predictions, channels)
-    # One tensor (N, A, B) is a YOLO grid, unless its rows are six numbers (a box, a
-    # score and a class), with or without mask coefficients.
+    # The rows of a tensor (N, D, 6) are a box, a score and a class.
     has_six_columns = is_batch and predictions.shape[2] == 6
     is_rows = bool(order_names) or has_mask_rows or has_six_columns
     if is_batch and (order in HEAD_ORDERS or not is_rows):
         return [
-            {"raw": grid.float(), "map_channels": map_channels} for grid in predictions
+            {"grid": grid.float(), "map_channels": map_channels} for grid in predictions
         ]
     if has_mask_rows:
         rows = read_detections(predictions[..., :6], count, order)
         return [{**detections, "map_channels": map_channels} for detections in rows]
+    # the words of a YOLO head, whose output would be a grid
     if "objectness" in order_names or "channels" in order_names:
-        # the user stated a YOLO head, and this is no grid
         raise ValueError(EXPECTED)
-    images = _split_images(predictions, count, order_names)
-    return list(map(_checked_detections, images))
+    return [
+        _check_detections(components)
+        for components in _split_images(predictions, count, order_names)
+    ]
 
 
 def _check_no_head_maps(returned: Any) -> None:
@@ -252,11 +263,12 @@ def _split_images(
             else _find_components(output, order_names)
             for output in returned
         ]
+    # rows of all images: a box, two numbers, and the index of the image
     if isinstance(returned, Tensor) and returned.ndim == 2 and returned.shape[1] == 7:
         return _split_batch_rows(returned, count, order_names)
     batch = _find_components(returned, order_names)
-    # The network has dropped the batch dimension.
     if batch["boxes"].ndim == 2 and count == 1:
+        # The network has dropped the batch dimension.
         batch = {name: component[None] for name, component in batch.items()}
     if batch["boxes"].ndim != 3 or any(len(x) != count for x in batch.values()):
         raise ValueError(EXPECTED)
@@ -285,14 +297,14 @@ def _split_batch_rows(
     names_before: Sequence[str] = ()
     if "batch" in order_names:
         names_before = order_names[: order_names.index("batch")]
-    # each name before takes one column, but boxes take four
+    # each name takes one column, but boxes take four
     batch_column = len(names_before)
     if "boxes" in names_before:
         batch_column += 4 - 1
     image_index = rows.detach()[:, batch_column]
     is_index = (
         (image_index == image_index.round())
-        & (image_index >= -1)  # of padding, which no image gets below
+        & (image_index >= -1)  # -1 is padding
         & (image_index < count)
     )
     if not bool(is_index.all()):
@@ -310,16 +322,11 @@ def _split_batch_rows(
 def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
     """Find the boxes and logits of a DETR output; None if it is no such output.
 
-    It is one if the order is one of `QUERIES`, or by its names.
+    A sequence of tensors is one if `order` says so (one of `QUERIES`), a mapping or an
+    object by the names of its components.
     """
     if order in QUERIES and isinstance(returned, (list, tuple)):
-        tensors = [value for value in returned if isinstance(value, Tensor)]
-        # Boxes are fractions, which logits are not.
-        boxes = next(filter(_are_fraction_boxes, tensors), None)
-        if boxes is None:
-            return None
-        logits = next((tensor for tensor in tensors if tensor is not boxes), None)
-        return None if logits is None else (boxes, logits)
+        return _find_query_tensors(returned)
     if order not in ("", *QUERIES):  # the user stated another form
         return None
     # items of a mapping, or attributes of an object
@@ -334,23 +341,36 @@ def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
     return None
 
 
+def _find_query_tensors(returned: Sequence[Any]) -> tuple[Tensor, Tensor] | None:
+    """Find the boxes and logits of a DETR output among values without names; None if
+    one is missing.
+    """
+    tensors = [value for value in returned if isinstance(value, Tensor)]
+    # Boxes are fractions, which logits are not.
+    boxes = next(filter(_are_fraction_boxes, tensors), None)
+    logits = next((tensor for tensor in tensors if tensor is not boxes), None)
+    if boxes is None or logits is None:
+        return None
+    return boxes, logits
+
+
 def _are_fraction_boxes(tensor: Tensor) -> bool:
     """Whether a tensor may hold boxes (..., 4) in fractions of the image."""
     return tensor.shape[-1] == 4 and bool(((tensor >= 0.0) & (tensor <= 1.0)).all())
 
 
 def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
-    """Return the predictions of a YOLO output and the channels of its feature maps.
+    """Split a YOLO output in training form into its predictions and feature maps.
 
-    In training form the predictions are the first of a tuple; feature maps (N, K, h, w)
-    and prototypes of masks follow, also in lists and mappings. Any other output is
-    returned as it is, with no channels.
+    In that form the predictions are the first of a tuple; feature maps (N, K, h, w)
+    and prototypes of masks follow, also in lists and mappings.
+
+    Returns:
+        The predictions, and the numbers of channels K of the maps; any other output as
+        it is, and no channels.
     """
-    if (
-        not isinstance(returned, (list, tuple))
-        or not returned
-        or not isinstance(returned[0], Tensor)
-    ):
+    is_sequence = isinstance(returned, (list, tuple)) and len(returned) > 0
+    if not is_sequence or not isinstance(returned[0], Tensor):
         return returned, set()
     predictions = returned[0]
     rest = returned[1:]
@@ -367,11 +387,11 @@ def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
 
 
 def _is_image_output(value: Any) -> bool:
-    """Whether an element of an output is that of one image, and not boxes or scores of
-    all images; None stands for an image without detections.
+    """Return whether a value may be the output for one image, and not the boxes or the
+    scores of all images; None stands for an image without detections.
     """
     if isinstance(value, Tensor):
-        return value.ndim == 2 and value.shape[1] == 6
+        return value.ndim == 2 and value.shape[1] == 6  # a box, a score and a class
     return (
         value is None
         or isinstance(value, (Mapping, list, tuple))
@@ -388,8 +408,8 @@ def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Ten
         order_names: the order that the user stated, or none.
 
     Returns:
-        "boxes" and "scores", perhaps with "labels"; or "boxes" and "either", the two
-        numbers of each box of which it is unknown which one is the score.
+        "boxes" and "scores", perhaps with "labels"; or "boxes" and "score_or_label",
+        two numbers of each box of which it is unknown which one is the score.
 
     Raises:
         ValueError: it is none of the forms of `EXPECTED`.
@@ -401,30 +421,40 @@ def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Ten
     named = _find_named(returned)
     if named is not None and "boxes" in named and "scores" in named:
         return named
-    values = returned.values() if isinstance(returned, Mapping) else returned
-    if not isinstance(values, Iterable):
-        raise ValueError(EXPECTED)
-    tensors = list(values)
-    if isinstance(returned, Mapping):
-        tensors = [value for value in tensors if isinstance(value, Tensor)]
-    if not all(isinstance(value, Tensor) for value in tensors):
-        raise ValueError(EXPECTED)
+    # without such names: by the order that is stated, or else by their shapes
+    tensors = _list_tensors_in_order(returned)
     if order_names and len(tensors) == len(order_names):
         components = dict(zip(order_names, tensors, strict=True))
         shape = components["boxes"].shape[:-1]
         return {
             name: _squeeze_last(tensor, shape) for name, tensor in components.items()
         }
-    return _components_by_shape(tensors)
+    return _identify_by_shape(tensors)
+
+
+def _list_tensors_in_order(returned: Any) -> list[Tensor]:
+    """Return the tensors of a sequence, or those among the values of a mapping.
+
+    Raises:
+        ValueError: it is neither, or the sequence has something else in it.
+    """
+    if isinstance(returned, Mapping):
+        return [value for value in returned.values() if isinstance(value, Tensor)]
+    if not isinstance(returned, Iterable):
+        raise ValueError(EXPECTED)
+    tensors = list(returned)
+    if not all(isinstance(value, Tensor) for value in tensors):
+        raise ValueError(EXPECTED)
+    return tensors
 
 
 def _split_columns(rows: Tensor, order_names: Sequence[str]) -> dict[str, Tensor]:
     """Split the columns of rows (..., 6): four of a box, and two single numbers.
 
-    Without an order these two are "either", (..., 2).
+    Without an order these two are "score_or_label", (..., 2).
     """
     if not order_names:
-        return {"boxes": rows[..., :4], "either": rows[..., 4:]}
+        return {"boxes": rows[..., :4], "score_or_label": rows[..., 4:]}
     widths = [4 if name == "boxes" else 1 for name in order_names]
     return {
         name: columns if name == "boxes" else columns[..., 0]
@@ -438,10 +468,14 @@ def _squeeze_last(tensor: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 def _find_named(returned: Any) -> dict[str, Tensor] | None:
-    """Find the components of a mapping or an object by their names: those of `NAMES`,
-    or else the only one with one of `WORDS` in it.
+    """Find the components of a mapping or an object by their names.
 
-    None if it is neither a mapping nor an object with boxes.
+    A component has one of its `NAMES`, or else is the only tensor with one of its
+    `WORDS` in the name.
+
+    Returns:
+        Those of "boxes", "scores" and "labels" that are found; None if it is neither a
+        mapping nor an object with boxes.
     """
     tensors = _list_named_tensors(returned)
     if tensors is None:
@@ -455,7 +489,7 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
         ]
         if exact or len(similar) == 1:
             match = (exact or similar)[0]
-            # taken out, so that no tensor is two components
+            # taken out, so that no tensor is found for two components
             components[component] = tensors.pop(match)
     return components
 
@@ -482,60 +516,62 @@ def _list_named_tensors(returned: Any) -> dict[str, Tensor] | None:
     }
 
 
-def _components_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
+def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
     """Identify the components of a tuple by shape and type.
 
-    Boxes have four columns, and labels an integer type. Two other components without an
-    integer type are "either", (..., 2).
+    Boxes have four columns, and labels an integer type. If each box has two numbers
+    and none of them is an integer, they are "score_or_label", (..., 2).
 
     Raises:
         ValueError: shapes and types do not identify them.
     """
-    boxes = _boxes_by_shape(tensors)
+    boxes = _find_boxes_by_shape(tensors)
     shape = boxes.shape[:-1]
-    rest = [
+    others = [
         tensor
         for tensor in tensors
         if tensor is not boxes and tensor.shape[: len(shape)] == shape
     ]
-    if len(rest) == 1 and rest[0].ndim == boxes.ndim:  # a score of every class
-        return {"boxes": boxes, "scores": rest[0]}
+    if len(others) == 1 and others[0].ndim == boxes.ndim:  # a score of every class
+        return {"boxes": boxes, "scores": others[0]}
     # otherwise two numbers for each box, a score and a label
-    numbers = [_squeeze_last(tensor, shape) for tensor in rest]
+    numbers = [_squeeze_last(tensor, shape) for tensor in others]
     integers = [tensor for tensor in numbers if not tensor.is_floating_point()]
-    if (
-        len(numbers) != 2
-        or len(integers) == 2
-        or any(tensor.shape != shape for tensor in numbers)
-    ):
+    has_other_shape = any(tensor.shape != shape for tensor in numbers)
+    if len(numbers) != 2 or len(integers) == 2 or has_other_shape:
         raise ValueError(EXPECTED)
     if integers:
-        labels = integers[0]
-        scores = numbers[0] if numbers[1] is labels else numbers[1]
+        (labels,) = integers
+        (scores,) = (tensor for tensor in numbers if tensor is not labels)
         return {"boxes": boxes, "scores": scores, "labels": labels}
     return {
         "boxes": boxes,
-        "either": torch.stack([tensor.to(boxes.dtype) for tensor in numbers], dim=-1),
+        "score_or_label": torch.stack(
+            [tensor.to(boxes.dtype) for tensor in numbers], dim=-1
+        ),
     }
 
 
-def _boxes_by_shape(tensors: Sequence[Tensor]) -> Tensor:
-    """Return the tensor that holds boxes; ValueError if there is none."""
-    candidates = [x for x in tensors if x.ndim > 1 and x.shape[-1] == 4]
-    max_ndim = max((x.ndim for x in candidates), default=0)
-    candidates = [x for x in candidates if x.ndim == max_ndim]
+def _find_boxes_by_shape(tensors: Sequence[Tensor]) -> Tensor:
+    """Return which of several tensors holds the boxes: it has four columns.
+
+    Of several it is the only one with values over 1, since scores of four classes have
+    none; else the first.
+
+    Raises:
+        ValueError: there are no boxes, or nothing else.
+    """
+    with_four_columns = [x for x in tensors if x.ndim > 1 and x.shape[-1] == 4]
+    max_ndim = max((x.ndim for x in with_four_columns), default=0)
+    candidates = [x for x in with_four_columns if x.ndim == max_ndim]
     if not candidates or len(tensors) < 2:
         raise ValueError(EXPECTED)
-    # Values over 1 are coordinates, and no scores of four classes.
     in_pixels = [x for x in candidates if bool((x.detach() > 1.0 + TOLERANCE).any())]
     return in_pixels[0] if len(in_pixels) == 1 else candidates[0]
 
 
-def _checked_detections(components: Mapping[str, Tensor]) -> Detections:
-    """Check the detections of one image and remove rows of padding.
-
-    Such a row has a class or score of -1, or a box of four equal numbers or NaN and no
-    score.
+def _check_detections(components: Mapping[str, Tensor]) -> Detections:
+    """Return the detections of one image, checked and without rows of padding.
 
     Raises:
         ValueError: shapes, classes or scores are not those of detections.
@@ -543,8 +579,10 @@ def _checked_detections(components: Mapping[str, Tensor]) -> Detections:
     boxes = components["boxes"]
     if boxes.numel() == 0:
         boxes = boxes.reshape(-1, 4)
-    # "blank" is a count; everything else has a row for each box
-    row_tensors = [tensor for name, tensor in components.items() if name != "blank"]
+    # everything has a row for each box, but for the count of rows that were removed
+    row_tensors = [
+        tensor for name, tensor in components.items() if name != "n_nan_rows"
+    ]
     if (
         boxes.ndim != 2
         or boxes.shape[1] != 4
@@ -552,39 +590,58 @@ def _checked_detections(components: Mapping[str, Tensor]) -> Detections:
     ):
         raise ValueError(EXPECTED)
     boxes = boxes.float()
-    if "either" in components:
-        return _remove_padded_pairs(boxes, components["either"].float())
+    if "score_or_label" in components:
+        return _remove_padded_pairs(boxes, components["score_or_label"].float())
 
-    scores, labels = _checked_scores(components)
+    scores, labels = _check_scores(components)
+    # (D, K), with a single score for each box if there are labels
     values = scores.detach() if labels is None else scores.detach()[:, None]
-    has_score = (values > 0.0).any(dim=1)
-    is_marked_as_padding = (values == -1.0).all(dim=1)
-    is_padding = (are_invalid(boxes.detach()) & ~has_score) | is_marked_as_padding
-    if labels is not None:
-        is_padding = is_padding | (labels < 0)
+    is_padding = _find_padding(boxes, values, labels)
     _check_probabilities(values[~is_padding], has_labels=labels is not None)
     checked = {"boxes": boxes, "scores": scores}
     if labels is not None:
         checked["labels"] = labels.long()
-    detections = dict(_without_padding(checked, is_padding, values))
-    if "blank" in components:
-        detections["blank"] = components["blank"]
+    detections = dict(_remove_padding(checked, is_padding, values))
+    if "n_nan_rows" in components:  # removed already
+        detections["n_nan_rows"] = components["n_nan_rows"]
     return detections
 
 
-def _remove_padded_pairs(boxes: Tensor, either: Tensor) -> Detections:
-    """Return boxes (D, 4) with two numbers each (D, 2), of which it is open which one
-    is the score, without rows of padding.
+def _find_padding(boxes: Tensor, scores: Tensor, labels: Tensor | None) -> Tensor:
+    """Return which rows of detections are padding, (D,) bool.
 
-    Such a row has an invalid box, and one of its numbers is not over 0.
+    They have a score or a class of -1, or an invalid box and no score over 0.
+
+    Args:
+        boxes: (D, 4).
+        scores: (D, K), of every class or of the label.
+        labels: (D,); None if scores are of every class.
     """
-    numbers = either.detach()
+    has_score = (scores > 0.0).any(dim=1)
+    is_marked = (scores == -1.0).all(dim=1)
+    is_padding = (are_invalid(boxes.detach()) & ~has_score) | is_marked
+    if labels is not None:
+        is_padding = is_padding | (labels < 0)
+    return is_padding
+
+
+def _remove_padded_pairs(boxes: Tensor, pairs: Tensor) -> Detections:
+    """Return boxes with their pairs ("score_or_label"), without rows of padding.
+
+    Such a row has an invalid box, and one of its two numbers is not over 0.
+
+    Args:
+        boxes: (D, 4).
+        pairs: (D, 2), of which it is open which number is the score.
+    """
+    numbers = pairs.detach()
     are_positive = (numbers > 0.0).all(dim=1)
     is_padding = are_invalid(boxes.detach()) & ~are_positive
-    return _without_padding({"boxes": boxes, "either": either}, is_padding, numbers)
+    components = {"boxes": boxes, "score_or_label": pairs}
+    return _remove_padding(components, is_padding, numbers)
 
 
-def _checked_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | None]:
+def _check_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | None]:
     """Return the scores of detections and their labels, None without labels.
 
     The score of a label that is NaN becomes NaN. Raises ValueError if the shapes do not
@@ -608,7 +665,11 @@ def _checked_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | 
 
 
 def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
-    """Raise ValueError if a finite value is outside [0, 1]."""
+    """Raise ValueError if a finite value is outside [0, 1].
+
+    Without labels the values may be logits of a DETR: then the message says how to
+    state that.
+    """
     is_too_low = values < -TOLERANCE
     is_too_high = (values > 1.0 + TOLERANCE) & values.isfinite()
     if not bool((is_too_low | is_too_high).any()):
@@ -623,10 +684,11 @@ def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
     )
 
 
-def _without_padding(
+def _remove_padding(
     components: dict[str, Tensor], is_padding: Tensor, values: Tensor
 ) -> Detections:
-    """Remove rows of padding, and count those that are all NaN as `blank`.
+    """Return components without rows of padding; `n_nan_rows` is added, the count of
+    those of them that are all NaN, if there are any.
 
     Args:
         components: components of one image, with a row for each box.
@@ -636,10 +698,10 @@ def _without_padding(
     if not bool(is_padding.any()):
         return components
     is_nan_box = components["boxes"].detach().isnan().all(dim=1)
-    is_blank = is_padding & values.isnan().all(dim=1) & is_nan_box
+    is_nan_row = is_padding & values.isnan().all(dim=1) & is_nan_box
     remaining = {name: tensor[~is_padding] for name, tensor in components.items()}
-    if bool(is_blank.any()):
-        remaining["blank"] = is_blank.sum()[None]
+    if bool(is_nan_row.any()):
+        remaining["n_nan_rows"] = is_nan_row.sum()[None]
     return remaining
 
 
@@ -652,7 +714,8 @@ def resolve_detections(
     """Return the detections of an image with boxes, scores and labels identified.
 
     Args:
-        detections: detections of one image, see the module.
+        detections: detections of one image, perhaps with a "grid", "logits" or
+            "score_or_label", of which the module's docstring says what they are.
         order: one of `ORDERS` or `QUERIES`, or of `HEADS` with a layout; "" to infer
             it from the values.
         classes: number of classes; None if it is unknown.
@@ -660,42 +723,42 @@ def resolve_detections(
     Raises:
         ValueError: the values do not show the order, or contradict it.
     """
-    if "raw" in detections or "logits" in detections:
+    if "grid" in detections or "logits" in detections:
         if classes is None:
             raise ValueError(EXPECTED)
         order = order or infer_order([detections], classes)
-        return _checked_detections(_split_by_class_count(detections, classes, order))
-    if "either" in detections:
+        return _check_detections(_split_by_class_count(detections, classes, order))
+    if "score_or_label" in detections:
         order = order or infer_order([detections], classes)
         return _resolve_pairs(detections, order)
+    # identified already
     return {name: value for name, value in detections.items() if name != "map_channels"}
 
 
 def _split_by_class_count(
     detections: Detections, classes: int, order: str
 ) -> dict[str, Tensor]:
-    """Return boxes (D, 4) and scores (D, C) of a YOLO grid ("raw") or of DETR logits.
+    """Return boxes (D, 4) and scores (D, C) of a YOLO grid ("grid") or of DETR logits.
 
     Args:
         detections: detections of one image.
         classes: number of classes, C.
-        order: order of the grid one of `HEADS` with a layout, of logits one of
-            `QUERIES`.
+        order: one of `HEADS` with a layout for a grid, one of `QUERIES` for logits.
     """
-    if "raw" in detections:
-        boxes, scores = split_grid(detections["raw"], classes, order)
+    if "grid" in detections:
+        boxes, scores = split_grid(detections["grid"], classes, order)
         return {"boxes": boxes, "scores": scores}
     logits = detections["logits"]
-    if order == QUERIES[1]:  # exclusive classes, of which a last one means no object
-        scores = logits.softmax(dim=1)[:, :classes]
+    if order == SOFTMAX_QUERIES:
+        scores = logits.softmax(dim=1)[:, :classes]  # without a last class for nothing
     else:
         scores = logits.sigmoid()
     return {"boxes": detections["boxes"], "scores": scores}
 
 
 def _resolve_pairs(detections: Detections, order: str) -> Detections:
-    """Return the detections of an image whose boxes have two numbers each ("either"),
-    with these as scores and labels.
+    """Return the detections of an image with its pairs of numbers ("score_or_label")
+    as scores and labels, or as scores alone.
 
     Args:
         detections: detections of one image.
@@ -705,26 +768,31 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
     Raises:
         ValueError: the order is unknown, and there are boxes that count.
     """
-    either = detections["either"]
-    has_values = are_counted(detections) | either.isnan().any(dim=1)
-    if not order and not bool(has_values.any()):
-        order = ORDERS[0]  # any order will do
+    pairs = detections["score_or_label"]
     if not order:
-        raise ValueError(
-            f"which of a box's two numbers is its score does not show; {ORDER_ADVICE}"
-        )
+        has_values = are_counted(detections) | pairs.isnan().any(dim=1)
+        if bool(has_values.any()):
+            raise ValueError(
+                "which of a box's two numbers is its score does not show; "
+                f"{ORDER_ADVICE}"
+            )
+        order = SCORES_FIRST  # of no importance, since no box counts
     if order in HEAD_ORDERS:
+        # both are scores; or the first is objectness, by which the other is multiplied
         has_objectness = "objectness" in order
-        scores = either.prod(dim=1, keepdim=True) if has_objectness else either
-        return _checked_detections({"boxes": detections["boxes"], "scores": scores})
-    first, second = either.unbind(dim=1)
-    scores, labels = (first, second) if order == ORDERS[0] else (second, first)
-    rest = {
+        scores = pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
+        return _check_detections({"boxes": detections["boxes"], "scores": scores})
+    first, second = pairs.unbind(dim=1)
+    if order == SCORES_FIRST:
+        identified = {"scores": first, "labels": second}
+    else:
+        identified = {"scores": second, "labels": first}
+    other_components = {
         name: value
         for name, value in detections.items()
-        if name not in ("either", "map_channels")
+        if name not in ("score_or_label", "map_channels")
     }
-    return _checked_detections({**rest, "scores": scores, "labels": labels})
+    return _check_detections({**other_components, **identified})
 
 
 def infer_order(
@@ -732,11 +800,11 @@ def infer_order(
     classes: int | None = None,
     head: str = "",
 ) -> str:
-    """Infer the order that the detections of any images show.
+    """Infer from values and sizes in which order a network returns scores and classes.
 
-    A class is an integer, a score lies in [0, 1]; and suppression returns boxes by
-    falling scores. Two numbers of which neither is a class are the scores of two
-    classes, or objectness and the score of the only class.
+    Logits and grids show it by the number of classes. Of the two numbers beside a box
+    a class is an integer, and a score lies in [0, 1] and does not rise from box to box.
+    If neither is a class, both are scores (`_infer_pair_order`).
 
     Args:
         detections_of_images: detections of images.
@@ -756,27 +824,33 @@ def infer_order(
     if classes is not None:
         logits = [x["logits"] for x in detections_of_images if "logits" in x]
         if logits:
-            return _order_of_logits(logits[0].shape[1], classes, head)
-        grids = [x for x in detections_of_images if "raw" in x]
+            return _infer_logit_order(logits[0].shape[1], classes, head)
+        grids = [x for x in detections_of_images if "grid" in x]
         if grids:
-            return _order_of_grids(grids, classes, head)
-    return _order_of_pairs(detections_of_images, classes)
+            return _infer_grid_order(grids, classes, head)
+    return _infer_pair_order(detections_of_images, classes)
 
 
-def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
-    """Return which of `QUERIES` logits of a box are, by their number.
+def _infer_logit_order(n_logits: int, classes: int, head: str) -> str:
+    """Return which of `QUERIES` has so many logits for each box.
 
     One more logit than classes is that of no object, unless the user states the head.
+
+    Args:
+        n_logits: number of logits of a box.
+        classes: number of classes.
+        head: one of `QUERIES` that the user stated, or "".
 
     Raises:
         ValueError: the number fits neither.
     """
+    has_nothing_logit = n_logits == classes + 1
     order = head
     if not order:
-        has_nothing = n_logits == classes + 1
-        order = QUERIES[1] if has_nothing else QUERIES[0]
-    is_softmax = order == QUERIES[1]
-    if n_logits == classes or (is_softmax and n_logits == classes + 1):
+        order = SOFTMAX_QUERIES if has_nothing_logit else SIGMOID_QUERIES
+    # Exclusive classes may have a last one for no object.
+    allows_nothing_logit = order == SOFTMAX_QUERIES
+    if n_logits == classes or (allows_nothing_logit and has_nothing_logit):
         return order
     fitting_sets = dict.fromkeys(
         [*list_sets_of_size(n_logits), *list_sets_of_size(n_logits - 1)]
@@ -792,35 +866,52 @@ def _order_of_logits(n_logits: int, classes: int, head: str) -> str:
     )
 
 
-def _order_of_grids(grids: Sequence[Detections], classes: int, head: str) -> str:
-    """Return the only head with layout (such as "boxes scores channels first") that
-    fits the YOLO grids of all images.
+def _infer_grid_order(grids: Sequence[Detections], classes: int, head: str) -> str:
+    """Return the only order (such as "boxes scores channels first") that fits the YOLO
+    grids of all images.
+
+    Args:
+        grids: detections with a "grid" each.
+        classes: number of classes.
+        head: one of `HEADS`, with or without a layout, that the user stated, or "".
 
     Raises:
-        ValueError: none fits all of them, or several do.
+        ValueError: no order fits all of them, or several do.
     """
-    heads_of_images = [
-        set(find_head_orders(x["raw"], x["map_channels"].tolist(), classes, head))
-        for x in grids
+    orders_of_images = [
+        set(
+            find_head_orders(
+                detections["grid"], detections["map_channels"].tolist(), classes, head
+            )
+        )
+        for detections in grids
     ]
-    heads = set.intersection(*heads_of_images)
-    if not heads:
+    orders = set.intersection(*orders_of_images)
+    if not orders:
         raise ValueError("pictures do not agree about how its numbers are to be read")
-    if len(heads) > 1:
-        options = " or ".join(format_option(f"order: {name}") for name in sorted(heads))
+    if len(orders) > 1:
+        options = " or ".join(
+            format_option(f"order: {name}") for name in sorted(orders)
+        )
         raise ValueError(f"how its numbers are to be read does not show; say {options}")
-    return heads.pop()
+    return orders.pop()
 
 
-def _order_of_pairs(
+def _infer_pair_order(
     detections_of_images: Sequence[Detections], classes: int | None
 ) -> str:
-    """Return the order of the two numbers of boxes in `either`, "" if it is open.
+    """Return what the two numbers of boxes ("score_or_label") are, "" if it is open.
 
-    The column of scores has values in [0, 1] only, that of classes integers only. If
-    both may be either, the one that never rises within an image is the scores. If
-    neither can be classes, both are scores of a network with two classes, or
-    objectness and score of one with a single class.
+    Scores lie in [0, 1], and classes are integers. If both columns may be either, the
+    one that never rises within an image has the scores, as after suppression. If
+    neither can be classes, both are scores (`_infer_order_without_labels`).
+
+    Args:
+        detections_of_images: detections of images.
+        classes: number of classes; None if it is unknown.
+
+    Raises:
+        ValueError: the numbers are neither scores nor classes.
     """
     pairs_of_images = _collect_pairs(detections_of_images)
     if not any(map(len, pairs_of_images)):
@@ -832,11 +923,10 @@ def _order_of_pairs(
     may_have_scores_first = are_scores[0] and are_classes[1]
     may_have_labels_first = are_scores[1] and are_classes[0]
     if not may_have_scores_first and not may_have_labels_first:
-        has_integers = any(bool((x == x.round()).all()) for x in columns)
-        if all(are_scores) and not has_integers and classes in (1, 2):
-            scores_head, objectness_head = HEADS
-            head = scores_head if classes == 2 else objectness_head
-            return f"{head} {LAYOUTS[1]}"
+        if all(are_scores):
+            order = _infer_order_without_labels(columns, classes)
+            if order:
+                return order
         if classes is not None:
             # The number of classes may be wrong: try without it.
             return infer_order(detections_of_images)
@@ -848,16 +938,34 @@ def _order_of_pairs(
         may_have_scores_first = _is_falling(pairs_of_images, column=0)
         may_have_labels_first = _is_falling(pairs_of_images, column=1)
     if may_have_scores_first == may_have_labels_first:
-        return ""  # it is open
-    return ORDERS[0] if may_have_scores_first else ORDERS[1]
+        return ""
+    return SCORES_FIRST if may_have_scores_first else LABELS_FIRST
+
+
+def _infer_order_without_labels(columns: Sequence[Tensor], classes: int | None) -> str:
+    """Return the order of boxes that have two scores and no class, "" if there is none.
+
+    They are the scores of two classes, or objectness and the score of the only class.
+
+    Args:
+        columns: the two numbers of all boxes, (D,) each, in [0, 1].
+        classes: number of classes; None if it is unknown.
+    """
+    has_integers = any(bool((x == x.round()).all()) for x in columns)
+    if has_integers or classes not in (1, 2):
+        return ""
+    head = PLAIN_HEAD if classes == 2 else OBJECTNESS_HEAD
+    return f"{head} {CHANNELS_LAST}"
 
 
 def _collect_pairs(detections_of_images: Sequence[Detections]) -> list[Tensor]:
-    """Return the finite pairs `either` (K, 2) of the boxes that count of each image."""
+    """Return the pairs `score_or_label` (K, 2) of each image that has such pairs: the
+    finite ones of boxes that count.
+    """
     pairs_of_images = []
     for detections in detections_of_images:
-        if "either" in detections:
-            pairs = detections["either"][are_counted(detections)]
+        if "score_or_label" in detections:
+            pairs = detections["score_or_label"][are_counted(detections)]
             is_finite = pairs.isfinite().all(dim=1)
             pairs_of_images.append(pairs[is_finite].detach())
     return pairs_of_images
@@ -910,34 +1018,27 @@ def find_head_orders(
         ValueError: it has none of them; the message names what it seems to be.
     """
     orders = list[str]()
-    problem = ""
-    for layout, n_channels in zip(LAYOUTS, returned.shape, strict=True):
-        for head, first_score in HEADS.items():
-            name = f"{head} {layout}"
-            # channels that are left over have to be mask coefficients
-            n_left_over = n_channels - first_score - classes
-            if order not in ("", head, name) or n_left_over not in (0, *map_channels):
-                continue
-            scores = split_grid(returned, classes, name, multiply_objectness=False)[
-                1
-            ].detach()
-            is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
-            if not bool((is_outside & scores.isfinite()).any()):
-                orders.append(name)
-            elif name == _WITH_ANGLE and not bool(is_outside[:, :-1].any()):
-                # only the last channel is outside: an angle
-                problem = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
-            elif not problem:
-                problem = (
-                    f"scores from {float(scores.min()):.3g} to "
-                    f"{float(scores.max()):.3g} if it is read as '{name}'; "
-                    "expected probabilities in [0, 1]: apply a sigmoid to them"
-                )
+    problem = ""  # why an order of the right size does not fit
+    for name in _list_orders_of_size(returned.shape, map_channels, classes, order):
+        _, scores = split_grid(returned, classes, name, multiply_objectness=False)
+        scores = scores.detach()
+        is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
+        if not bool((is_outside & scores.isfinite()).any()):
+            orders.append(name)
+        elif name == _WITH_ANGLE and not bool(is_outside[:, :-1].any()):
+            # only the last channel is outside: an angle
+            problem = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
+        elif not problem:
+            problem = (
+                f"scores from {float(scores.min()):.3g} to "
+                f"{float(scores.max()):.3g} if it is read as '{name}'; "
+                "expected probabilities in [0, 1]: apply a sigmoid to them"
+            )
     if orders == [_WITH_ANGLE] and not order:
         raise ValueError(
             f"its {5 + classes} channels may be those of an OBB head (with an angle), "
-            f"{_UNREAD}; if it has "
-            f"objectness, say `task='detection={{order: {_WITH_ANGLE}}}'`"
+            f"{_UNREAD}; if it has objectness, say `task='detection={{order: "
+            f"{_WITH_ANGLE}}}'`"
         )
     if orders:
         return tuple(orders)
@@ -946,9 +1047,27 @@ def find_head_orders(
     raise _make_channel_error((returned.shape[0], returned.shape[1]), classes)
 
 
+def _list_orders_of_size(
+    shape: Sequence[int], map_channels: Collection[int], classes: int, order: str
+) -> Iterator[str]:
+    """Yield the orders whose number of channels fits the output (A, B) of one image.
+
+    Channels beyond the box and the scores have to be mask coefficients, as many as a
+    feature map has channels. For the arguments see `find_head_orders`.
+    """
+    for layout, n_channels in zip(LAYOUTS, shape, strict=True):
+        for head, first_score in HEADS.items():
+            name = f"{head} {layout}"
+            n_left_over = n_channels - first_score - classes
+            if order in ("", head, name) and n_left_over in (0, *map_channels):
+                yield name
+
+
 def _make_channel_error(shape: tuple[int, int], classes: int) -> ValueError:
     """Return the error about an output (A, B) of one image whose number of channels
-    fits no head; the smaller of the two sizes is taken for it.
+    fits no head.
+
+    The smaller of the two sizes is taken for that number, since there are more boxes.
     """
     n_channels = min(shape)
     is_channels_last = shape[0] >= shape[1]
@@ -961,17 +1080,18 @@ def _make_channel_error(shape: tuple[int, int], classes: int) -> ValueError:
 
 
 def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> str:
-    """Return what to do about an output whose number of channels does not fit, by what
-    the channels beyond boxes and scores seem to be; it follows on a message.
+    """Return the end of a message about an output whose number of channels does not
+    fit: what the channels beyond boxes and scores seem to be, and what to do.
 
     Args:
         n_channels: number of channels of a box.
         classes: number of classes.
-        may_be_rows: whether boxes are rows, which may begin with six numbers.
+        may_be_rows: whether boxes are rows; these may begin with a box, a score and a
+            class.
     """
     excess_channels = {n_channels - 4 - classes}
-    if may_be_rows:
-        excess_channels.add(n_channels - 6)
+    if may_be_rows:  # 4 numbers of a box, a score and a class
+        excess_channels.add(n_channels - 4 - 2)
     fitting = [
         f"`labels={name}`"
         for first_score in HEADS.values()
@@ -1010,9 +1130,9 @@ def split_grid(
         Boxes (D, 4) and scores (D, classes); (D, 1 + classes), objectness first, if it
         is not multiplied.
     """
-    rows = returned.T if order.endswith(LAYOUTS[0]) else returned
+    rows = returned.T if order.endswith(CHANNELS_FIRST) else returned
     boxes = rows[:, :4]
-    if not order.startswith("boxes objectness"):
+    if not order.startswith(OBJECTNESS_HEAD):
         return boxes, rows[:, 4 : 4 + classes]
     objectness = rows[:, 4:5]
     scores = rows[:, 5 : 5 + classes]

@@ -52,8 +52,8 @@ class Rig(tasks.JointTask):
             )
         if not isinstance(self.task, (str, Mapping, Task)):
             raise InputError(
-                "task rig: task: expected a name, or a mapping with a "
-                f"`name`, got {self.task!r:.80}"
+                "task rig: task: expected a name, or a mapping with a `name`, got "
+                f"{self.task!r:.80}"
             )
 
     @property
@@ -127,7 +127,7 @@ class Rig(tasks.JointTask):
         """
         scores = self._map_images(self.part.score, output, truth)
         if self.target is not None or self.minimise:
-            # these scores are over 0 where an image is as it should be by the rule
+            # The score of an image is then minus a loss, and the rule is one for losses.
             return -self._combine(-scores)
         return self._combine(scores)
 
@@ -137,7 +137,9 @@ class Rig(tasks.JointTask):
         output: Sequence[tasks.Outputs],
         truth: tasks.Truths,
     ) -> Tensor:
-        """Apply the loss or the score to each of K images of each of N rigs, (N, K)."""
+        """Apply a function, the loss or the score of the task of an image, to each of K
+        images of each of N rigs, (N, K).
+        """
         rows = []
         for image_outputs in output:
             values = [
@@ -150,17 +152,18 @@ class Rig(tasks.JointTask):
     def _combine(self, values: Tensor) -> Tensor:
         """Combine losses of images (N, K) by the rule, (N,). A loss over 0 is a wrong
         prediction.
-
-        Sorted, the smallest is over 0 if no image is right, the largest if not all are
-        right, and the middle one if most are wrong.
         """
         if self.rule == "mean":
             return values.mean(dim=1)
         n_images = values.shape[1]
-        # index of the loss that decides; with `vote`, of an even number of images, the
-        # upper of the two in the middle: more than half have to be right
-        rank = {"any": 0, "all": n_images - 1, "vote": n_images // 2}[self.rule]
-        return values.sort(dim=1).values[:, rank]
+        # Which of the losses in ascending order decides.
+        rank_by_rule = {
+            "any": 0,  # over 0 only if no image is right
+            "all": n_images - 1,  # over 0 unless all are right
+            # over 0 unless more than half are right: of an even number the upper middle
+            "vote": n_images // 2,
+        }
+        return values.sort(dim=1).values[:, rank_by_rule[self.rule]]
 
     def predictions(
         self, output: Sequence[tasks.Outputs], count: int = 1
@@ -191,31 +194,45 @@ class Rig(tasks.JointTask):
             ]
             if any(judgement.is_non_finite for judgement in judgements):
                 margin = math.nan
-            image_payloads: list[tasks.JsonValue] = [
-                {
-                    "prediction": judgement.prediction.label,
-                    "right": judgement.right,
-                    "payload": judgement.payload,
-                }
-                for judgement in judgements
-            ]
-            prediction = tasks.join_predictions(
-                judgement.prediction for judgement in judgements
-            )
-            outcome = tasks.make_outcome_payload(
-                self._find_deciding_judgement(judgements, margin)
-            )
-            payload = {"pictures": image_payloads, **outcome}
-            rig_judgements.append(
-                tasks.Judgement.of(score, margin, prediction, payload)
-            )
+            rig_judgements.append(self._join_judgements(judgements, margin, score))
         return rig_judgements
+
+    def _join_judgements(
+        self, judgements: Sequence[tasks.Judgement], margin: float, score: float
+    ) -> tasks.Judgement:
+        """Return the judgement of a rig.
+
+        Args:
+            judgements: the judgements of its images.
+            margin: joint margin by the rule; NaN if an image has none.
+            score: joint score by the rule.
+        """
+        image_payloads: list[tasks.JsonValue] = [
+            {
+                "prediction": judgement.prediction.label,
+                "right": judgement.right,
+                "payload": judgement.payload,
+            }
+            for judgement in judgements
+        ]
+        prediction = tasks.join_predictions(
+            judgement.prediction for judgement in judgements
+        )
+        outcome = tasks.make_outcome_payload(
+            self._find_deciding_judgement(judgements, margin)
+        )
+        payload = {"pictures": image_payloads, **outcome}
+        return tasks.Judgement.of(score, margin, prediction, payload)
 
     def _find_deciding_judgement(
         self, judgements: Sequence[tasks.Judgement], margin: float
     ) -> tasks.Judgement:
-        """Return the judgement that decides by the rule; for the mean, the worst
-        one.
+        """Return the judgement of the image that decides about the rig by the rule; for
+        the mean, to which all images add, the worst one.
+
+        Args:
+            judgements: the judgements of the images.
+            margin: the joint margin.
         """
         if self.rule == "mean":
             return min(judgements, key=lambda judgement: judgement.margin)

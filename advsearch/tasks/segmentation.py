@@ -40,15 +40,15 @@ class SegmentationTruth:
     def resize_mask(self, size: tuple[int, int]) -> Tensor:
         """Resize the mask to the size of an output, (h, w) bool.
 
-        A pixel is the object's if at least half of it is; if there is no such pixel,
-        all that contain a part of the object are.
+        A pixel is the object's if the object covers at least half of it. If there is no
+        such pixel, all that the object touches are.
         """
         if self.mask.shape == size:
             return self.mask
         mask = self.mask[None, None].float()
         fraction = F.interpolate(mask, size=size, mode="area")[0, 0]
-        is_half = fraction >= 0.5
-        return is_half if bool(is_half.any()) else fraction > 0.0
+        is_half_covered = fraction >= 0.5
+        return is_half_covered if bool(is_half_covered.any()) else fraction > 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ class Segmentation(tasks.ClassTask):
             not isinstance(returned, Tensor)
             or returned.ndim != 4
             or len(returned) != count
-            or returned.shape[1] < 2  # no prediction could be wrong
+            or returned.shape[1] < 2  # with a single class nothing could be wrong
         ):
             raise ValueError(EXPECTED)
         return returned.float()
@@ -107,9 +107,8 @@ class Segmentation(tasks.ClassTask):
     def loss(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
         """Compute the margin of wrong classes at the deciding pixel, in logits, (N,).
 
-        It is over 0 if too few pixels are right. Of the object's pixels in ascending
-        order of that margin, the deciding one is that at which `accuracy` of them is
-        reached.
+        It is over 0 if fewer than `accuracy` of the object's pixels are right, see
+        `_compute_deciding_margin`.
         """
         return self._compute_deciding_margin(
             output, truth, tasks.compute_misclassification_margin, truth.labels
@@ -121,20 +120,24 @@ class Segmentation(tasks.ClassTask):
         """
         if self.target is None:
             return super().score(output, truth)
+
+        def compute_target_shortfall(logits: Tensor, labels: tasks.Labels) -> Tensor:
+            """Compute by how much the target falls short at pixels: at most 0 if they get
+            it, as the margin of wrong classes is at most 0 at right ones.
+            """
+            return -tasks.compute_target_margin(logits, labels)
+
         return -self._compute_deciding_margin(
-            output,
-            truth,
-            lambda logits, labels: -tasks.compute_target_margin(logits, labels),
-            self.target,
+            output, truth, compute_target_shortfall, self.target
         )
 
     def pixel_margin(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
-        """Compute the mean over the object's pixels of what is sought, in logits, (N,).
+        """Compute the mean margin over the object's pixels, in logits, (N,).
 
-        That is the margin of wrong classes, or of the target's. Every pixel has a
-        derivative, not only the deciding one as in `loss`.
+        It is the margin of wrong classes, or of those of the target; with `minimise` that
+        of right ones. Every pixel has a derivative, not only the deciding one as in `loss`.
         """
-        pixels = self._object_logits(output, truth)
+        pixels = self._select_object_logits(output, truth)
         if pixels is None:
             return _make_hidden_value(output)
         if self.target is None:
@@ -151,10 +154,12 @@ class Segmentation(tasks.ClassTask):
         compute_margin: PixelMargin,
         labels: tasks.Labels,
     ) -> Tensor:
-        """Compute the margin (N,) at the pixel at which `accuracy` of them is reached.
+        """Compute the margin (N,) at the deciding pixel of the object.
 
-        The object's pixels are sorted by their margin, in ascending order. The value is
-        NaN if a margin is not finite, and -1 if the object is out of view.
+        The object's pixels are sorted by their margin, in ascending order; the first
+        `accuracy` of them end with the deciding pixel. So it is at most 0 exactly if
+        enough of them are. It is NaN if a margin is not finite, and -1 if the object is
+        out of view.
 
         Args:
             output: logits (N, classes, h, w).
@@ -163,7 +168,7 @@ class Segmentation(tasks.ClassTask):
                 classes) and the labels.
             labels: classes that the margin is about.
         """
-        pixels = self._object_logits(output, truth)
+        pixels = self._select_object_logits(output, truth)
         if pixels is None:
             return _make_hidden_value(output)
         margins = compute_margin(pixels, labels).reshape(len(output), -1)  # (N, P)
@@ -172,7 +177,9 @@ class Segmentation(tasks.ClassTask):
         return torch.where(margins.isfinite().all(dim=1), deciding_margin, math.nan)
 
     @staticmethod
-    def _object_logits(output: Tensor, truth: SegmentationTruth) -> Tensor | None:
+    def _select_object_logits(
+        output: Tensor, truth: SegmentationTruth
+    ) -> Tensor | None:
         """Select the logits of the object's pixels, image by image, (N * P, classes).
 
         None if the object is out of view.
@@ -188,46 +195,51 @@ class Segmentation(tasks.ClassTask):
         """Return the most frequent classes of the pixels of each image, with their
         fractions of the image.
         """
-        predictions_of_images = []
-        for logits in output.detach():
-            # minus infinity is a class that is excluded
-            is_number = (logits.isfinite() | (logits == -math.inf)).all(dim=0)
-            class_of_pixel = logits[:, is_number].argmax(dim=0)
-            n_classes = len(logits)
-            n_pixels = logits[0].numel()
-            counts = class_of_pixel.bincount(minlength=n_classes)
-            counts[list(self.nothing_classes)] = 0
-            top_counts, top_classes = counts.topk(min(count, n_classes))
-            predictions = tuple(
-                tasks.Prediction(
-                    self.get_class_name(class_id), class_id, class_count / n_pixels
-                )
-                for class_id, class_count in zip(
-                    top_classes.tolist(), top_counts.tolist(), strict=True
-                )
-                if class_count
+        return [self._rank_classes(logits, count) for logits in output.detach()]
+
+    def _rank_classes(self, logits: Tensor, count: int) -> tuple[tasks.Prediction, ...]:
+        """Return the `count` most frequent classes of the pixels of an image.
+
+        Args:
+            logits: (classes, h, w), without a graph.
+            count: how many; there may be fewer.
+        """
+        # minus infinity is a class that is excluded
+        is_number = (logits.isfinite() | (logits == -math.inf)).all(dim=0)
+        class_of_pixel = logits[:, is_number].argmax(dim=0)
+        n_classes = len(logits)
+        n_pixels = logits[0].numel()
+        counts = class_of_pixel.bincount(minlength=n_classes)
+        counts[list(self.nothing_classes)] = 0
+        top_counts, top_classes = counts.topk(min(count, n_classes))
+        predictions = tuple(
+            tasks.Prediction(
+                self.get_class_name(class_id), class_id, class_count / n_pixels
             )
-            if not predictions:  # only classes that stand for nothing, or only NaN
-                label = "nothing" if len(class_of_pixel) else tasks.NOT_A_NUMBER
-                predictions = (tasks.Prediction(label),)
-            predictions_of_images.append(predictions)
-        return predictions_of_images
+            for class_id, class_count in zip(
+                top_classes.tolist(), top_counts.tolist(), strict=True
+            )
+            if class_count
+        )
+        if predictions:
+            return predictions
+        # all pixels have classes that stand for nothing, or NaN
+        label = "nothing" if len(class_of_pixel) else tasks.NOT_A_NUMBER
+        return (tasks.Prediction(label),)
 
     def describe(
         self, output: Tensor, truth: SegmentationTruth, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
-        """See `Task.describe`: the class of most of the object's pixels.
+        """See `Task.describe`: the class of most of the object's pixels
+        (`_describe_object`).
 
-        If too few are right, it is the most frequent wrong class; if that is
-        background, "no bottle", or "bottle in part" from `MIN_PARTIAL_ACCURACY` on. The
-        probability is the fraction of the object's pixels that are right. The payload
-        has the outcome, the fractions of the pixels by class, and the intersection over
-        union.
+        The payload has the outcome, the fraction of the object's pixels that are right,
+        their fractions by class, and the intersection over union.
         """
         results: list[tasks.PredictionWithPayload] = []
         mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
         for logits, margin in zip(output, margins, strict=True):
-            pixels = self._object_logits(logits[None], truth)
+            pixels = self._select_object_logits(logits[None], truth)
             if pixels is None:
                 results.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
                 continue
@@ -273,18 +285,22 @@ class Segmentation(tasks.ClassTask):
     ) -> tuple[tasks.Prediction, tasks.Outcome]:
         """Return the prediction about the object, and what becomes of it.
 
+        If the object is right, it is the most frequent right class. Else it is the most
+        frequent wrong class; where that stands for nothing, "no bottle", or from
+        `MIN_PARTIAL_ACCURACY` on "bottle in part".
+
         Args:
             counts: the object's pixels by class, (classes,).
             truth: truth of the image.
-            accuracy: fraction of the object's pixels that are right.
+            accuracy: fraction of the object's pixels that are right: the probability of
+                the prediction.
             is_right: whether enough of them are.
         """
         is_right_class = torch.zeros_like(counts, dtype=torch.bool)
         is_right_class[list(truth.labels)] = True
-        # the most frequent right class if the object is right, else the most frequent
-        # wrong one; the other classes are left out by a count of -1
-        is_other_kind = is_right_class != is_right
-        top_class = int(counts.masked_fill(is_other_kind, -1).argmax())
+        is_candidate = is_right_class == is_right
+        # a count of -1 comes last, also behind classes without a pixel
+        top_class = int(counts.masked_fill(~is_candidate, -1).argmax())
         if is_right or top_class not in self.nothing_classes:
             prediction = tasks.Prediction(
                 self.get_class_name(top_class), top_class, accuracy
@@ -300,8 +316,8 @@ class Segmentation(tasks.ClassTask):
 
     @staticmethod
     def _find_correct_pixels(logits: Tensor, truth: SegmentationTruth) -> Tensor:
-        """Whether the largest of the logits (C, h, w) is that of a right class, (h, w)
-        bool; a tie is right, NaN is not.
+        """Return at which pixels the largest of the logits (C, h, w) is that of a right
+        class, (h, w) bool; a tie is right, NaN is not.
         """
         n_classes = logits.shape[0]
         pixels = logits.permute(1, 2, 0).reshape(-1, n_classes)

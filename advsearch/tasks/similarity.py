@@ -71,8 +71,7 @@ def list_name_folders(folder: str) -> list[tuple[str, Path]]:
         got = f"only {folders[0][0]}" if folders else "no folder"
         raise InputError(
             f"references: expected two folders of pictures at least in {root}, each "
-            "called by its name, such as mug "
-            f"and bowl, got {got}"
+            f"called by its name, such as mug and bowl, got {got}"
         )
     return folders
 
@@ -95,6 +94,32 @@ def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
     """
     named_folders = list_name_folders(folder)
     root = Path(folder).expanduser()
+    paths, name_indices = _list_references(root, named_folders)
+    features = _embed_images(paths, model)
+    name_index = torch.tensor(name_indices)
+    return Gallery(
+        names=tuple(name for name, _ in named_folders),
+        name_index=name_index,
+        paths=tuple(path.relative_to(root).as_posix() for path in paths),
+        features=features,
+        embedder=(model.module, model.preprocessing),
+        head=fit_linear_head(features, name_index) if linear else None,
+    )
+
+
+def _list_references(
+    root: Path, named_folders: Sequence[tuple[str, Path]]
+) -> tuple[list[Path], list[int]]:
+    """List the reference images in folders, and for each the index of its folder.
+
+    Args:
+        root: folder that the folders are in, for messages.
+        named_folders: name and path of each folder.
+
+    Raises:
+        InputError: a folder is empty.
+        FileFormatError: there are too many images.
+    """
     paths: list[Path] = []
     name_indices: list[int] = []
     for index, (name, name_folder) in enumerate(named_folders):
@@ -111,20 +136,12 @@ def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
         raise stored_files.make_size_error(
             root, f"at most {limit:,} reference pictures", f"{len(paths):,}"
         )
-    features = _embed_images(paths, model)
-    name_index = torch.tensor(name_indices)
-    return Gallery(
-        names=tuple(name for name, _ in named_folders),
-        name_index=name_index,
-        paths=tuple(path.relative_to(root).as_posix() for path in paths),
-        features=features,
-        embedder=(model.module, model.preprocessing),
-        head=fit_linear_head(features, name_index) if linear else None,
-    )
+    return paths, name_indices
 
 
 def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
     """Compute the features (R, D) of length 1 of the images in files, in batches."""
+    # loaded one by one, as the batches below ask for them
     images = (
         _crop_center(
             torch.from_numpy(models.load_upright(path, MAX_IMAGE_SIZE)),
@@ -169,9 +186,10 @@ def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tenso
     """
     n_names = int(name_index.max()) + 1
     images_per_name = torch.bincount(name_index, minlength=n_names).double()
-    # of each image, so that every name has the same weight, and the sum is 1
+    # of each image: the images of every name weigh 1 / n_names together
     image_weights = 1.0 / (n_names * images_per_name[name_index])
-    # Centered features make the fit faster; the biases are shifted back below.
+    # The fit is faster with centered features. With bias b, w (x - center) + b is
+    # w x + (b - w center): so the bias is shifted at the end.
     center = features.double().mean(dim=0)
     centered = features.double() - center
     weights = torch.zeros(
@@ -198,8 +216,9 @@ def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tenso
 
     with torch.enable_grad():
         optimizer.step(closure)
-    weights = weights.detach()
-    return weights.float(), (biases.detach() - weights @ center).float()
+    fitted_weights = weights.detach()
+    fitted_biases = biases.detach() - fitted_weights @ center
+    return fitted_weights.float(), fitted_biases.float()
 
 
 def _list_visible(folder: Path) -> list[Path]:
@@ -215,8 +234,7 @@ def _list_visible(folder: Path) -> list[Path]:
     except OSError as error:
         raise InputError(
             "references: expected a folder with a folder of pictures for each name, "
-            f"got {folder} "
-            f"({error.strerror}); check the path"
+            f"got {folder} ({error.strerror}); check the path"
         ) from None
 
 
@@ -297,8 +315,8 @@ class Similarity(tasks.Classification):
         super().__post_init__()
         if self.method not in METHODS:
             raise InputError(
-                "task similarity: method: expected one of "
-                f"{', '.join(METHODS)}, got {self.method!r}"
+                f"task similarity: method: expected one of {', '.join(METHODS)}, got "
+                f"{self.method!r}"
             )
         if isinstance(self.k, bool) or not isinstance(self.k, int) or self.k < 1:
             raise InputError(
@@ -333,10 +351,9 @@ class Similarity(tasks.Classification):
         if not self.references and self.threshold is None:
             raise InputError(
                 "task similarity: references: expected a folder with a folder of "
-                "pictures for each name, or a "
-                "`threshold` of the cosine to the clean picture, got neither; write "
-                "`task='similarity={references: FOLDER}'` or "
-                "`task='similarity={threshold: 0.8}'`"
+                "pictures for each name, or a `threshold` of the cosine to the clean "
+                "picture, got neither; write `task='similarity={references: FOLDER}'` "
+                "or `task='similarity={threshold: 0.8}'`"
             )
         if target is not None and not self.references:
             raise InputError(
@@ -357,8 +374,10 @@ class Similarity(tasks.Classification):
         return tuple(name for name, _ in list_name_folders(self.references)), True
 
     def find_right_classes(self, facts: tasks.Facts) -> tasks.Labels:
-        """See `ClassTask.find_right_classes`; with a threshold the clean image defines
-        what is right, whose class is 0.
+        """See `ClassTask.find_right_classes`.
+
+        With a threshold there are two classes, `ITSELF` (the thing in the clean image) and
+        `SOMETHING_ELSE`, of which the first is right.
         """
         if self.references:
             return super().find_right_classes(facts)
@@ -383,8 +402,8 @@ class Similarity(tasks.Classification):
         return replace(self, clean=features[0])
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Read features (count, D): a tensor, the first of a tuple, or the first of
-        `PARTS`.
+        """Read features (count, D): a tensor, the first of a tuple, or a component that
+        has one of the names `PARTS`.
 
         Of `last_hidden_state` these are of the first token (CLS); a map is averaged
         over its positions.
@@ -392,7 +411,8 @@ class Similarity(tasks.Classification):
         Raises:
             ValueError: there are none.
         """
-        is_tuple = type(returned) in (tuple, list) and returned  # no named tuple
+        # A named tuple has the type of its class, and its components have names.
+        is_tuple = type(returned) in (tuple, list) and returned
         features = models.pooled(returned[0] if is_tuple else returned, token=True)
         if features is None or features.dim() != 2 or features.shape[0] != count:
             raise ValueError(
@@ -405,15 +425,7 @@ class Similarity(tasks.Classification):
         """Compute logits (N, names) of features (N, D); differentiable."""
         features = functional.normalize(output, dim=1)
         if self.gallery is None:
-            if self.clean is None or self.threshold is None:
-                raise InputError(
-                    "task similarity: expected references, or a clean "
-                    "picture that it was shown first"
-                )
-            cosine = features @ self.clean.to(features)
-            # class 0, the clean thing, wins where the cosine exceeds the threshold
-            threshold = torch.full_like(cosine, self.threshold)
-            return torch.stack([cosine, threshold], dim=1) / TEMPERATURE
+            return self._compute_threshold_logits(features)
         if self.method == "linear":
             assert self.gallery.head is not None
             weights, biases = self.gallery.head
@@ -428,6 +440,25 @@ class Similarity(tasks.Classification):
             k = min(self.k, name_cosines.shape[1])
             name_scores.append(name_cosines.topk(k, dim=1).values.mean(dim=1))
         return torch.stack(name_scores, dim=1) / TEMPERATURE
+
+    def _compute_threshold_logits(self, features: Tensor) -> Tensor:
+        """Compute the logits (N, 2) of `ITSELF` and `SOMETHING_ELSE`: the first is larger
+        where the cosine to the clean image exceeds the threshold.
+
+        Args:
+            features: (N, D), of length 1.
+
+        Raises:
+            InputError: there is no clean image, or no threshold.
+        """
+        if self.clean is None or self.threshold is None:
+            raise InputError(
+                "task similarity: expected references, or a clean picture that it was "
+                "shown first"
+            )
+        cosine = features @ self.clean.to(features)
+        threshold = torch.full_like(cosine, self.threshold)
+        return torch.stack([cosine, threshold], dim=1) / TEMPERATURE
 
     def as_logits(self, output: Tensor, truth: tasks.Labels) -> Tensor:
         return super().as_logits(self.compute_logits(output), truth)
@@ -450,6 +481,7 @@ class Similarity(tasks.Classification):
         return [
             replace(
                 judgement,
+                # an output of NaN has neither cosine nor ranks
                 payload=payload if math.isfinite(judgement.margin) else None,
             )
             for judgement, payload in zip(judgements, payloads, strict=True)

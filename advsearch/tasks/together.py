@@ -18,7 +18,6 @@ from advsearch.models import Model, Preprocessing
 from advsearch.models.model import join_outputs
 from advsearch.options import (
     FROM_RUN,
-    OUT_OF_VIEW,
     OUTCOME,
     TASK_SEPARATOR,
     get_outcome,
@@ -183,7 +182,7 @@ class EnsembleTask(JointTask):
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
     ) -> EnsembleTask:
-        """See `Task.on`; if only some tasks take a label, the target is theirs.
+        """See `Task.on`; a target goes only to the tasks that take a label, if any do.
 
         Raises:
             InputError: the model is not from `join_models`, or has not one model per
@@ -268,7 +267,7 @@ class EnsembleTask(JointTask):
     def predictions(
         self, output: Sequence[Outputs], count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """Return a single prediction for each image: those of the models, joined."""
+        """Return a single prediction for each image, with the labels of all models."""
         predictions_of_models = [
             task.predictions(model_output)
             for task, model_output in zip(
@@ -318,23 +317,23 @@ class EnsembleTask(JointTask):
         prediction of each model under its name.
         """
         marks_of_images: list[list[Mark]] = [[] for _ in output]
-        is_first_model = True
-        for model, (task, model_output, task_truth) in zip(
-            self.models, self._by_task(output, truth), strict=True
+        for index, (task, model_output, task_truth) in enumerate(
+            self._by_task(output, truth)
         ):
+            model = self.models[index]
             model_marks = task.marks(model_output, task_truth)
             for image_marks, marks in zip(marks_of_images, model_marks, strict=True):
+                # boxes and masks of the truth are the same for all models
                 image_marks += [
                     mark
                     for mark in marks
-                    if mark.true and (is_first_model or mark.map is not None)
+                    if mark.true and (index == 0 or mark.map is not None)
                 ]
                 image_marks += [
                     replace(mark, text=f"{model.name}: {mark.text}")
                     for mark in marks
                     if not mark.true
                 ]
-            is_first_model = False
         return marks_of_images
 
     def _by_task(
@@ -420,13 +419,7 @@ class EachThingTask(JointTask):
             by_name: dict[str, Judgement] = dict(
                 zip(truth, image_judgements, strict=True)
             )
-            visible = [
-                name
-                for name, judgement in by_name.items()
-                if judgement.prediction.label != OUT_OF_VIEW
-            ]
-            # of all things if none is visible
-            worst = min(visible or by_name, key=lambda name: by_name[name].margin)
+            worst = _find_worst_thing(by_name)
             worst_payload = by_name[worst].payload
             payload: dict[str, JsonValue] = {
                 **(worst_payload if isinstance(worst_payload, dict) else {}),
@@ -456,6 +449,18 @@ class EachThingTask(JointTask):
         return marks_of_images
 
 
+def _find_worst_thing(judgements: Mapping[str, Judgement]) -> str:
+    """Return the name of the thing with the smallest margin among the visible ones; of
+    all, if none is visible.
+    """
+    visible = [
+        name
+        for name, judgement in judgements.items()
+        if not judgement.prediction.is_out_of_view
+    ]
+    return min(visible or judgements, key=lambda name: judgements[name].margin)
+
+
 def _summarize_thing(judgement: Judgement) -> dict[str, JsonValue]:
     """Return what a payload has about one of several things."""
     summary: dict[str, JsonValue] = {
@@ -479,9 +484,9 @@ def make_each_thing_task(task: Task) -> EachThingTask:
     if isinstance(task, EnsembleTask) or task.name not in PER_THING_TASKS:
         raise InputError(
             f"judge: all is for {' and '.join(PER_THING_TASKS)}, got task {task.name}; "
-            "judge "
-            "one thing, by its name"
+            "judge one thing, by its name"
         )
+    # a class of its own, since name and objective are attributes of the class
     attributes = {"name": task.name, "objective": task.objective}
     task_class: Any = type("EachThing", (EachThingTask,), attributes)
     result: EachThingTask = task_class(

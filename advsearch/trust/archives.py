@@ -116,16 +116,7 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
         entries = archive.infolist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise make_truncation_error(path, error) from None
-    unpacked = sum(entry.file_size for entry in entries)
-    limit = ""
-    if unpacked > scale_limit(LARGEST):
-        limit = f"a model of at most {scale_limit(LARGEST):,} bytes unpacked"
-        got = f"{unpacked:,}"
-    elif unpacked > scale_limit(LARGEST_RATIO) * size + SLACK:
-        limit = f"a model that unpacks to at most {scale_limit(LARGEST_RATIO)} times its size"
-        got = f"{size:,} bytes that unpack to {unpacked:,}"
-    if limit:
-        raise make_size_error(path, limit, got)
+    _check_unpacked_size(path, sum(entry.file_size for entry in entries), size)
     # torch puts all members into one folder, whose name means nothing: it is left out
     roots = {
         entry.filename.partition("/")[0] if "/" in entry.filename else ""
@@ -138,11 +129,34 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     for name, entry in members.items():
         if not _NAME.fullmatch(name) or ".." in name.split("/"):
             raise make_archive_error(path, f"has a member of the name {name[:80]!r}")
-        if entry.flag_bits & 0x1 or entry.compress_type not in _METHODS:
+        is_encrypted = entry.flag_bits & 0x1
+        if is_encrypted or entry.compress_type not in _METHODS:
             raise make_archive_error(
                 path, f"has an encrypted or strangely packed member, {name[:80]!r}"
             )
     return Archive(path, archive, members)
+
+
+def _check_unpacked_size(path: Path, unpacked: int, size: int) -> None:
+    """Check that the members of an archive of `size` bytes have not too many bytes
+    together, unpacked.
+
+    Raises:
+        FileFormatError: they have more than the limit, or than the ratio allows.
+    """
+    if unpacked > scale_limit(LARGEST):
+        raise make_size_error(
+            path,
+            f"a model of at most {scale_limit(LARGEST):,} bytes unpacked",
+            f"{unpacked:,}",
+        )
+    elif unpacked > scale_limit(LARGEST_RATIO) * size + SLACK:
+        raise make_size_error(
+            path,
+            f"a model that unpacks to at most {scale_limit(LARGEST_RATIO)} times its "
+            "size",
+            f"{size:,} bytes that unpack to {unpacked:,}",
+        )
 
 
 def make_archive_error(path: Path, what: str) -> FileFormatError:
@@ -202,6 +216,32 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
         FileFormatError: the code calls what a network has no use for, or the pickles
             state what is not there.
     """
+    code = _read_code(archive)
+    for name in PICKLES:
+        _check_pickle(archive, name)
+    tensors = [
+        name for name in archive.members if name.partition("/")[0] in PICKLES.values()
+    ]
+    version = _read_version(archive)
+    buffer = io.BytesIO()
+    writer = torch._C.PyTorchFileWriter(buffer)
+    writer.set_min_version(version)
+    for name in (*code, *PICKLES, *tensors):
+        content = code[name] if name in code else archive.read(name)
+        writer.write_record(name, content, len(content))
+    writer.write_end_of_file()
+    buffer.seek(0)
+    # torch calls a module's own __setstate__ on loading
+    runs_code = any(b"__setstate__" in content for content in code.values())
+    return buffer, runs_code
+
+
+def _read_code(archive: Archive) -> dict[str, bytes]:
+    """Return the source code of a TorchScript archive by member, checked.
+
+    Raises:
+        FileFormatError: there is too much, or it calls what a network has no use for.
+    """
     scripts = [
         name
         for name in archive.members
@@ -217,11 +257,15 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
             raise make_archive_error(
                 archive.path, f"{name!r} {wrong}, which no plain network does"
             )
-    for name in PICKLES:
-        _check_pickle(archive, name)
-    tensors = [
-        name for name in archive.members if name.partition("/")[0] in PICKLES.values()
-    ]
+    return code
+
+
+def _read_version(archive: Archive) -> int:
+    """Return the version of a TorchScript archive's form.
+
+    Raises:
+        FileFormatError: it is missing, or no small number.
+    """
     # torch writes it under one of two names
     name = "version" if "version" in archive else ".data/version"
     version = archive.read(name, 100).decode("ascii", "replace").strip()
@@ -229,16 +273,7 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
         raise make_archive_error(
             archive.path, f"expected a version number in {name!r}, got {version[:20]!r}"
         )
-    buffer = io.BytesIO()
-    writer = torch._C.PyTorchFileWriter(buffer)
-    writer.set_min_version(int(version))
-    for name in (*code, *PICKLES, *tensors):
-        content = code[name] if name in code else archive.read(name)
-        writer.write_record(name, content, len(content))
-    writer.write_end_of_file()
-    buffer.seek(0)
-    # torch calls a module's own __setstate__ on loading
-    return buffer, any(b"__setstate__" in content for content in code.values())
+    return int(version)
 
 
 def _find_code_problem(content: bytes) -> str:
@@ -253,17 +288,28 @@ def _find_code_problem(content: bytes) -> str:
         return f"uses {found[0]!r}"
     if any(family not in _CLASSES for family in _CLASS.findall(text)):
         return "uses native classes other than those of quantized networks"
-    # an escape in a text may stand for something that torch writes plainly, or that
-    # steers a terminal
-    escapes = _ESCAPE.findall(text)
-    hidden = any(
-        # digits are octal; codes below 128 are plain ASCII
-        not e.isdigit() or (int(e, 8) < 128 and int(e, 8) not in _WHITE)
-        for e in escapes
+    has_control_character = any(
+        ord(sign) < 32 and ord(sign) not in _WHITE for sign in text
     )
-    if hidden or any(ord(sign) < 32 and ord(sign) not in _WHITE for sign in text):
+    if has_control_character or any(map(_hides_character, _ESCAPE.findall(text))):
         return "has text with hidden characters"
     return ""
+
+
+def _hides_character(escape: str) -> bool:
+    r"""Return whether an escape in a text of source code may hide what it stands for.
+
+    It may be a character that torch writes plainly, or one that steers a terminal.
+
+    Args:
+        escape: what stands behind the backslash: octal digits, as torch writes them for
+            bytes of other languages; or the beginning of another escape, such as x1b.
+    """
+    if not escape.isdigit():
+        return True
+    code = int(escape, 8)
+    is_ascii = code < 128
+    return is_ascii and code not in _WHITE
 
 
 class _Inert:
@@ -317,6 +363,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
         raise make_archive_error(
             archive.path, f"{name!r} is damaged ({get_first_line(error)})"
         ) from None
+    # of torch's native classes only those of quantized networks and the like are plain
     if any(
         family not in _CLASSES
         for text in reader.names
@@ -326,57 +373,80 @@ def _check_pickle(archive: Archive, name: str) -> None:
             archive.path, f"{name!r} holds native objects, which are never loaded"
         )
     _check_values(archive, name, value)
-    # torch reads as many numbers as are stated, be they there or not
     for storage in reader.storages:
-        # torch writes ("storage", type, member, device, count of numbers)
-        parts = (
-            storage if isinstance(storage, tuple) and len(storage) == 5 else (None,) * 5
+        _check_storage(archive, PICKLES[name], storage)
+
+
+def _check_storage(archive: Archive, folder: str, storage: Any) -> None:
+    """Check that the data of a tensor is there in full.
+
+    torch reads as many numbers as are stated, be they there or not.
+
+    Args:
+        archive: the archive.
+        folder: folder of the data in it.
+        storage: what a pickle has in the place of the data. torch writes ("storage",
+            type, member, device, count of numbers).
+
+    Raises:
+        FileFormatError: it is of another form, or there is less data.
+    """
+    item_type: Any = None
+    member: Any = None
+    count: Any = None
+    if isinstance(storage, tuple) and len(storage) == 5:
+        _, item_type, member, _, count = storage
+    kind = getattr(item_type, "name", "")
+    key = f"{folder}/{member}"
+    if kind not in _ITEM_BYTES or not isinstance(count, int) or count < 0:
+        raise make_archive_error(
+            archive.path, f"has a tensor of another kind in {key[:80]!r}"
         )
-        kind = getattr(parts[1], "name", "")
-        key = f"{PICKLES[name]}/{parts[2]}"
-        count = parts[4]
-        if kind not in _ITEM_BYTES or not isinstance(count, int) or count < 0:
-            raise make_archive_error(
-                archive.path, f"has a tensor of another kind in {key[:80]!r}"
-            )
-        size = archive.members[key].file_size if key in archive else 0
-        if count * _ITEM_BYTES[kind] > size:
-            got = f"{key[:80]!r} has {size:,} bytes, but should hold {count:,} numbers"
-            raise make_archive_error(archive.path, f"is damaged: {got}")
+    size = archive.members[key].file_size if key in archive else 0
+    if count * _ITEM_BYTES[kind] > size:
+        got = f"{key[:80]!r} has {size:,} bytes, but should hold {count:,} numbers"
+        raise make_archive_error(archive.path, f"is damaged: {got}")
 
 
 def _check_values(archive: Archive, name: str, value: Any) -> None:
-    """Check the texts in a nested value, one level of nesting after the other, each
-    object once.
+    """Check the texts in a nested value of a pickle.
+
+    Each object is looked at once, however often the pickle names it; those at one
+    depth come before those below.
 
     Raises:
         FileFormatError: a text has hidden characters, or the nesting is deeper than
             `DEPTH`.
     """
-    level = [value]
+    level = [value]  # the objects at one depth
     checked_ids = {id(value)}
     for _ in range(DEPTH):
-        signs = {sign for item in level if isinstance(item, str) for sign in item}
-        if any(ord(sign) not in _WHITE and not sign.isprintable() for sign in signs):
+        characters = {char for item in level if isinstance(item, str) for char in item}
+        if any(
+            ord(char) not in _WHITE and not char.isprintable() for char in characters
+        ):
             raise make_archive_error(
                 archive.path, f"{name!r} has text with hidden characters"
             )
-        # each once: a pickle may name one part any number of times
-        new = dict[int, Any]()
+        new_by_id = dict[int, Any]()
         for outer in level:
-            inside: Iterable[Any] = ()
-            if isinstance(outer, dict):
-                inside = chain(outer, outer.values())
-            elif isinstance(outer, (list, tuple, _Inert)):
-                inside = outer.parts if isinstance(outer, _Inert) else outer
-            new |= {
-                id(inner): inner for inner in inside if id(inner) not in checked_ids
-            }
-        level = list(new.values())
-        checked_ids.update(new)
+            for inner in _list_inner_values(outer):
+                if id(inner) not in checked_ids:
+                    new_by_id[id(inner)] = inner
+        level = list(new_by_id.values())
+        checked_ids.update(new_by_id)
         if not level:
             return
     raise make_archive_error(archive.path, f"{name!r} is nested deeper than {DEPTH}")
+
+
+def _list_inner_values(value: Any) -> Iterable[Any]:
+    """Return what is directly in a value that was read from a pickle."""
+    if isinstance(value, dict):
+        return chain(value, value.values())
+    if isinstance(value, _Inert):
+        return value.parts
+    return value if isinstance(value, (list, tuple)) else ()
 
 
 @contextlib.contextmanager
@@ -386,10 +456,11 @@ def without_unpickling() -> Iterator[None]:
 
     It sets an environment variable of torch, and restores the old value afterwards.
     """
-    switches = ("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
+    switch = "TORCH_FORCE_WEIGHTS_ONLY_LOAD"
     # torch refuses to load where both are set
+    switches = (switch, "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
     before = {key: os.environ.pop(key) for key in switches if key in os.environ}
-    os.environ[switches[0]] = "1"
+    os.environ[switch] = "1"
     try:
         yield
     finally:

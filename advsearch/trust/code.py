@@ -64,44 +64,63 @@ def allowed_code() -> tuple[str, ...]:
 
 
 def allow_named(settings: Mapping[str, Any]) -> None:
-    """Allow the code that settings name which a person has typed, or given in Python.
+    """Allow the code that a person names in settings, by typing them or in Python.
 
-    Looked at are models, controls and metrics, in each form that they may have.
-    Settings that come from a file are never given to this.
+    It is named by models, controls and metrics. Settings that come from a file are
+    never given to this function.
     """
     names: list[object] = []
     for key in ("model", "compared", "than"):
-        texts = [text for text in _to_list(settings.get(key)) if isinstance(text, str)]
-        # several models have commas between them, and each may have @WEIGHTS
-        names += [part.partition("@")[0] for text in texts for part in text.split(",")]
+        names += _list_model_names(settings.get(key))
     for key in ("controls", "over"):
-        value = settings.get(key)
-        # controls are a list of names or mappings, or a mapping from names to either
-        for control in (
-            *_to_list(value),
-            *(value.values() if isinstance(value, Mapping) else ()),
-        ):
-            names += (
-                control.split(",")
-                if isinstance(control, str)
-                else [getattr(control, "kind", None)]
-            )
-            names += [control.get("kind")] if isinstance(control, Mapping) else []
+        names += _list_control_names(settings.get(key))
     metrics = settings.get("metrics")
-    for metric in metrics.values() if isinstance(metrics, Mapping) else ():
-        names.append(
-            f"{metric.__module__}:{getattr(metric, '__qualname__', '')}"
-            if callable(metric)
-            else metric
-        )
+    if isinstance(metrics, Mapping):
+        names += map(_name_metric, metrics.values())
     texts = [name.strip() for name in names if isinstance(name, str)]
     # plain names, such as those of bundled models, need no permission
     _ALLOWED.update(filter(_CODE.fullmatch, texts))
 
 
+def _list_model_names(value: Any) -> list[str]:
+    """Return the names in a setting of models: one, or several with commas between
+    them or in a list, each perhaps with @WEIGHTS.
+    """
+    texts = [text for text in _to_list(value) if isinstance(text, str)]
+    return [part.partition("@")[0] for text in texts for part in text.split(",")]
+
+
+def _list_control_names(value: Any) -> list[object]:
+    """Return what may name code in a setting of controls: their names and kinds.
+
+    Args:
+        value: a list of names, mappings or instances; or a mapping from names to
+            mappings or instances.
+    """
+    controls = _to_list(value)
+    if isinstance(value, Mapping):
+        controls += value.values()
+    names: list[object] = []
+    for control in controls:
+        if isinstance(control, str):
+            names += control.split(",")
+        elif isinstance(control, Mapping):
+            names.append(control.get("kind"))
+        else:
+            names.append(getattr(control, "kind", None))
+    return names
+
+
+def _name_metric(metric: Any) -> Any:
+    """Return the name of the code of a metric that is a function; any other as it is."""
+    if callable(metric):
+        return f"{metric.__module__}:{getattr(metric, '__qualname__', '')}"
+    return metric
+
+
 def allow_code_of_call(function: Function) -> Function:
-    """Decorate a function so that the code which its caller names in the arguments is
-    allowed (`allow_named`).
+    """Make a function allow the code that its caller names in the arguments
+    (`allow_named`).
 
     It is for functions that are called from Python only, never with what a file says.
     """
@@ -109,8 +128,8 @@ def allow_code_of_call(function: Function) -> Function:
 
     @wraps(function)
     def wrapper(*args: Any, **keywords: Any) -> Any:
-        # bind raises it for arguments that do not fit; the function's own error is
-        # better
+        # Arguments that do not fit the signature raise TypeError here; the call below
+        # raises a better one.
         with suppress(TypeError):
             allow_named(signature.bind(*args, **keywords).arguments)
         return function(*args, **keywords)
@@ -119,6 +138,7 @@ def allow_code_of_call(function: Function) -> Function:
 
 
 def _to_list(value: Any) -> list[Any]:
+    """Return the items of a list, the names of a mapping, or any other value alone."""
     return list(value) if isinstance(value, (list, tuple, Mapping)) else [value]
 
 
@@ -160,9 +180,8 @@ def check_import(name: str) -> None:
         return
     importlib.invalidate_caches()
     # finding the top package runs nothing of it
-    spec = PathFinder.find_spec(
-        name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()]
-    )
+    top_package = name.partition(":")[0].partition(".")[0]
+    spec = PathFinder.find_spec(top_package, [*sys.path, os.getcwd()])
     where = f" from {spec.origin}" if spec is not None and spec.origin else ""
     raise CodeNotAllowedError(
         f"a file names {name}, Python code{where} that would be imported and run; read "

@@ -53,7 +53,7 @@ def check_schema(db: sqlite3.Connection, path: Path, statements: str) -> None:
     More is refused: a view or a trigger is code, and may never end.
 
     Args:
-        db: is closed before the error.
+        db: the database; it is closed if the check fails.
         path: path of its file, for the error.
         statements: SQL that makes the right schema.
     """
@@ -66,6 +66,7 @@ def check_schema(db: sqlite3.Connection, path: Path, statements: str) -> None:
 
 @cache
 def _schema_of(statements: str) -> Counter[Any]:
+    """Return the schema that SQL statements make, as `read_schema` returns it."""
     with closing(sqlite3.connect(":memory:")) as db:
         db.executescript(statements)
         return read_schema(db)
@@ -95,11 +96,10 @@ def _strip_comments(statement: str) -> str:
 
 
 def protect(db: sqlite3.Connection) -> None:
-    """Let a stranger's file call no function of its own choosing, and let SQLite look
-    at each page that it reads.
+    """Make SQLite careful with a database that may be somebody else's: its schema calls
+    no functions, and each page is checked when it is read.
 
-    Nothing here needs the schema, so nothing of the file's own statements has run by
-    then.
+    Nothing here reads the schema, so none of the file's own statements has run by then.
     """
     db.execute("PRAGMA trusted_schema = OFF")
     db.execute("PRAGMA writable_schema = OFF")
@@ -133,24 +133,29 @@ def _check_journal(journal: Path) -> None:
     if not os.path.lexists(journal):
         return
     with open_regular(journal, "a journal of SQLite", LARGEST) as file:
-        file.seek(-min(len(_JOURNAL), os.fstat(file.fileno()).st_size), os.SEEK_END)
-        if file.read() == _JOURNAL:
+        size = os.fstat(file.fileno()).st_size
+        file.seek(-min(len(_JOURNAL), size), os.SEEK_END)
+        last_bytes = file.read()
+        if last_bytes == _JOURNAL:
             raise FileFormatError(
-                f"{journal}: expected the journal of one file, got "
-                "one that names another; remove it"
+                f"{journal}: expected the journal of one file, got one that names "
+                "another; remove it"
             )
 
 
 def connect_to_read(path: Path) -> sqlite3.Connection:
     """Open a database for reading.
 
-    Beside a database in WAL mode SQLite has to make a file. Where it can't (a read-only
-    disk), the database is opened as one that never changes.
+    To read a database in WAL mode SQLite has to make a file beside it. Where it can't
+    (a read-only disk), the database is opened as one that never changes.
+
+    Raises:
+        FileFormatError: there is no such file.
     """
     if not os.path.isfile(path):
         raise FileFormatError(
-            f"{path}: expected the results of a run, got no such "
-            "file; check the name of the run"
+            f"{path}: expected the results of a run, got no such file; check the name "
+            "of the run"
         )
     address = path.resolve().as_uri()
     db = sqlite3.connect(f"{address}?mode=ro", uri=True)

@@ -40,9 +40,8 @@ NUMBER = 1 << 63  # numbers are smaller than this
 
 FUNCTIONS = frozenset(
     "Integer Rational Float Add Mul Max Min Mod Abs Eq Ne Lt Le Gt Ge Equality "
-    "Unequality StrictLessThan LessThan "
-    "StrictGreaterThan GreaterThan And Or Not Piecewise ExprCondPair FloorDiv "
-    "ModularIndexing Where PythonMod CleanDiv "
+    "Unequality StrictLessThan LessThan StrictGreaterThan GreaterThan And Or Not "
+    "Piecewise ExprCondPair FloorDiv ModularIndexing Where PythonMod CleanDiv "
     "CeilToInt FloorToInt CeilDiv FloatTrueDiv IntTrueDiv "
     "IsNonOverlappingAndDenseIndicator TruncToFloat TruncToInt "
     "RoundToInt RoundDecimal ToFloat Identity floor ceiling".split()
@@ -83,14 +82,13 @@ def problem(text: object) -> str:
         tree = ast.parse(text.strip(), mode="eval")
         _check(tree.body, DEPTH, EXPONENT)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        reason = (
-            # a plain ValueError is from `_check`; those of Python are subclasses
-            str(error.args[0]) if type(error) is ValueError else "it cannot be read"
-        )
+        reason = "it cannot be read"
+        # a plain ValueError is from `_check`; those of Python are subclasses
+        if type(error) is ValueError:
+            reason = str(error.args[0])
         return (
             "expected arithmetic with whole numbers and symbols, got "
-            f"{text[:60]!r} "
-            f"({reason})"
+            f"{text[:60]!r} ({reason})"
         )
     return ""
 
@@ -109,43 +107,16 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
     operands: list[ast.expr] = []
     match node:
         case ast.Constant(value=number):
-            if not isinstance(number, (int, float)):
-                raise ValueError("text")
-            if isinstance(number, int) and abs(number) >= NUMBER:
-                raise ValueError("a number that is too large")
+            _check_number(number)
         case ast.Name(id=name):
             # symbols are numbered by torch: s0, u12
-            if not (name in NAMES or (is_symbol(name) and name[-1].isdigit())):
+            is_numbered_symbol = is_symbol(name) and name[-1].isdigit()
+            if name not in NAMES and not is_numbered_symbol:
                 raise ValueError(f"the name {name[:40]!r}")
-        case ast.Call(
-            func=ast.Name(id="Symbol" | "Float" as name), args=arguments, keywords=words
-        ):
-            text = (
-                arguments[0].value
-                if len(arguments) == 1 and isinstance(arguments[0], ast.Constant)
-                else None
-            )
-            keyword_names = {word.arg for word in words}
-            keyword_values = [
-                word.value.value if isinstance(word.value, ast.Constant) else None
-                for word in words
-            ]  # repeated keys too
-            if name == "Symbol":  # Symbol('s0', positive=True, integer=True)
-                has_plain_assumptions = None not in keyword_names and all(
-                    isinstance(value, bool) for value in keyword_values
-                )
-                if not (
-                    isinstance(text, str) and is_symbol(text) and has_plain_assumptions
-                ):
-                    raise ValueError("a symbol of another form")
-            elif not (
-                isinstance(text, str) and _DECIMAL.fullmatch(text)
-            ):  # Float('0.5', precision=53)
-                raise ValueError("a number of another form")
-            elif not keyword_names <= {"precision", "prec", "dps"} or not all(
-                isinstance(value, int) and 0 < value <= 200 for value in keyword_values
-            ):
-                raise ValueError("a number of another precision")
+        case ast.Call(func=ast.Name(id="Symbol")):
+            _check_symbol(node)
+        case ast.Call(func=ast.Name(id="Float")):
+            _check_decimal(node)
         # any other call has no keywords
         case ast.Call(keywords=[_, *_]):
             raise ValueError("keywords")
@@ -180,42 +151,80 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
         _check(operand, depth - 1, power)
 
 
-def _power_left(exponent: ast.expr, power: int) -> int:
-    """Return by how much exponents below this one may still multiply: `power` divided
-    by it.
+def _check_number(value: object) -> None:
+    """Raise ValueError unless a constant is a number of at most 64 bits."""
+    if not isinstance(value, (int, float)):
+        raise ValueError("text")
+    if isinstance(value, int) and abs(value) >= NUMBER:
+        raise ValueError("a number that is too large")
 
-    It may be a whole number, also with a sign or in ``Integer(...)``, or half: a root
-    multiplies nothing up.
+
+def _check_symbol(call: ast.Call) -> None:
+    """Raise ValueError unless a call is like Symbol('s0', positive=True, integer=True)."""
+    text = _get_only_argument(call)
+    assumptions = [_get_constant(keyword.value) for keyword in call.keywords]
+    # None is the name of **keywords
+    has_names = all(keyword.arg is not None for keyword in call.keywords)
+    are_plain = has_names and all(isinstance(value, bool) for value in assumptions)
+    if not isinstance(text, str) or not is_symbol(text) or not are_plain:
+        raise ValueError("a symbol of another form")
+
+
+def _check_decimal(call: ast.Call) -> None:
+    """Raise ValueError unless a call is like Float('0.5', precision=53)."""
+    text = _get_only_argument(call)
+    if not isinstance(text, str) or not _DECIMAL.fullmatch(text):
+        raise ValueError("a number of another form")
+    names = {keyword.arg for keyword in call.keywords}
+    precisions = [_get_constant(keyword.value) for keyword in call.keywords]
+    if not names <= {"precision", "prec", "dps"} or not all(
+        isinstance(value, int) and 0 < value <= 200 for value in precisions
+    ):
+        raise ValueError("a number of another precision")
+
+
+def _get_only_argument(call: ast.Call) -> object:
+    """Return the constant that is the only positional argument of a call; None if it is
+    something else, or not the only one.
+    """
+    return _get_constant(call.args[0]) if len(call.args) == 1 else None
+
+
+def _get_constant(node: ast.expr) -> object:
+    """Return the value of a constant; None for any other node."""
+    return node.value if isinstance(node, ast.Constant) else None
+
+
+def _power_left(exponent: ast.expr, power: int) -> int:
+    """Return how large the product of the exponents below this one may still become:
+    `power` divided by it.
+
+    It may be a whole number, also with a sign or in ``Integer(...)``; or a half, a root
+    that makes nothing larger.
 
     Raises:
         ValueError: it is anything else, or larger than `power`.
     """
     exponent = _without_sign(exponent)
-    if (
-        isinstance(exponent, ast.Call)
-        and isinstance(exponent.func, ast.Name)
-        and exponent.func.id == "Integer"
-    ):
-        exponent = (
-            _without_sign(exponent.args[0]) if len(exponent.args) == 1 else exponent
-        )
+    match exponent:
+        case ast.Call(func=ast.Name(id="Integer"), args=[number]):
+            exponent = _without_sign(number)
     if isinstance(exponent, ast.Call) and ast.unparse(exponent) in (
         "Rational(1, 2)",
         "Rational(-1, 2)",
     ):
         return power
-    value = exponent.value if isinstance(exponent, ast.Constant) else None
+    value = _get_constant(exponent)
     if not isinstance(value, int) or isinstance(value, bool) or value > power:
         raise ValueError("an exponent that is not a small number")
     return power // max(value, 1)
 
 
 def _without_sign(node: ast.expr) -> ast.expr:
-    return (
-        node.operand
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub)
-        else node
-    )
+    """Return the operand of a minus sign; any other node as it is."""
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        return node.operand
+    return node
 
 
 PROGRAM = "models/model.json"
@@ -269,6 +278,8 @@ _GLOBALS = re.compile(
     r"|torch (u?int|b?float|complex|bool)[0-9]*\w*"
 )
 """What the pickle of a tensor names; nothing of it runs anything."""
+_OTHER_IMPORTS = ("STACK_GLOBAL", "INST", "OBJ", "EXT1", "EXT2", "EXT4")
+"""Steps of a pickle that name a class in another way; torch.save uses none of them."""
 
 _CONTAINERS = frozenset(
     [
@@ -297,16 +308,7 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
 
     # archives up to torch 2.7 have other names for the same members
     names = {new: old if old in archive else new for new, old in OLD_NAMES.items()}
-    program = archive.read_json(names[PROGRAM])
-    if not isinstance(program, dict) or not isinstance(
-        program.get("graph_module"), dict
-    ):
-        expected = f"expected a network in {names[PROGRAM]!r}, got other JSON"
-        raise make_archive_error(
-            archive.path, f"cannot be read as torch.export ({expected})"
-        )
-    # raises, and leaves out what is not needed
-    program = _check_value(archive.path, program, "")
+    program = _read_program(archive, names[PROGRAM])
     for name in EXAMPLE:
         if name in archive:
             _check_pickle(archive, name)
@@ -315,20 +317,36 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
         writer.write_bytes(PROGRAM, json.dumps(program).encode())
         # torch wants the member, and takes an empty one
         writer.write_bytes(EXAMPLE[0], b"")
-        for folder, kind in (
-            ("data/weights/", "weights"),
-            ("data/constants/", "constants"),
-        ):
-            old = names[f"{folder}model.pt"]
-            if old in archive:
-                _check_pickle(archive, old)
-                writer.write_bytes(f"{folder}model.pt", archive.read(old))
+        for kind in ("weights", "constants"):
+            folder = f"data/{kind}/"
+            # either one pickle of all tensors, or a record for each
+            pickle_name = names[f"{folder}model.pt"]
+            if pickle_name in archive:
+                _check_pickle(archive, pickle_name)
+                writer.write_bytes(f"{folder}model.pt", archive.read(pickle_name))
             else:
-                _copy_tensors(
-                    archive, writer, folder, f"{folder}model_{kind}_config.json"
-                )
+                config = f"{folder}model_{kind}_config.json"
+                _copy_tensors(archive, writer, folder, config)
     buffer.seek(0)
     return buffer
+
+
+def _read_program(archive: Archive, name: str) -> Any:
+    """Return the description of the network in a member, checked and without what is
+    not needed.
+
+    Raises:
+        FileFormatError: it is something else, or has what a plain network does not have.
+    """
+    program = archive.read_json(name)
+    if not isinstance(program, dict) or not isinstance(
+        program.get("graph_module"), dict
+    ):
+        expected = f"expected a network in {name!r}, got other JSON"
+        raise make_archive_error(
+            archive.path, f"cannot be read as torch.export ({expected})"
+        )
+    return _check_value(archive.path, program, "")
 
 
 def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> None:
@@ -356,29 +374,10 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             f"expected a table of tensors in {config!r}, got something else",
         )
     table = _check_value(archive.path, table, "tensor_name")
-    copied: set[str] = set()
+    copied: set[str] = set()  # tensors that share their numbers name one record
     for name, entry in table.items():
-        record = entry.get("path_name") if isinstance(entry, dict) else None
-        is_plain = isinstance(record, str) and _RECORD.fullmatch(record)
-        if not isinstance(entry, dict) or entry.get("use_pickle") or not is_plain:
-            raise make_archive_error(
-                archive.path,
-                f"{name[:80]!r} is a pickled object or "
-                "compiled code, which is never loaded",
-            )
-        member = f"{folder}{record}"
-        meta = entry.get("tensor_meta")
-        sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
-        entries = sizes if isinstance(sizes, list) else [None]
-        shape: list[Any] = [
-            size.get("as_int") if isinstance(size, dict) else None for size in entries
-        ]
-        if not all(isinstance(size, int) and size >= 0 for size in shape):
-            raise make_archive_error(
-                archive.path,
-                "expected the sizes of a tensor for "
-                f"{member[:80]!r}, got something else",
-            )
+        member = f"{folder}{_get_record(archive, name, entry)}"
+        shape = _read_shape(archive, member, entry)
         # torch makes a tensor without data of whatever size it is told
         if (
             member in archive
@@ -393,6 +392,44 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             writer.write_bytes(member, archive.read(member))
             copied.add(member)
     writer.write_bytes(config, json.dumps({"config": table}).encode())
+
+
+def _get_record(archive: Archive, name: str, entry: Any) -> str:
+    """Return the name of the file with the numbers of a tensor, by its entry in the
+    table.
+
+    Raises:
+        FileFormatError: it is a pickle, or no plain file in the folder of the tensors.
+    """
+    record = entry.get("path_name") if isinstance(entry, dict) else None
+    if isinstance(record, str) and _RECORD.fullmatch(record):
+        if not entry.get("use_pickle"):
+            return record
+    raise make_archive_error(
+        archive.path,
+        f"{name[:80]!r} is a pickled object or compiled code, which is never loaded",
+    )
+
+
+def _read_shape(archive: Archive, member: str, entry: JsonObject) -> list[int]:
+    """Return the sizes of a tensor, by its entry in the table.
+
+    Raises:
+        FileFormatError: they are something else than whole numbers from 0.
+    """
+    meta = entry.get("tensor_meta")
+    sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
+    if not isinstance(sizes, list):
+        sizes = [None]  # refused below
+    shape: list[Any] = [
+        size.get("as_int") if isinstance(size, dict) else None for size in sizes
+    ]
+    if not all(isinstance(size, int) and size >= 0 for size in shape):
+        raise make_archive_error(
+            archive.path,
+            f"expected the sizes of a tensor for {member[:80]!r}, got something else",
+        )
+    return shape
 
 
 # ---- the description of the network
@@ -420,16 +457,17 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
         return value
     checked: JsonObject = {}
     for name, inner in value.items():
+        # names of values stand as keys, too: they are checked like a text under `key`
         wrong = "" if name in ("", *_FORGOTTEN) else _problem(name, key)
-        if name in ("as_custom_obj", "custom_obj") or (
-            name == "custom_obj_values" and inner
-        ):
+        is_custom_object = name in ("as_custom_obj", "custom_obj")
+        if is_custom_object or (name == "custom_obj_values" and inner):
             wrong = "holds a custom object, which is never loaded"
         if wrong:
             raise make_archive_error(path, wrong)
-        checked[name] = (
-            _FORGOTTEN[name] if name in _FORGOTTEN else _check_value(path, inner, name)
-        )
+        if name in _FORGOTTEN:
+            checked[name] = _FORGOTTEN[name]
+        else:
+            checked[name] = _check_value(path, inner, name)
     return checked
 
 
@@ -438,7 +476,8 @@ def _problem(value: Any, key: str) -> str:
     nothing does.
     """
     if isinstance(value, str):
-        return _TEXTS.get(key, _plain_problem)(value)
+        find_problem = _TEXTS.get(key, _plain_problem)
+        return find_problem(value)
     if key == "expr_str":
         return "an expression that is no text"
     if isinstance(value, int) and abs(value) >= NUMBER:
@@ -488,34 +527,38 @@ def _tree_problem(text: str) -> str:
     Torch imports the types that it names, so only tuples, lists and dicts are allowed.
 
     Args:
-        text: JSON of [version, node]; a node has a type, a context (the keys of a dict)
-            and its children.
+        text: JSON of [version, node]; a node has a type, a context (the keys of a dict,
+            as JSON) and its children.
     """
     try:
         version, tree = parse_json(text)
         nodes: list[Any] = [tree]
         while nodes:
             node = nodes.pop()
-            context = "[]" if node["context"] in (None, "null") else node["context"]
-            # the keys of a dict; a tuple or list has none
-            names: Any = parse_json(context) if isinstance(context, str) else None
-            is_plain = isinstance(names, list) and all(
-                isinstance(name, (str, int)) for name in names
-            )
-            if (
-                node["type"] not in _CONTAINERS
-                or not is_plain
-                or any(_plain_problem(str(name)) for name in names)
-            ):
-                return (
-                    "has inputs or outputs in a container that is no tuple, list "
-                    "or "
-                    "dict"
-                )
+            has_plain_keys = _has_plain_keys(node["context"])
+            if node["type"] not in _CONTAINERS or not has_plain_keys:
+                return "has inputs or outputs in a container that is no tuple, list or dict"
             nodes += node["children_spec"]
     except (ValueError, TypeError, KeyError, RecursionError):
         return f"expected the structure of inputs or outputs, got {text[:60]!r}"
     return "" if version == 1 else "has inputs or outputs of another version"
+
+
+def _has_plain_keys(context: Any) -> bool:
+    """Return whether the context of a container is a JSON list of plain names or
+    numbers, the keys of a dict; a tuple or a list has no context.
+
+    Raises:
+        ValueError: it is a text that is not JSON.
+    """
+    if context in (None, "null"):
+        return True
+    if not isinstance(context, str):
+        return False
+    keys = parse_json(context)
+    return isinstance(keys, list) and all(
+        isinstance(key, (str, int)) and not _plain_problem(str(key)) for key in keys
+    )
 
 
 _TEXTS: dict[str, Callable[[str], str]] = {
@@ -551,33 +594,22 @@ def _check_pickle(archive: Archive, name: str) -> None:
     data = archive.read(name)
     if not data:
         return
-    what = (
+    refusal = make_archive_error(
+        archive.path,
         f"cannot be read as torch.export ({name!r} is in need of unpickling, which "
-        "is never done)"
+        "is never done)",
     )
-    inner = (
-        open_archive(archive.path, io.BytesIO(data), len(data))
-        # the first bytes of a zip archive
-        if data[:2] == b"PK"
-        else None
-    )
-    if inner is None or "data.pkl" not in inner:
-        raise make_archive_error(archive.path, what)
+    is_zip = data[:2] == b"PK"
+    if not is_zip:
+        raise refusal
+    inner = open_archive(archive.path, io.BytesIO(data), len(data))
+    if "data.pkl" not in inner:
+        raise refusal
     try:
         steps = list(pickletools.genops(inner.read("data.pkl", LARGEST_TEXT)))
     except (ValueError, IndexError, UnicodeDecodeError):
-        raise make_archive_error(archive.path, what) from None
+        raise refusal from None
     for step, argument, _ in steps:
-        names_other_class = step.name == "GLOBAL" and not _GLOBALS.fullmatch(
-            str(argument)
-        )
-        if names_other_class or step.name in (
-            # other ways to name a class; torch.save uses none of them
-            "STACK_GLOBAL",
-            "INST",
-            "OBJ",
-            "EXT1",
-            "EXT2",
-            "EXT4",
-        ):
-            raise make_archive_error(archive.path, what)
+        imports_other = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
+        if imports_other or step.name in _OTHER_IMPORTS:
+            raise refusal

@@ -19,7 +19,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -48,9 +48,8 @@ class TimedOut(Exception):
 
     def __init__(self) -> None:
         super().__init__(
-            f"no answer within {scale_limit(LONGEST)} seconds; if you trust it, {FACTOR}=10 "
-            "in the environment "
-            "waits ten times as long"
+            f"no answer within {scale_limit(LONGEST)} seconds; if you trust it, "
+            f"{FACTOR}=10 in the environment waits ten times as long"
         )
 
 
@@ -69,11 +68,12 @@ def run_within_limits(
             thread may go on.
     """
     outcome: Future[Result] = Future()
-    gradients = torch.is_grad_enabled()  # a thread has its own
+    # each thread has this switch for itself: the new one takes it over
+    records_gradients = torch.is_grad_enabled()
 
     def work() -> None:
         try:
-            with torch.set_grad_enabled(gradients):
+            with torch.set_grad_enabled(records_gradients):
                 outcome.set_result(call())
         except BaseException as error:
             outcome.set_exception(error)
@@ -85,7 +85,7 @@ def run_within_limits(
     if thread.is_alive():
         if stop is not None:
             stop()
-            thread.join(GRACE)
+            thread.join(GRACE)  # its result would be too late all the same
         raise TimedOut
     return outcome.result()
 
@@ -95,12 +95,12 @@ def try_torchscript(archive: io.BytesIO) -> str:
     is.
 
     In this process it could not be stopped: torch keeps Python waiting while it loads.
-    Only a crash and too long a time are told. An error that torch raises is not, since
-    loading it here raises it again.
+    Only a crash and too long a time are reported. An error that torch raises is not,
+    since loading it here raises it again.
     """
     command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             command,
             input=archive.getbuffer(),
             capture_output=True,
@@ -109,12 +109,9 @@ def try_torchscript(archive: io.BytesIO) -> str:
         )
     except subprocess.TimeoutExpired:
         return str(TimedOut())
-    return (
-        f"torch crashed while loading it (signal {-done.returncode})"
-        # a negative status is minus the number of a signal
-        if done.returncode < 0
-        else ""
-    )
+    if process.returncode < 0:  # minus the number of the signal that ended it
+        return f"torch crashed while loading it (signal {-process.returncode})"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -132,13 +129,13 @@ class Switches:
 
     @classmethod
     def read_current(cls) -> Switches:
-        """Return them as they are."""
-        new = torch.get_default_dtype(), torch.get_default_device()
+        """Return the switches as torch has them now."""
         return cls(
-            *new,
-            torch.is_grad_enabled(),
-            torch.get_deterministic_debug_mode(),
-            torch.is_anomaly_enabled(),
+            dtype=torch.get_default_dtype(),
+            device=torch.get_default_device(),
+            gradients=torch.is_grad_enabled(),
+            deterministic=torch.get_deterministic_debug_mode(),
+            anomalies=torch.is_anomaly_enabled(),
         )
 
     def apply(self) -> None:
@@ -165,11 +162,10 @@ def use_plain_switches() -> Iterator[None]:
     """Inside the block, set torch's global switches to their defaults (`PLAIN`), and
     leave `torch.inference_mode`; restore them afterwards.
     """
-    with (
-        torch.inference_mode(False)
-        if torch.is_inference_mode_enabled()
-        else nullcontext()
-    ):
+    leaves_inference_mode: AbstractContextManager[Any] = nullcontext()
+    if torch.is_inference_mode_enabled():
+        leaves_inference_mode = torch.inference_mode(False)
+    with leaves_inference_mode:
         before = Switches.read_current()
         _outside.append(before)
         if before != PLAIN:
@@ -186,26 +182,26 @@ def find_code_switches() -> Switches:
     """Return the switches that the code of a network is to run with, and set `PLAIN`
     again.
 
-    Call it inside `use_plain_switches`, after the code was loaded. Where loading it has
-    turned switches, it runs with those, else with the ones from before the outermost
+    Call it inside `use_plain_switches`, after the code was loaded. The switches are
+    those that loading it has set; if it has set none, those from before the outermost
     `use_plain_switches`.
     """
-    turned = Switches.read_current()
-    if turned == PLAIN:
+    current = Switches.read_current()
+    if current == PLAIN:  # loading the code has set none
         return _outside[0] if _outside else PLAIN
     PLAIN.apply()
-    return turned
+    return current
 
 
 def call_with_switches(module: nn.Module, switches: Switches) -> None:
-    """Make every call of a module use its own dtype and device for new tensors;
-    afterwards those of the caller are back.
+    """Make every call of a module use the dtype and device of `switches` for new
+    tensors; after the call those of the caller are back.
 
     It adds hooks to the module, unless both are the defaults.
     """
     if (switches.dtype, switches.device) == (PLAIN.dtype, PLAIN.device):
         return
-    # a stack, since a module may call itself
+    # of the callers; a stack, since a module may call itself
     before: list[Switches] = []
 
     def enter(*_: Any) -> None:
@@ -223,12 +219,13 @@ def get_first_line(error: BaseException) -> str:
     """Return an error of foreign code as one short line: its type, and the first line
     of its message with hidden characters escaped.
     """
+    text = type(error).__name__
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    lines = [
-        "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line)
-        for line in lines[:1]
-    ]
-    text = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    if lines:
+        first_line = "".join(
+            sign if sign.isprintable() else repr(sign)[1:-1] for sign in lines[0]
+        )
+        text = f"{text}: {first_line}"
     # 300 characters with the dots
     return text if len(text) <= 300 else text[:297] + "..."
 
@@ -241,9 +238,9 @@ def translate_errors(
     own errors pass unchanged.
 
     Args:
-        what: failed, the beginning of the message; the foreign error follows in
+        what: beginning of the message, what failed; the foreign error follows in
             brackets.
-        kind: kind of the new error.
+        kind: class of the new error.
     """
     try:
         yield

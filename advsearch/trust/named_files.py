@@ -38,6 +38,21 @@ def is_inside(path: Path | str, folder: Path | str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
+def _list_spellings(name: str) -> list[str]:
+    """Return the names that the file which a mesh file names may have, in the order in
+    which they are tried.
+
+    They are the name as written and as this system writes it, each as it is, without a
+    leading slash, and as a bare name in the folder of the mesh.
+    """
+    spellings = [
+        spelling
+        for text in (name.strip(), normalize_name(name))
+        for spelling in (text, text.lstrip("/"), os.path.basename(text))
+    ]
+    return [spelling for spelling in dict.fromkeys(spellings) if spelling]
+
+
 class References:
     """Finds the files that a mesh file names. `refused` are those that it could not
     get, as `normalize_name` gives them, and why: `MISSING`, `OUTSIDE` or another clause.
@@ -70,35 +85,25 @@ class References:
         Unlike `get` it does not add to `refused`.
         """
         reason = MISSING
-        spellings = (name.strip(), normalize_name(name))
-        # as written, without a leading slash, and the bare name in the mesh's folder
-        forms = [
-            form
-            for text in spellings
-            for form in (text, text.lstrip("/"), os.path.basename(text))
-        ]
-        # each once, in this order, without the empty one
-        for form in filter(None, dict.fromkeys(forms)):
+        for spelling in _list_spellings(name):
             try:
-                return self._content(form)
+                return self._read_once(spelling)
             except ValueError:  # a zero byte in the name
                 continue
             except OSError as error:
-                reason = (
-                    reason
-                    if error.errno in _NO_SUCH_NAME
-                    else f"cannot be read ({error.strerror})"
-                )
+                if error.errno not in _NO_SUCH_NAME:
+                    reason = f"cannot be read ({error.strerror})"
             except FileFormatError as error:
                 reason = str(error)
         return reason
 
-    def _content(self, name: str) -> bytes:
+    def _read_once(self, name: str) -> bytes:
         """Return the bytes of a file that another file names; each is read once.
 
         Raises:
             FileFormatError: it is outside of the folder, missing, no ordinary file,
                 or all files together are too large.
+            OSError: it cannot be read.
         """
         path = os.path.realpath(os.path.join(self._folder, name))
         if not is_inside(path, self._folder):
@@ -115,9 +120,9 @@ class References:
                     "files of at most {} bytes in all",
                 )
             except FileFormatError as error:
-                raise FileFormatError(
-                    f"is not read ({str(error).removeprefix(f'{path}: ')})"
-                ) from error
+                # the message becomes a clause about the name, without the path
+                text = str(error).removeprefix(f"{path}: ")
+                raise FileFormatError(f"is not read ({text})") from error
             self._contents[path] = data
             self._size += len(data)
         return self._contents[path]

@@ -53,29 +53,38 @@ def check_address(spec: str) -> SplitResult:
         raise InputError(
             f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})"
         ) from None
-    if not host or not spec.isascii() or not spec.isprintable() or " " in spec:
+    is_plain = spec.isascii() and spec.isprintable() and " " not in spec
+    if not host or not is_plain:
         raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH")
-    secret_names = [
-        name
-        for name, _ in parse_qsl(address.query)
-        if re.search("key|token|secret|passw|sig|auth", name, re.I)
-    ]
-    if "@" in address.netloc or secret_names:
-        where = (
-            f"`{secret_names[0]}` in the address"
-            if secret_names
-            else "the user and password in the address"
-        )
-        raise InputError(
-            f"model: {where} would be stored with the run; put the key "
-            f"into {KEY} and leave it out there"
-        )
+    _check_no_secret(address)
     if read_key() and address.scheme == "http" and not is_local(host):
         raise InputError(
             f"model {spec}: the key in {KEY} would go there unencrypted; "
             f"use https, or unset {KEY}"
         )
     return address
+
+
+def _check_no_secret(address: SplitResult) -> None:
+    """Check that an address has neither a password nor a key in its query.
+
+    Raises:
+        InputError: it has, by the names in its query.
+    """
+    secret_names = [
+        name
+        for name, _ in parse_qsl(address.query)
+        if re.search("key|token|secret|passw|sig|auth", name, re.I)
+    ]
+    if not secret_names and "@" not in address.netloc:
+        return
+    where = "the user and password in the address"
+    if secret_names:
+        where = f"`{secret_names[0]}` in the address"
+    raise InputError(
+        f"model: {where} would be stored with the run; put the key into {KEY} and "
+        "leave it out there"
+    )
 
 
 def is_local(host: str) -> bool:
@@ -125,70 +134,58 @@ def make_https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
     Raises:
         InputError: there is no program `openssl`, or it makes none.
     """
-    names = ",".join(
-        f"IP:{host}" if is_address(host) else f"DNS:{host}"
-        for host in dict.fromkeys(hosts)
-    )
     with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
         key = Path(folder) / "key.pem"
         certificate = Path(folder) / "certificate.pem"
         # made before openssl writes it, so that nobody else can read it
         key.touch(mode=0o600)
-        command = [
-            "openssl",
-            "req",
-            "-x509",
-            "-newkey",
-            "ec",
-            "-pkeyopt",
-            "ec_paramgen_curve:P-256",
-            "-nodes",
-        ]
-        command += [
-            "-keyout",
-            str(key),
-            "-out",
-            str(certificate),
-            "-days",
-            str(DAYS),
-            "-subj",
-            "/CN=advsearch",
-        ]
-        command += [
-            "-addext",
-            f"subjectAltName={names}",
-            "-addext",
-            "extendedKeyUsage=serverAuth",
-        ]
-        try:
-            subprocess.run(
-                command,
-                check=True,
-                capture_output=True,
-                timeout=30.0,
-                stdin=subprocess.DEVNULL,
-            )
-        except FileNotFoundError:
-            raise InputError(
-                "https: needs the program openssl, which makes the certificate; "
-                "apt-get install openssl, or leave "
-                "`host` and `https` out"
-            ) from None
-        except (OSError, subprocess.SubprocessError) as error:
-            text = (getattr(error, "stderr", None) or b"").decode(errors="replace")[
-                -300:
-            ]
-            raise InputError(
-                f"https: openssl made no certificate: {text or error}"
-            ) from None
+        _write_certificate(hosts, key, certificate)
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.load_cert_chain(certificate, key)
         data = ssl.PEM_cert_to_DER_cert(certificate.read_text(encoding="ascii"))
     digest = hashlib.sha256(data).hexdigest().upper()
-    return context, ":".join(
-        digest[index : index + 2] for index in range(0, len(digest), 2)
+    pairs = [digest[index : index + 2] for index in range(0, len(digest), 2)]
+    return context, ":".join(pairs)
+
+
+def _write_certificate(hosts: Sequence[str], key: Path, certificate: Path) -> None:
+    """Make a key and a self-signed certificate with openssl, and write them to files.
+
+    Raises:
+        InputError: there is no such program, or it fails.
+    """
+    names = ",".join(
+        f"IP:{host}" if is_address(host) else f"DNS:{host}"
+        for host in dict.fromkeys(hosts)
     )
+    command = [
+        *("openssl", "req", "-x509"),
+        *("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"),
+        *("-keyout", str(key), "-out", str(certificate)),
+        *("-days", str(DAYS), "-subj", "/CN=advsearch"),
+        *("-addext", f"subjectAltName={names}"),
+        *("-addext", "extendedKeyUsage=serverAuth"),
+    ]
+    try:
+        subprocess.run(
+            command,
+            check=True,
+            capture_output=True,
+            timeout=30.0,
+            stdin=subprocess.DEVNULL,
+        )
+    except FileNotFoundError:
+        raise InputError(
+            "https: needs the program openssl, which makes the certificate; apt-get "
+            "install openssl, or leave `host` and `https` out"
+        ) from None
+    except (OSError, subprocess.SubprocessError) as error:
+        output: bytes = getattr(error, "stderr", None) or b""
+        text = output.decode(errors="replace")[-300:]  # the end says what went wrong
+        raise InputError(
+            f"https: openssl made no certificate: {text or error}"
+        ) from None
 
 
 def is_address(host: str) -> bool:
@@ -205,8 +202,12 @@ def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
     """Inside the block, refuse every connection that this thread makes, unless
     `allowed`.
 
-    `tries` is extended by the address of each connection that was refused. Other
-    threads connect as usual.
+    It is for loading a model of a library that only a file names. Other threads connect
+    as usual.
+
+    Args:
+        allowed: refuse nothing.
+        tries: is extended by the address of each connection that was refused.
     """
     if allowed:
         yield
@@ -215,7 +216,7 @@ def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
     thread = threading.get_ident()
     before = {name: getattr(socket.socket, name) for name in names}
 
-    def refusing(name: str) -> Callable[[socket.socket, Any], Any]:
+    def make_refusing(name: str) -> Callable[[socket.socket, Any], Any]:
         def connect(self: socket.socket, address: Any) -> Any:
             if threading.get_ident() != thread:
                 return before[name](self, address)
@@ -225,7 +226,7 @@ def restrict_connections(allowed: bool, tries: list[object]) -> Iterator[None]:
         return connect
 
     for name in names:
-        setattr(socket.socket, name, refusing(name))
+        setattr(socket.socket, name, make_refusing(name))
     try:
         yield
     finally:

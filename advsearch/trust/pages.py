@@ -86,33 +86,46 @@ def check_request(
             HTTPStatus.FORBIDDEN,
             "a page of another origin asks; open the address that was printed",
         )
+    is_same_origin = headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")
     # another site may link to a page here, but not read or change anything
-    if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-        if headers.get("Sec-Fetch-Mode") != "navigate" or command == "POST":
-            raise RequestRejected(HTTPStatus.FORBIDDEN, "a page of another site asks")
-    if token is not None:
-        tokens = parse_qs(urlsplit(path).query).get("token", [])
-        for part in headers.get("Cookie", "").split(";"):
-            name, _, value = part.strip().partition("=")
-            if name == f"{COOKIE}-{port}":
-                tokens.append(value)
-        if not any(
-            # takes as long for a wrong token as for the right one
-            hmac.compare_digest(token, candidate)
-            for candidate in tokens
-            if candidate.isascii()
-        ):
-            raise RequestRejected(
-                HTTPStatus.UNAUTHORIZED,
-                "the token is missing; open the address that was printed",
-            )
+    follows_link = headers.get("Sec-Fetch-Mode") == "navigate" and command != "POST"
+    if not is_same_origin and not follows_link:
+        raise RequestRejected(HTTPStatus.FORBIDDEN, "a page of another site asks")
+    if token is not None and not _has_token(path, headers, port, token):
+        raise RequestRejected(
+            HTTPStatus.UNAUTHORIZED,
+            "the token is missing; open the address that was printed",
+        )
+
+
+def _has_token(path: str, headers: Message, port: int, token: str) -> bool:
+    """Return whether a request has the token of the server that listens at a port, in
+    its query or in the cookie that `make_token_cookie` makes.
+    """
+    tokens = parse_qs(urlsplit(path).query).get("token", [])
+    for part in headers.get("Cookie", "").split(";"):
+        name, _, value = part.strip().partition("=")
+        if name == f"{COOKIE}-{port}":
+            tokens.append(value)
+    # `compare_digest` takes ASCII only, and as long for a wrong token as for the right one
+    return any(
+        hmac.compare_digest(token, candidate)
+        for candidate in tokens
+        if candidate.isascii()
+    )
 
 
 def _is_server_address(host: str, named: str, port: int, token: str | None) -> bool:
     """Return whether the Host of a request is an address of this server.
 
     Any other name is refused: a site could let its own name lead here (DNS rebinding).
-    A number as address needs no name server, so it is always the right one.
+    A numeric address needs no name server, so it leads where it says.
+
+    Args:
+        host: what the request states, NAME:PORT.
+        named: the host that the server was told to listen at.
+        port: port that it listens at.
+        token: its token; None for a server that only this machine can reach.
     """
     name, _, port_text = host.rpartition(":")
     if not port_text.isdecimal() or int(port_text) != port:
@@ -144,14 +157,16 @@ def make_page_policy(digests: Iterable[str], *, connects: bool) -> str:
         digests: digests of the scripts that may run.
         connects: it may load pictures from its server, and send requests there.
     """
-    images, connect = (
-        ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
-    )
-    runs = "".join(f" 'sha256-{digest}'" for digest in sorted(digests))
-    scripts = f"; script-src{runs}" if runs else ""
+    images = "data:"
+    connections = ""
+    if connects:
+        images = "data: 'self'"
+        connections = "; connect-src 'self'"
+    hashes = "".join(f" 'sha256-{digest}'" for digest in sorted(digests))
+    scripts = f"; script-src{hashes}" if hashes else ""
     return (
         f"default-src 'none'; img-src {images}; style-src "
-        f"'unsafe-inline'{scripts}{connect}; base-uri 'none'"
+        f"'unsafe-inline'{scripts}{connections}; base-uri 'none'"
     )
 
 
@@ -166,12 +181,15 @@ def make_served_policy(digests: Iterable[str], *, is_generated: bool) -> str:
         digests: digests of all our scripts.
         is_generated: the server made the page itself.
     """
-    sandbox = (
-        "form-action 'none'; sandbox allow-scripts allow-popups "
-        "allow-popups-to-escape-sandbox"
-    )
-    closed = "form-action 'self'" if is_generated else sandbox
-    return f"{make_page_policy(digests, connects=is_generated)}; frame-ancestors 'none'; {closed}"
+    if is_generated:
+        limits = "form-action 'self'"
+    else:
+        limits = (
+            "form-action 'none'; sandbox allow-scripts allow-popups "
+            "allow-popups-to-escape-sandbox"
+        )
+    page_policy = make_page_policy(digests, connects=is_generated)
+    return f"{page_policy}; frame-ancestors 'none'; {limits}"
 
 
 def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
@@ -180,13 +198,13 @@ def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
     Scripts that are data do not count. The page may come from somebody else, so that it
     is gone through once only, however long it is.
     """
-    end = 0
+    end = 0  # of the script before
     for opening in re.finditer(rb"<script", page, re.IGNORECASE):
-        # it stands inside the script before it
-        if opening.start() < end:
+        is_inside_script = opening.start() < end
+        if is_inside_script:
             continue
         begin = page.find(b">", opening.end()) + 1
-        if not begin:
+        if not begin:  # the tag has no end, so that nothing after it runs
             return False
         close = re.compile(rb"</script", re.IGNORECASE).search(page, begin)
         end = close.start() if close else len(page)

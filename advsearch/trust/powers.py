@@ -26,40 +26,43 @@ where it does nothing there.
 
 
 def no_power(value: Any) -> str:
-    """Of a setting that decides what happens in its run alone."""
+    """Return no power: the setting decides only what happens in its run."""
     return ""
 
 
 def describe_processes(count: int | None) -> str:
-    """Return the power of a setting for a number of processes: none up to one a
-    processor, which a run uses anyway.
+    """Return the power of a setting that starts processes, "" for none.
+
+    Up to one process for each processor is none, since a run uses all of them anyway.
     """
     n_processors = count_cores()
-    return (
-        ""
-        if count is None or count <= n_processors
-        else (f"starts {count} processes on {n_processors} processors")
-    )
+    if count is None or count <= n_processors:
+        return ""
+    return f"starts {count} processes on {n_processors} processors"
 
 
 def describe_connection(address: str | None) -> str:
-    """Of where workers are."""
-    return (
-        ""
-        if address in (None, "local")
-        else (f"connects to {address}, and what answers there can run code here")
-    )
+    """Return the power of a setting that says where workers are, "" for none."""
+    if address in (None, "local"):
+        return ""
+    return f"connects to {address}, and what answers there can run code here"
 
 
 def describe_tracker(name: str | None) -> str:
-    """Of an experiment tracker; TensorBoard's files lie in the run."""
+    """Return the power of an experiment tracker, "" for none.
+
+    TensorBoard has none: its files lie in the run.
+    """
     return "" if name in (None, "tensorboard") else f"sends every evaluation to {name}"
 
 
 def describe_location(run: str | None) -> str:
-    """Of where a run is kept; a name is one in runs/."""
-    inside = run is None or (os.sep not in run and run not in (".", ".."))
-    return "" if inside else f"writes into {run}, outside of runs/"
+    """Return the power of a setting that says where a run is stored, "" for none.
+
+    A plain name has none: it stands for a folder in runs/.
+    """
+    is_name = run is None or (os.sep not in run and run not in (".", ".."))
+    return "" if is_name else f"writes into {run}, outside of runs/"
 
 
 def describe_overwrite(wanted: bool) -> str:
@@ -75,6 +78,11 @@ def describe_file(path: str | None) -> str:
 def describe_suite_change(wanted: str | bool | None) -> str:
     """Of what changes what lies beside a suite."""
     return "changes what is kept beside the suite" if wanted else ""
+
+
+def _format_typed(value: Any) -> Any:
+    """Return a value as a person types it: true and false in lower case."""
+    return str(value).lower() if isinstance(value, bool) else value
 
 
 class OmittedSetting(NamedTuple):
@@ -93,13 +101,6 @@ class OmittedSetting(NamedTuple):
         """How a person sets it, and how to do without it, as both are typed after the
         name of a file or a run.
         """
-        value_text, default_text = (
-            str(v).lower() if isinstance(v, bool) else v
-            for v in (self.value, self.default)
-        )
-        assignment = shlex.quote(f"{self.name}={value_text}")
-        return (
-            f"{assignment} if you want that, or "
-            f"{self.name}={'null' if default_text is None else default_text} to do "
-            "without"
-        )
+        assignment = shlex.quote(f"{self.name}={_format_typed(self.value)}")
+        default = "null" if self.default is None else _format_typed(self.default)
+        return f"{assignment} if you want that, or {self.name}={default} to do without"

@@ -45,13 +45,12 @@ def run_converter(
         FileFormatError: it takes too long.
     """
     longest = scale_limit(seconds)
-    unread = subprocess.DEVNULL
     try:
         return subprocess.run(
             command,
             cwd=folder,
             env=env,
-            stdin=unread,
+            stdin=subprocess.DEVNULL,  # a program that asks gets no answer
             capture_output=True,
             errors="replace",
             timeout=longest,
@@ -59,15 +58,14 @@ def run_converter(
     except subprocess.TimeoutExpired:
         raise FileFormatError(
             f"{path}: {program} had not read it after {longest} seconds; export glTF "
-            "(.glb) from it yourself, or give "
-            f"it longer: {FACTOR}=10 in the environment makes all limits ten times as "
-            "large"
+            f"(.glb) from it yourself, or give it longer: {FACTOR}=10 in the "
+            "environment makes all limits ten times as large"
         ) from None
 
 
 def make_environment(folder: str) -> dict[str, str]:
-    """Return the environment variables of a process whose home is `folder`; of ours it
-    gets the search paths only.
+    """Return the environment variables of a process whose home is `folder`; of the
+    variables of this process it gets those of search paths only.
     """
     variables = {
         name: os.environ[name]
@@ -88,33 +86,30 @@ def find_blender(who: str, otherwise: str) -> list[str]:
     after it.
 
     Args:
-        who: needs it, the beginning of the error.
-        otherwise: what else can be done, its end.
+        who: beginning of the error's message: what needs Blender.
+        otherwise: end of the message: what else can be done.
 
     Raises:
         FileFormatError: there is no Blender.
     """
     program = os.environ.get(BLENDER) or shutil.which("blender")
     if program is None and importlib.util.find_spec("bpy") is not None:
-        # Blender as a package of this Python
+        # this Python has Blender as a package
         program = sys.executable
     executable = shutil.which(program or "")
     if executable is None:
-        missing = (
-            "none is installed"
-            if program is None
-            else f"{BLENDER} names {program}, which can't be run"
-        )
+        missing = "none is installed"
+        if program is not None:
+            missing = f"{BLENDER} names {program}, which can't be run"
         raise FileFormatError(
             f"{who}, and {missing}; install Blender so that `blender` is found, or "
-            "type "
-            "`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
+            "type `python3.11 -m venv bpy && bpy/bin/pip install bpy` and set "
             f"{BLENDER}=bpy/bin/python; or {otherwise}"
         )
     program = os.path.abspath(executable)
-    if Path(program).name.startswith("python"):
-        # a Python with the package bpy, without the user's own modules
-        return [program, "-I"]
+    is_python = Path(program).name.startswith("python")  # one with the package bpy
+    if is_python:
+        return [program, "-I"]  # without the user's own modules
     return [
         program,
         "--background",

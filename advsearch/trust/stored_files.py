@@ -72,15 +72,17 @@ def list_opened_files(path: Path | str) -> list[str]:
 
 
 def scale_limit(limit: int) -> int:
-    """Return a limit on the size of input (bytes, pixels, faces, ...) times
-    `ADVSEARCH_LIMITS`, which is 1 by default. Raises InputError where
-    `ADVSEARCH_LIMITS` is not a number greater than 0.
+    """Return a limit on the size of input (bytes, pixels, faces, ...) times the
+    environment variable `ADVSEARCH_LIMITS`, which is 1 by default.
+
+    Raises:
+        InputError: the variable is not a number greater than 0.
     """
     text = os.environ.get(FACTOR, "") or "1"
     try:
         factor = float(text)
     except ValueError:
-        factor = math.nan
+        factor = math.nan  # refused below
     if not 0 < factor < math.inf:
         raise InputError(
             f"{FACTOR}: expected a number greater than 0, by which limits "
@@ -99,8 +101,7 @@ def make_size_error(path: Path | str, expected: str, size: str) -> FileFormatErr
     """
     return FileFormatError(
         f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the "
-        "environment makes all limits "
-        "ten times as large"
+        "environment makes all limits ten times as large"
     )
 
 
@@ -140,23 +141,28 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
     """Return the content of an ordinary file; arguments and errors as for
     `open_regular`.
     """
-    most = scale_limit(limit)
+    max_bytes = scale_limit(limit)
     with open_regular(path, expected, limit) as file:
-        data = file.read(most + 1)  # a file may grow, and those of /proc give no size
-    if data is None:  # the kernel's log is such a file
+        # read once more than allowed: a file may grow, and those of /proc state no size
+        data = file.read(max_bytes + 1)
+    if data is None:  # nothing to read yet, as in the kernel's log
         raise FileFormatError(
             f"{path}: expected {expected}, got a file that waits for something; name "
             "an ordinary file"
         )
-    if len(data) > most:
-        raise make_size_error(path, f"{expected} of at most {most:,} bytes", "more")
+    if len(data) > max_bytes:
+        raise make_size_error(
+            path, f"{expected} of at most {max_bytes:,} bytes", "more"
+        )
     return data
 
 
 def read_text(path: Path, expected: str, limit: int) -> str:
-    """Return the text of an ordinary file in UTF-8, without a byte order mark. Raises
-    FileFormatError: as for `open_regular`, or the bytes are not UTF-8; OSError: as for
-    `open_regular`.
+    """Return the text of an ordinary file in UTF-8, without a byte order mark.
+
+    Raises:
+        FileFormatError: as for `open_regular`, or the bytes are not UTF-8.
+        OSError: as for `open_regular`.
     """
     try:
         return read_bytes(path, expected, limit).decode("utf-8-sig")
@@ -167,8 +173,10 @@ def read_text(path: Path, expected: str, limit: int) -> str:
 
 
 def read_existing_text(path: Path | str, expected: str, limit: int) -> str:
-    """Return what `read_text` returns, and raise FileFormatError where it raises
-    OSError, too.
+    """Return the text of a file that has to exist, as `read_text` does.
+
+    Raises:
+        FileFormatError: as for `read_text`, or the file is missing or cannot be read.
     """
     try:
         return read_text(Path(path), expected, limit)
@@ -187,10 +195,10 @@ def parse_text(
         path: path of the file, for errors.
         text: its content.
         kind: what it should be, for errors, such as "JSON".
-        parse: makes the value; raises ValueError or SyntaxError.
+        parse: returns the value of a text; raises ValueError or SyntaxError.
 
     Raises:
-        FileFormatError: it is not of its kind.
+        FileFormatError: the text is not of its kind.
     """
     try:
         return parse(text)
@@ -205,14 +213,20 @@ class JsonBoundsError(ValueError):
 
 
 def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
-    """Return the value of a JSON text. Raises ValueError where it is not JSON, is
-    nested deeper than `DEPTH`, or has a number of thousands of digits; with `finite`
-    also where one is NaN or infinite. The message is short.
+    """Return the value of a JSON text.
+
+    Raises:
+        ValueError: it is not JSON, is nested deeper than `DEPTH`, or has a number of
+            thousands of digits; with `finite` also if a number is NaN or infinite. The
+            message is short.
     """
-    number = _parse_finite if finite else None
+    parse_number = _parse_finite if finite else None  # None is Python's own `float`
     try:
         value = json.loads(
-            text, parse_int=_parse_integer, parse_float=number, parse_constant=number
+            text,
+            parse_int=_parse_integer,
+            parse_float=parse_number,
+            parse_constant=parse_number,
         )
     except RecursionError:
         raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}") from None
@@ -222,15 +236,18 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
 
 
 def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
-    """Return whether lists and mappings in a value are nested at most `levels` deep;
-    other values have level 0.
+    """Return whether lists and mappings in a value are nested at most `levels` deep.
+
+    A value that is none has level 0, a list of such values level 1.
     """
+    if levels < 0:
+        return False
     children: Iterable[Any] = ()
     if isinstance(value, Mapping):
         children = value.values()
     elif isinstance(value, (list, tuple)):
         children = value
-    return levels >= 0 and all(is_shallow(child, levels - 1) for child in children)
+    return all(is_shallow(child, levels - 1) for child in children)
 
 
 def _parse_integer(text: str) -> int:
@@ -280,7 +297,7 @@ def check_most(
     Raises:
         FileFormatError: it has more.
     """
-    if count > (most := scale_limit(limit)):
-        raise make_size_error(
-            path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got
-        )
+    max_count = scale_limit(limit)
+    if count > max_count:
+        text = f"{count:,}" if got is None else got
+        raise make_size_error(path, expected.format(f"{max_count:,}"), text)

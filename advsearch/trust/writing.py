@@ -20,6 +20,7 @@ import stat
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from advsearch.errors import FileFormatError, InputError, StorageError
 
@@ -57,18 +58,21 @@ def storage_errors(path: Path) -> Iterator[None]:
     except (OSError, sqlite3.OperationalError) as error:
         # raises where the folder was moved, which explains any of these errors
         check_not_moved(path)
-        if isinstance(error, OSError):
-            known = _ADVICE.get(error.errno or 0)
-            text = str(error.strerror or error)
-        else:
-            known = next(
-                (how for words, how in _SQLITE_ADVICE.items() if words in str(error)),
-                None,
-            )
-            text = str(error)
-        # what to do about a known error, else the error itself
-        advice = known or f"{text}; choose another place with `run`"
+        advice = _find_advice(error)
+        if advice is None:
+            text = getattr(error, "strerror", None) or error
+            advice = f"{text}; choose another place with `run`"
         raise StorageError(f"cannot write {path}: {advice}") from error
+
+
+def _find_advice(error: OSError | sqlite3.OperationalError) -> str | None:
+    """Return what to do about an error; None if nothing is known about it."""
+    if isinstance(error, OSError):
+        return _ADVICE.get(error.errno or 0)
+    for words, advice in _SQLITE_ADVICE.items():
+        if words in str(error):
+            return advice
+    return None
 
 
 @contextmanager
@@ -84,10 +88,18 @@ def name_setting_in_errors(setting: str) -> Iterator[None]:
 
 @contextmanager
 def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a path to write to; when the block ends well its file takes the place of
-    `path` in one step. When it raises, or the process is killed, `path` is as it was
-    before. Missing folders are made. A `durable` file survives a power cut; that takes
-    some 10 ms.
+    """Yield a path to write to; at the end of the block its file takes the place of
+    `path` in one step.
+
+    When the block raises, or the process is killed, `path` is as it was before. Missing
+    folders are made.
+
+    Args:
+        path: path of the file.
+        durable: the file survives a power cut; that takes some 10 ms.
+
+    Raises:
+        StorageError: it cannot be written.
     """
     part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
     check_not_moved(path)  # or missing folders would be made
@@ -148,6 +160,7 @@ def write_text(path: Path, text: str, *, durable: bool = True) -> Path:
 
 
 def _flush(path: Path) -> None:
+    """Make a file or a folder durable: have the system write it to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -155,10 +168,21 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
-_open: dict[Path, tuple[Path, tuple[int, int]]] = {}
-"""Of the folders of runs that are written to here, the results and which file these
-are.
-"""
+class _OpenResults(NamedTuple):
+    """The results of a run that this process writes: path, and device and inode of the
+    file, which a new file of that name does not have.
+    """
+
+    path: Path
+    file_id: tuple[int, int]
+
+
+_open: dict[Path, _OpenResults] = {}  # by the folder of the run
+
+
+def _get_file_id(status: os.stat_result) -> tuple[int, int]:
+    """Return device and inode of a file."""
+    return status.st_dev, status.st_ino
 
 
 def note_open(results: Path) -> Callable[[], None]:
@@ -168,16 +192,17 @@ def note_open(results: Path) -> Callable[[], None]:
     Returns:
         What to call when they are closed.
     """
+    folder = results.parent
     with storage_errors(results):
-        found = results.stat()
-    entry = _open[results.parent] = results, (found.st_dev, found.st_ino)
+        entry = _OpenResults(results, _get_file_id(results.stat()))
+    _open[folder] = entry
 
-    def closed() -> None:
+    def note_closed() -> None:
         # the run may have been opened again since
-        if _open.get(results.parent) is entry:
-            del _open[results.parent]
+        if _open.get(folder) is entry:
+            del _open[folder]
 
-    return closed
+    return note_closed
 
 
 def check_not_moved(path: Path) -> None:
@@ -193,21 +218,43 @@ def check_not_moved(path: Path) -> None:
     for folder in (path, *path.parents):
         if folder not in _open:
             continue
-        results, known = _open[folder]
+        results = _open[folder]
         try:
-            # compared by device and inode: a new file of that name is another one
-            found = results.stat()
+            is_same_file = _get_file_id(results.path.stat()) == results.file_id
         except OSError:
-            found = None
-        if found is None or (found.st_dev, found.st_ino) != known:
+            is_same_file = False
+        if not is_same_file:
             raise StorageError(
                 f"{folder}: the folder of this run was removed or renamed while the "
-                "run went on; start it again, or "
-                "go on with what was renamed by advsearch resume"
+                "run went on; start it again, or go on with what was renamed by "
+                "advsearch resume"
             )
 
 
 LOCK = ".lock"
+
+
+def _make_lock_error(folder: Path, error: OSError, pid: str) -> Exception:
+    """Return the error for a run directory that could not be locked.
+
+    Args:
+        folder: the run directory.
+        error: the error of the system.
+        pid: the process number in the lock, perhaps damaged.
+    """
+    if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+        owner = f"process {pid}" if pid.isdigit() else "another process"
+        return InputError(
+            f"{folder}: {owner} is working on this run; wait for it or choose "
+            "another name with `run`"
+        )
+    if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
+        return StorageError(
+            f"{folder}: the file system has no locks; choose a local disk with `run`"
+        )
+    return StorageError(
+        f"cannot lock {folder}: {error.strerror}; choose another place with `run`"
+    )
 
 
 class RunLock:
@@ -232,31 +279,18 @@ class RunLock:
         if not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
             self.release()
             raise FileFormatError(
-                f"{self._path}: expected an ordinary file, got a "
-                "pipe or the like; remove it"
+                f"{self._path}: expected an ordinary file, got a pipe or the like; "
+                "remove it"
             )
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.truncate(self._descriptor, 0)
             os.write(self._descriptor, str(os.getpid()).encode())
         except OSError as error:
+            # of the process that holds the lock
             pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
             self.release()
-            if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-                owner = f"process {pid}" if pid.isdigit() else "another process"
-                raise InputError(
-                    f"{folder}: {owner} is working on this run; wait for it or choose "
-                    "another name with `run`"
-                ) from None
-            if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
-                raise StorageError(
-                    f"{folder}: the file system has no locks; choose a "
-                    "local disk with `run`"
-                ) from None
-            raise StorageError(
-                f"cannot lock {folder}: {error.strerror}; choose "
-                "another place with `run`"
-            ) from None
+            raise _make_lock_error(folder, error, pid) from None
 
     def release(self) -> None:
         if self._descriptor >= 0:
@@ -288,9 +322,10 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
 
     Args:
         run: the folder.
-        contents: names in it that are looked at, beside the lock.
-        unchecked_suffix: end of the paths of those folders whose subfolders are not
-            looked into.
+        contents: names directly in it that are checked, beside the lock; others are
+            ignored.
+        unchecked_suffix: end of a path; of a folder with such a path the subfolders
+            are not looked into.
 
     Raises:
         FileFormatError: there is a link, or a pipe or the like.
@@ -298,12 +333,13 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
     folders = [str(run)]
     while folders:
         folder = folders.pop()
+        is_root = folder == str(run)
         try:
             with os.scandir(folder) as entries:
                 inside = [
                     entry
                     for entry in entries
-                    if folder != str(run) or entry.name in (*contents, LOCK)
+                    if not is_root or entry.name in (*contents, LOCK)
                 ]
         except OSError as error:
             if error.errno == errno.ENOENT:  # it was removed meanwhile
@@ -314,12 +350,12 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
         for entry in inside:
             if entry.is_symlink():
                 raise FileFormatError(
-                    f"{entry.path}: expected a file or a folder of "
-                    "this run, got a link; remove it"
+                    f"{entry.path}: expected a file or a folder of this run, got a "
+                    "link; remove it"
                 )
             if entry.is_dir(follow_symlinks=False):
                 if not folder.endswith(unchecked_suffix):
-                    folders.append(entry.path)
+                    folders.append(entry.path)  # its contents are checked, too
             elif not entry.is_file(follow_symlinks=False) and entry.name != LOCK:
                 raise FileFormatError(
                     f"{entry.path}: expected a file of this run, got a "

@@ -22,6 +22,7 @@ _PLAIN = frozenset(
     f"tag:yaml.org,2002:{kind}"
     for kind in "str int float bool null seq map merge".split()
 )
+_UNFINISHED = 0  # in the place of a node's count, which is 1 at least
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
@@ -33,7 +34,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         node = self.get_single_node()
         if node is None:
             return None
-        _check(node, 0, {})
+        _count_checked(node, 0, {})
         return self.construct_document(node)
 
     def construct_yaml_int(self, node: yaml.Node) -> int:
@@ -72,9 +73,11 @@ _Loader.add_implicit_resolver(
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the value of a YAML text. Raises ValueError where it is not YAML, is too
-    large or nested too deeply, or holds something else than settings are made of; the
-    message is short.
+    """Return the value of a YAML text.
+
+    Raises:
+        ValueError: it is not YAML, is too large or nested too deeply, or holds something
+            else than settings are made of; the message is short.
     """
     if len(text) > scale_limit(MAX_YAML_BYTES):
         raise ValueError(f"a text of {len(text):,} characters")
@@ -83,14 +86,12 @@ def parse_yaml(text: str) -> Any:
     except RecursionError:
         raise ValueError(f"lists or mappings nested deeper than {DEPTH}") from None
     except yaml.MarkedYAMLError as error:
-        what = error.note or f"other text ({error.problem or error.context})"
+        # the note is ours (`_problem`); other errors are the parser's
+        got = error.note or f"other text ({error.problem or error.context})"
         mark = error.problem_mark or error.context_mark
-        marked = (
-            what
-            if mark is None
-            else (f"{what} in line {mark.line + 1}, column {mark.column + 1}")
-        )
-        raise ValueError(_short(marked)) from None
+        if mark is not None:
+            got = f"{got} in line {mark.line + 1}, column {mark.column + 1}"
+        raise ValueError(_shorten(got)) from None
     except (
         yaml.YAMLError,
         ValueError,
@@ -101,15 +102,16 @@ def parse_yaml(text: str) -> Any:
     ) as error:
         # The constructors of PyYAML raise all of these for values that do not fit their
         # tags.
-        raise ValueError(_short(str(error))) from None
+        raise ValueError(_shorten(str(error))) from None
 
 
-def _short(text: str) -> str:
+def _shorten(text: str) -> str:
+    """Return a text on one line, cut to 200 characters."""
     words = " ".join(text.split())
     return words if len(words) <= 200 else f"{words[:197]}..."
 
 
-def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
+def _count_checked(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
     """Check a node of a YAML document, and return how many values it has with all that
     is in it.
 
@@ -119,8 +121,8 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
     Args:
         node: node of the document.
         depth: how many nodes are around it.
-        counts: the results so far, by id of the node; 0 for a node that is still being
-            counted, which can only come again inside itself. It is extended.
+        counts: the results so far, by id of the node; `_UNFINISHED` while a node is
+            being counted. It is extended.
 
     Raises:
         yaml.YAMLError: it has a tag that no setting has, is nested too deeply, repeats
@@ -130,31 +132,42 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
         raise _problem(node, f"the tag {node.tag[:40]!r}, which no setting has")
     if isinstance(node, yaml.ScalarNode):
         return 1
-    if depth >= DEPTH or counts.get(id(node), 1) == 0:
+    # an alias of a node that is around it: a structure without an end
+    contains_itself = counts.get(id(node)) == _UNFINISHED
+    if depth >= DEPTH or contains_itself:
         raise _problem(node, f"lists or mappings nested deeper than {DEPTH}")
     if isinstance(node, yaml.MappingNode):
-        names = set[str]()
-        for name, _ in node.value:
-            if isinstance(name, yaml.ScalarNode) and name.value in names:
-                raise _problem(name, f"the name {name.value[:60]!r} twice")
-            names.add(str(name.value))
+        _check_names(node)
     if id(node) not in counts:
-        counts[id(node)] = 0
-        children = (
-            node.value
-            if isinstance(node, yaml.SequenceNode)
-            else [part for pair in node.value for part in pair]
-        )
+        counts[id(node)] = _UNFINISHED
+        if isinstance(node, yaml.SequenceNode):
+            children = node.value
+        else:  # names and values
+            children = [child for pair in node.value for child in pair]
         total = 1
-        for part in children:
-            total += _check(part, depth + 1, counts)
+        for child in children:
+            total += _count_checked(child, depth + 1, counts)
             if total > MAX_VALUES:
                 raise _problem(node, f"more than {MAX_VALUES:,} values")
         counts[id(node)] = total
     return counts[id(node)]
 
 
+def _check_names(node: yaml.MappingNode) -> None:
+    """Check that no name stands twice in a mapping.
+
+    Raises:
+        yaml.YAMLError: one does.
+    """
+    names = set[str]()
+    for name, _ in node.value:
+        if isinstance(name, yaml.ScalarNode) and name.value in names:
+            raise _problem(name, f"the name {name.value[:60]!r} twice")
+        names.add(str(name.value))
+
+
 def _problem(node: yaml.Node, what: str) -> yaml.YAMLError:
+    """Return the error for a node that is not allowed; the message is `what`."""
     return yaml.constructor.ConstructorError(
         None, None, what, node.start_mark, note=what
     )

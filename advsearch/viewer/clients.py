@@ -19,7 +19,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, LifoQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 # requests that are served at once; others wait
 N_WORKERS = 16
@@ -50,7 +50,7 @@ def find_reachable_address(host: str) -> str:
     """
     if host not in ("0.0.0.0", "::", ""):
         return host
-    # addresses of documentation, RFC 3849 and RFC 5737
+    # a machine far away; these addresses are for documentation, RFC 3849 and RFC 5737
     family = socket.AF_INET
     remote = "192.0.2.1"
     if host == "::":
@@ -58,7 +58,8 @@ def find_reachable_address(host: str) -> str:
         remote = "2001:db8::1"
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:
-            # chooses an address of this machine; nothing is sent, whatever the port
+            # nothing is sent: the system only chooses the address of this machine from
+            # which it would send, whatever the port
             probe.connect((remote, 9))
             return str(probe.getsockname()[0])
     except OSError:
@@ -81,6 +82,13 @@ class _Connection:
     due: float = math.inf
 
 
+class _SilentClient(NamedTuple):
+    """A client that has connected and sent nothing: its address, and since when."""
+
+    address: Any
+    since: float
+
+
 class ConnectionPool:
     """Serve the connections that a socket accepts until `close`.
 
@@ -97,17 +105,17 @@ class ConnectionPool:
         handle: Callable[[socket.socket, Any], None],
         context: ssl.SSLContext | None,
     ) -> None:
-        """Make a pool that passes each accepted connection to `handle`.
-
-        With an SSL `context` a connection is encrypted first.
-        """
+        """Make a pool; arguments as for the class."""
         self._listening = listening_socket
         self._handle = handle
         self._context = context
-        # The newest connection is served first: many old ones may be an attack.
+        # Connections (and the clients' addresses) that have sent something and wait for a
+        # worker; None ends a worker. The newest is served first: many old ones may be an
+        # attack.
         self._ready: LifoQueue[tuple[socket.socket, Any] | None] = LifoQueue()
-        self._connections: dict[int, _Connection] = {}
+        self._connections: dict[int, _Connection] = {}  # by the thread of their worker
         self._closed = threading.Event()
+        # set unless `serve` runs, so that `close` never waits for what has not begun
         self._ended = threading.Event()
         self._ended.set()
 
@@ -116,8 +124,12 @@ class ConnectionPool:
         self._ended.clear()
 
         def work() -> None:
-            while (job := self._ready.get()) is not None:
-                self.serve_connection(*job)
+            while True:
+                job = self._ready.get()
+                if job is None:  # put by `close`
+                    return
+                connection, address = job
+                self.serve_connection(connection, address)
 
         for _ in range(N_WORKERS):
             threading.Thread(target=work, daemon=True).start()
@@ -131,10 +143,11 @@ class ConnectionPool:
         """End `serve`, and close the connections that wait for a worker."""
         self._closed.set()
         self._ended.wait()
+        # first the connections: behind `None` no worker would come to them
         with suppress(Empty):
-            # behind `None` no worker comes to them
             while (job := self._ready.get_nowait()) is not None:
-                job[0].close()
+                connection, _ = job
+                connection.close()
         for _ in range(N_WORKERS):
             self._ready.put(None)
 
@@ -158,8 +171,8 @@ class ConnectionPool:
         """Accept connections, pass those that have sent something to the workers, and
         close those that take too long; return when the pool is closed.
         """
-        # address, and since when it is silent, by connection
-        silent: dict[Any, tuple[Any, float]] = {}
+        # connections that have sent nothing yet
+        silent: dict[Any, _SilentClient] = {}
         listens = False  # whether new connections are accepted at present
         while not self._closed.is_set():
             # with too many connections, new ones wait in the system's queue
@@ -174,18 +187,18 @@ class ConnectionPool:
                 if connection is self._listening:
                     with suppress(OSError):
                         connection, address = self._listening.accept()
-                        silent[connection] = address, time.monotonic()
+                        silent[connection] = _SilentClient(address, time.monotonic())
                         selector.register(connection, selectors.EVENT_READ)
                 else:
                     selector.unregister(connection)
-                    self._ready.put((connection, silent.pop(connection)[0]))
+                    self._ready.put((connection, silent.pop(connection).address))
             now = time.monotonic()
             # silent clients have less time where others wait
             patience = REQUEST_SECONDS
             if not has_room:
                 patience = min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
-            for connection, (_, silent_since) in list(silent.items()):
-                if now - silent_since > patience:
+            for connection, client in list(silent.items()):
+                if now - client.since > patience:
                     del silent[connection]
                     selector.unregister(connection)
                     connection.close()
@@ -197,24 +210,30 @@ class ConnectionPool:
         """Disconnect clients that a worker has waited for too long.
 
         Where connections wait for a worker, clients that have had `SLOW_CLIENT_SECONDS`
-        have to go too, the slowest first, as many as are needed.
+        are disconnected too, the slowest first, as many as are needed.
+
+        Args:
+            now: the time, `time.monotonic`.
         """
         clients = sorted(
             self._connections.copy().values(), key=lambda client: client.since
         )
-        n_waiting = 0  # as long as a worker is free, nobody has to go
+        n_needed_workers = 0  # as long as a worker is free, none is needed
         if len(clients) == N_WORKERS:
-            n_waiting = self._ready.qsize()
+            n_needed_workers = self._ready.qsize()
         for client in clients:
-            makes_room = n_waiting > 0 and now - client.since > SLOW_CLIENT_SECONDS
-            if client.due < now or makes_room:
-                n_waiting -= 1  # its worker is free then
-                client.since = math.inf  # so that it is not ended twice
-                client.due = math.inf
-                # The worker's next read or write ends then. (The plain method: that of
-                # an SSL socket would forget that it is one.)
-                with suppress(OSError):
-                    socket.socket.shutdown(client.connection, socket.SHUT_RDWR)
+            is_overdue = client.due < now
+            is_slow = now - client.since > SLOW_CLIENT_SECONDS
+            if not is_overdue and not (n_needed_workers > 0 and is_slow):
+                continue
+            n_needed_workers -= 1  # its worker becomes free
+            # so that it is not ended twice
+            client.since = math.inf
+            client.due = math.inf
+            # The worker's next read or write ends then. (The plain method: that of an SSL
+            # socket would forget that it is one.)
+            with suppress(OSError):
+                socket.socket.shutdown(client.connection, socket.SHUT_RDWR)
 
     def serve_connection(self, connection: socket.socket, address: Any) -> None:
         """Serve one client in this thread; whatever it does, nothing is raised."""
@@ -222,8 +241,7 @@ class ConnectionPool:
         try:
             connection.setblocking(True)
             if self._context is not None:
-                # the handshake waits for the client, so it is done below, when the time
-                # counts
+                # the handshake waits for the client: it is done below, where its time counts
                 connection = self._context.wrap_socket(
                     connection, server_side=True, do_handshake_on_connect=False
                 )

@@ -63,7 +63,8 @@ class Boxes:
                 self._put_box(thing["box"], name, NO_PROBABILITY)
         for detection in payload.get("found", ()):
             score = min(max(float(detection["score"]), 0.0), 1.0)
-            self._put_box(detection["box"], detection["label"], round(10_000 * score))
+            in_ten_thousandths = round(10_000 * score)
+            self._put_box(detection["box"], detection["label"], in_ten_thousandths)
 
     def _put_box(self, box: Any, name: object, score: int) -> None:
         """Add the values of a box (x0, y0, x1, y1) in pixels, with its name and score.
@@ -128,30 +129,35 @@ def read_columns(
 
 
 def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
-    """Return the corners of a row's true box and of its best detection, and add all its
-    boxes to `boxes`.
+    """Return the corners of a row's true box and of its best detection (`CORNERS`), and
+    add all boxes of the row to `boxes`.
 
-    The best detection is the first one with the label that the model predicted or,
-    where it missed the object, should have. Rows of other tasks have no corners.
+    Rows of other tasks have no corners.
     """
     payload: Any = row.payload
     corners: Mapping[str, float] = {}
     if isinstance(payload, dict) and "box" in payload:
-        label = payload.get("class", row.label)
-        best_box = None
-        for detection in payload.get("found", ()):
-            if detection["label"] == label:
-                best_box = detection["box"]
-                break
+        best_box = _find_best_detection(row, payload)
         boxes.add(payload)
         values = list[float]()
         for box in (payload["box"], best_box):
             for corner in box or [None] * 4:  # no box: four NaN
                 values.append(math.nan if corner is None else float(corner))
         corners = dict(zip(CORNERS, values, strict=True))
-    # an end for every row, also one without boxes
+    # every row has an end, also one without boxes
     boxes.ends.append(len(boxes.values) // VALUES_PER_BOX)
     return corners
+
+
+def _find_best_detection(row: Row, payload: Mapping[str, Any]) -> Any:
+    """Return the box of the first detection with the label that the model predicted or,
+    where it missed the object, should have; None if there is none.
+    """
+    label = payload.get("class", row.label)
+    for detection in payload.get("found", ()):
+        if detection["label"] == label:
+            return detection["box"]
+    return None
 
 
 def pack_columns(
@@ -179,7 +185,6 @@ def pack_columns(
     # the largest values first, so that all are aligned
     arrays = sorted(columns.items(), key=lambda item: -item[1].itemsize)
 
-    layout = _make_layout(arrays)
     boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
     head = {
         "count": len(rows),
@@ -190,7 +195,7 @@ def pack_columns(
         "outcomes": outcome_names,
         "parameters": parameters,
         "things": list(boxes.names) if boxes is not None else [],
-        "columns": layout,
+        "columns": _make_layout(arrays),
     }
     head_data = json.dumps(head).encode()
     head_data += b" " * (-len(head_data) % 4)  # up to a multiple of 4 bytes
@@ -226,8 +231,8 @@ def _make_layout(
 def _prediction_columns(
     rows: pd.DataFrame,
 ) -> tuple[dict[str, Any], list[str], list[str]]:
-    """Return the columns about predictions, and the names that the indices in "answer"
-    and "outcome" stand for.
+    """Return the columns about predictions, by name, then the names that the indices in
+    "answer" stand for, then those for "outcome".
 
     Probabilities are in 1/10000; "right" is 0, 1 or `UNKNOWN`.
     """
@@ -254,8 +259,10 @@ def _prediction_columns(
 def _parameter_columns(
     rows: pd.DataFrame,
 ) -> tuple[dict[str, Any], list[dict[str, object]]]:
-    """Return the columns of the parameters, and for each parameter its name, unit,
-    levels (the names that its numbers stand for, if any) and edges of its ranges.
+    """Return the columns of the parameters, and a description of each parameter.
+
+    A description has its name, its unit, its levels (the names that the numbers of its
+    column stand for; None if they are values), and the edges of its ranges.
     """
     edges = rows.attrs["edges"]
     columns = dict[str, Any]()
@@ -267,7 +274,7 @@ def _parameter_columns(
             unit = ""
             values, levels = _encode_levels(column)
         else:
-            # too large for float32: it becomes infinite
+            # what is too large for float32 becomes infinite, without a warning
             with np.errstate(over="ignore"):
                 values = column.to_numpy(np.float32)
         columns[f"parameter {index}"] = values
@@ -285,15 +292,17 @@ def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
         steps = (BOX_STEPS * pixels).clip(0, NO_BOX - 1).round()
         columns["boxes"] = np.where(np.isnan(pixels), NO_BOX, steps).astype(np.uint16)
     boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
-    # the ends fit only if the boxes are those of exactly these rows
-    if boxes is not None and boxes.values and len(boxes.ends) == len(rows):
-        columns["others"] = np.asarray(boxes.values, np.uint16)
-        columns["others end"] = np.asarray(boxes.ends, np.uint32)
+    if boxes is not None and boxes.values:
+        # a frame with other rows has the attribute of the one that it was made from
+        are_of_these_rows = len(boxes.ends) == len(rows)
+        if are_of_these_rows:
+            columns["others"] = np.asarray(boxes.values, np.uint16)
+            columns["others end"] = np.asarray(boxes.ends, np.uint32)
     return columns
 
 
 def _encode_levels(column: pd.Series) -> tuple[Any, list[str]]:
-    """Encode a column of names: return the index (n,) uint16 of each, and the names.
+    """Encode a column of names as indices (n,) uint16, and return these and the names.
 
     Names beyond `MAX_LEVELS` share the last one, "others". A column without any name
     has the index 0 throughout.
@@ -303,5 +312,6 @@ def _encode_levels(column: pd.Series) -> tuple[Any, list[str]]:
         return np.zeros(len(column), np.uint16), names
     if len(names) >= MAX_LEVELS:
         names = [*names[: MAX_LEVELS - 1], "others"]
+    # what is beyond becomes the last name; a missing name has the code -1, 65535 here
     indices = np.minimum(column.cat.codes.to_numpy(), len(names) - 1)
     return indices.astype(np.uint16), names

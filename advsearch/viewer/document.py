@@ -69,25 +69,7 @@ def make_document(
     # the policy lets no other script run
     digests = [pages.compute_script_digest(code.encode())] if code else []
     policy = pages.make_page_policy(digests, connects=connects)
-    head = make_element(
-        "head",
-        make_element("meta", charset="utf-8"),
-        make_element(
-            "meta",
-            http_equiv="Content-Security-Policy",
-            content=f"{policy}; form-action 'self'",
-        ),
-        make_element(
-            "meta", name="viewport", content="width=device-width, initial-scale=1"
-        ),
-        make_element("meta", name="color-scheme", content="light dark"),
-        make_element("title", f"{title} - advsearch"),
-        # an empty icon, or browsers would ask the server for one
-        make_element("link", rel="icon", href="data:,"),
-        make_element(
-            "style", Html(f"\n{read_asset('document.css')}{read_asset('viewer.css')}")
-        ),
-    )
+    head = _make_head(title, f"{policy}; form-action 'self'")
     footer_html = make_element("footer", f"advsearch {__version__}, {footer or title}")
     # no line break between a number and its percent sign
     text = re.sub(r"(\d) %", r"\1&nbsp;%", join_html(*body, footer_html))
@@ -95,6 +77,24 @@ def make_document(
     script = make_element("script", Html(code)) if code else None
     page = make_element("html", head, make_element("body", content, script), lang="en")
     return f"<!doctype html>\n{page}\n"
+
+
+def _make_head(title: str, policy: str) -> Html:
+    """Return the head of a page: its policy, its title and its style."""
+    style = f"\n{read_asset('document.css')}{read_asset('viewer.css')}"
+    return make_element(
+        "head",
+        make_element("meta", charset="utf-8"),
+        make_element("meta", http_equiv="Content-Security-Policy", content=policy),
+        make_element(
+            "meta", name="viewport", content="width=device-width, initial-scale=1"
+        ),
+        make_element("meta", name="color-scheme", content="light dark"),
+        make_element("title", f"{title} - advsearch"),
+        # an empty icon, or browsers would ask the server for one
+        make_element("link", rel="icon", href="data:,"),
+        make_element("style", Html(style)),
+    )
 
 
 def _join_scripts(scripts: Sequence[str]) -> str:
@@ -183,8 +183,8 @@ def make_header(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
 
 
 def remarks_html(remarks: Sequence[str]) -> Html:
-    """Return a list of remarks on a result, and behind it one of notes on how files
-    were read, which is folded where it is long.
+    """Return a list of the remarks on a result, and after it a second list of those
+    that say how files were read, which is folded if it is long.
     """
     notes = [remark for remark in remarks if _FILE_REMARK.match(remark)]
     others = [remark for remark in remarks if remark not in notes]
@@ -206,8 +206,8 @@ def subject_html(*parts: tuple[str, str]) -> Html:
     """Return what a run is about as HTML.
 
     Args:
-        parts: (kind, name) each; the kind may be empty. A path is shortened, and shown
-            in full where the mouse is over it.
+        parts: (kind, name) each, such as ("model", "resnet50"); the kind may be empty.
+            A path is shortened, and shown in full where the mouse is over it.
     """
     content = list[Html | str]()
     for index, (kind, text) in enumerate(parts):
@@ -240,22 +240,22 @@ def make_table(
 
     Args:
         heads: heads of the columns.
-        rows: the cells of each row.
+        rows: the cells of each row, the name first.
         links: addresses of the names; rows with an empty or no link have none.
-        shares: fractions that color cells, as in `ResultPart`.
+        shares: fractions that color cells, by (row, column), as in `ResultPart`.
         bars: intervals with marks in an extra column, as in `ResultPart`.
     """
     lines = []
-    for index, (first, *texts) in enumerate(rows):
-        link = links[index] if index < len(links) else ""
+    for row, (first, *texts) in enumerate(rows):
+        link = links[row] if row < len(links) else ""
         name = make_element("a", first, href=link) if link else first
         cells = [make_element("th", name, scope="row")]
-        for column, text in enumerate(texts, 1):
-            share = (shares or {}).get((index, column))
+        for column, text in enumerate(texts, 1):  # the name is column 0
+            share = (shares or {}).get((row, column))
             cells.append(make_element("td", text, class_=_cell_class(text, share)))
         if bars:
             cells.append(
-                make_element("td", _interval_bar(bars[index]), class_="hide-small")
+                make_element("td", _interval_bar(bars[row]), class_="hide-small")
             )
         lines.append(make_element("tr", *cells))
     # the column of bars has no head

@@ -91,6 +91,11 @@ def make_part(run: Path, part: ResultPart, description: str) -> Html:
 def _part_content(run: Path, part: ResultPart, description: str) -> Html:
     """Return a part of a result without its title: text, chart or figure, table, images
     and note.
+
+    Args:
+        run: directory of the run.
+        part: part of its result.
+        description: text for the chart, for who cannot see it, if the part has none.
     """
     content = list[Html | None]()
     if part.draw is not None:
@@ -110,7 +115,7 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
         content.append(
             document.make_table(part.heads, part.rows, links, part.shares, part.bars)
         )
-    elif part.rows:
+    elif part.rows:  # names and values
         content.append(document.facts_table({row[0]: row[1] for row in part.rows}))
     for group in part.pictures:
         content.append(_embed_images(run, group, part.layout))
@@ -120,24 +125,24 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
 
 
 def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | None:
-    """Return images side by side with captions, None if no file can be embedded."""
+    """Return images side by side with captions, None if no file can be embedded.
+
+    Args:
+        run: directory of the run.
+        group: its images.
+        layout: CSS class of the layout; "" for the one that suits their number.
+    """
     figures = []
     for picture in group:
-        is_png = picture.file.lower().endswith(".png")
-        # a PNG is scaled down, so that it may be larger
-        max_bytes = MAX_PNG_BYTES if is_png else MAX_FIGURE_BYTES
-        file = find_image(run, picture.file, max_bytes)
-        if file is None:
+        data = _read_image(run, picture)
+        if data is None:
             continue
-        data = file.read_bytes()
-        if is_png and len(data) > MAX_UNSCALED_BYTES:
-            # large pictures would make the page huge
-            data = shrink_png(data, MAX_SCALED_SIZE)
+        media_type = MEDIA_TYPES[Path(picture.file).suffix.lower()]
         image = make_element(
             "img",
-            src=document.make_data_url(data, MEDIA_TYPES[file.suffix.lower()]),
+            src=document.make_data_url(data, media_type),
             alt=": ".join(filter(None, (picture.name, picture.caption))),
-            data_picture=file.stem,
+            data_picture=Path(picture.file).stem,
         )
         name = [make_element("strong", picture.name), ": "] if picture.name else []
         caption = make_element("figcaption", *name, picture.caption)
@@ -147,6 +152,22 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
     if not layout and len(figures) <= 2:
         layout = "pair"
     return make_element("div", *figures, class_=f"pictures {layout}".strip())
+
+
+def _read_image(run: Path, picture: Picture) -> bytes | None:
+    """Return the bytes of an image as they are embedded, a large PNG scaled down; None
+    if there is no such file, or it is too large.
+    """
+    is_png = picture.file.lower().endswith(".png")
+    # a PNG is scaled down, so that it may be larger
+    max_bytes = MAX_PNG_BYTES if is_png else MAX_FIGURE_BYTES
+    file = find_image(run, picture.file, max_bytes)
+    if file is None:
+        return None
+    data = file.read_bytes()
+    if is_png and len(data) > MAX_UNSCALED_BYTES:
+        return shrink_png(data, MAX_SCALED_SIZE)
+    return data
 
 
 def _embed_figure(run: Path, name: str, alt: str) -> Html | None:
@@ -176,23 +197,16 @@ def make_end(run: Path, result: Result, view: ShownResult) -> Html:
     content = [make_element("h2", "Cost and conditions"), document.facts_table(facts)]
     if result.is_unfinished:
         resume = shlex.join(["advsearch", "resume", str(run)])
-        content += [
-            make_element("h2", "Go on"),
-            make_element("pre", resume, class_="wrap"),
-        ]
+        content += _make_command("Go on", resume)
     config_file = run / CONFIG
-    # names of settings that were given from Python and no file can hold
+    # parts that exist only in a Python session, so that no file can name them
     python_only = getattr(result, "python_only", [])
-    repeat = ""
     if python_only:
         repeat = f"No command repeats this: {format_python_only(python_only)}"
+        content += _make_command("Do it again", repeat)
     elif config_file.is_file():
         repeat = shlex.join(["advsearch", "run", str(config_file)])
-    if repeat:
-        content += [
-            make_element("h2", "Do it again"),
-            make_element("pre", repeat, class_="wrap"),
-        ]
+        content += _make_command("Do it again", repeat)
     if config_file.is_file():
         settings = config_file.read_text(encoding="utf-8", errors="replace")
         if settings:
@@ -200,6 +214,11 @@ def make_end(run: Path, result: Result, view: ShownResult) -> Html:
             summary = make_element("summary", "All settings")
             content.append(make_element("details", summary, settings_html))
     return join_html(*content)
+
+
+def _make_command(title: str, command: str) -> list[Html]:
+    """Return a title and a command to type, or why there is none."""
+    return [make_element("h2", title), make_element("pre", command, class_="wrap")]
 
 
 AnyResult = TypeVar("AnyResult", bound=Result)
@@ -309,14 +328,14 @@ def make_view_page(
         scripts: files that fill the parts that are `live`.
     """
     content = list[Html | None]()
-    # an experiment that names no figures shows all of its images
-    if not any(part.draw or part.figure or part.pictures for part in view.sections):
-        for file in sorted((run / IMAGES).glob("*.png")):
-            name = file.stem.replace("-", " ").replace("_", " ").capitalize()
-            alt = f"{name}: {view.statement}"
-            content.append(_embed_figure(run, f"{IMAGES}/{file.name}", alt))
+    names_figures = any(
+        part.draw or part.figure or part.pictures for part in view.sections
+    )
+    if not names_figures:
+        content += _embed_all_images(run, view)
     for part in view.sections:
-        if part.only in ("", "page") and not part.is_empty:
+        is_for_page = part.only in ("", "page")  # and not for texts alone
+        if is_for_page and not part.is_empty:
             content.append(make_part(run, part, view.statement))
     content.append(_list_parts(run, list(getattr(result, "parts", ()))))
     subject = views.list_subjects(result, view)
@@ -333,6 +352,16 @@ def make_view_page(
         scripts=scripts,
         footer=f"run {run.name}. This page needs no other file.",
     )
+
+
+def _embed_all_images(run: Path, view: ShownResult) -> list[Html | None]:
+    """Return all images of a run as figures, for a result that names none."""
+    figures = []
+    for file in sorted((run / IMAGES).glob("*.png")):
+        name = file.stem.replace("-", " ").replace("_", " ").capitalize()
+        alt = f"{name}: {view.statement}"
+        figures.append(_embed_figure(run, f"{IMAGES}/{file.name}", alt))
+    return figures
 
 
 def _list_parts(run: Path, parts: list[object]) -> Html | None:

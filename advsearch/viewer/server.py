@@ -91,6 +91,7 @@ def make_list_page(runs: Mapping[str, Path]) -> str:
         (name, listing.read_listed_run(path, counts=False))
         for name, path in runs.items()
     ]
+    # the newest first; those of an unknown time last
     listed.sort(key=lambda item: item[1].when or 0.0, reverse=True)
     # a single sweep has nothing to be compared with
     can_compare = sum(run.command == "sweep" for _, run in listed) > 1
@@ -125,7 +126,13 @@ def _runs_table(
 
 
 def _run_row(name: str, run: listing.ListedRun, can_compare: bool) -> Html:
-    """Return the row of a run in the list."""
+    """Return the row of a run in the list of runs.
+
+    Args:
+        name: name of the run.
+        run: what is known of it.
+        can_compare: begin with a cell to choose the run, if it is a sweep.
+    """
     address = f"runs/{quote_name(name)}/"
     cells = []
     if can_compare:
@@ -269,7 +276,8 @@ def _attack_list_html(run: Path) -> Html | None:
 
 
 def make_progress_json(run: Path, after: int) -> bytes:
-    """Return, as JSON, what is new in a run.
+    """Return, as JSON, the rows and pictures that a run has stored after a row, and
+    whether it goes on.
 
     Args:
         run: directory of the run.
@@ -278,8 +286,8 @@ def make_progress_json(run: Path, after: int) -> bytes:
     Raises:
         FileFormatError: the stored results are corrupt.
     """
-    # looked up before the rows are read: rows that come in between are asked for next
-    # time
+    # looked up before the rows are read: a run that ends in between counts as running,
+    # so that the page asks once more for its last rows
     running = is_held(run)
     ended = not is_unfinished(run)
     last = after
@@ -291,10 +299,10 @@ def make_progress_json(run: Path, after: int) -> bytes:
                 rows.append(_row_json(row))
                 last = row.id or after
             # those of the search alone, which the page draws
-            for number, picture in results.iterate_images("search", after, last):
+            for step, picture in results.iterate_images("search", after, last):
                 jpeg = make_thumbnail(picture.astype("float32") / 255.0)
                 url = make_data_url(jpeg, "image/jpeg")
-                pictures.append({"step": number, "picture": url})
+                pictures.append({"step": step, "picture": url})
     progress = {
         "rows": rows,
         "pictures": pictures,
@@ -377,7 +385,9 @@ class PhotographServer(Protocol):
 
 
 def _name_runs(paths: Sequence[Path]) -> dict[str, Path]:
-    """Return directories of runs by name; further runs of one name get numbers."""
+    """Return directories of runs by name; further runs of one name get a number, as in
+    "mug (2)".
+    """
     path_of_name: dict[str, Path] = {}
     for path in paths:
         name = path.resolve().name
@@ -425,7 +435,7 @@ class Dashboard(HTTPServer):
         """
         self._explicit_runs = _name_runs(runs)
         self.token = None if is_local(host) else secrets.token_urlsafe(24)
-        self._secret = secrets.token_bytes(32)
+        self._secret = secrets.token_bytes(32)  # from which `make_key` makes keys
         self.photographs = photographs
         self._listing = threading.Lock()
         self.host_name = host
@@ -435,6 +445,7 @@ class Dashboard(HTTPServer):
             self._context, self.fingerprint = make_https_context(
                 (find_reachable_address(host), "localhost", LOOPBACK)
             )
+        # bound below, where an address that is taken becomes an error of ours
         super().__init__((host, port), _Handler, bind_and_activate=False)
         self.clients = ConnectionPool(self.socket, self.finish_request, self._context)
         try:
@@ -479,10 +490,11 @@ class Dashboard(HTTPServer):
             FileFormatError: it has links in it.
         """
         path = self._explicit_runs.get(name)
-        # the name comes from a request, and must not lead out of the folder
-        is_name = name not in ("", ".", "..") and not set("/\0") & set(name)
-        if not self._explicit_runs and is_name and is_run(HOME / name):
-            path = HOME / name
+        if not self._explicit_runs:
+            # the name comes from a request, and must not lead out of the folder
+            is_name = name not in ("", ".", "..") and not set("/\0") & set(name)
+            if is_name and is_run(HOME / name):
+                path = HOME / name
         if path is None:
             raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such run")
         check_links(path)
@@ -619,14 +631,16 @@ class _Handler(BaseHTTPRequestHandler):
         return self._route(query, parts), headers
 
     def _take_photograph(self, parts: list[str]) -> Response:
-        """Respond to a POST request; only photographs are accepted."""
+        """Respond to a POST request by the parts of its path; only photographs are
+        accepted.
+        """
         match parts:
             case ["runs", name, "align", "renderings", file]:
                 run = self.server.find_run(name)
-                kind, data = self.server.photograph_pages.store_photograph(
+                media_type, data = self.server.photograph_pages.store_photograph(
                     run, file, self.headers, self.server.make_key(name), self._read_body
                 )
-                return Response(kind, data)
+                return Response(media_type, data)
         raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _route(self, query: Query, parts: list[str]) -> Response:
@@ -660,11 +674,12 @@ class _Handler(BaseHTTPRequestHandler):
                 )
             case ["runs", name, "align", ""]:
                 return self._serve_photograph_page(name)
-            case ["runs", name, "align", ("renderings" | "photos") as kinds, file]:
-                kind, data = server.photograph_pages.read_picture(
-                    kinds.removesuffix("s"), server.find_run(name), file
+            case ["runs", name, "align", ("renderings" | "photos") as folder, file]:
+                kind = folder.removesuffix("s")
+                media_type, data = server.photograph_pages.read_picture(
+                    kind, server.find_run(name), file
                 )
-                return Response(kind, data)
+                return Response(media_type, data)
         raise RequestRejected(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _serve_run(self, name: str) -> Response:
@@ -740,13 +755,13 @@ class _Handler(BaseHTTPRequestHandler):
             stored = read_bytes(run / COLUMNS, "columns of a sweep", MAX_COLUMNS_BYTES)
             return Response(media_type, stored)
         max_rows = MAX_ROWS if after else FIRST_ROWS
-        # looked up before the rows are read: rows that come in between are asked for
-        # next time
-        running = is_held(run)
+        # looked up before the rows are read: a run that ends in between counts as running,
+        # so that the page asks once more for its last rows
+        is_running = is_held(run)
         rows = read_columns(run, after, max_rows)
         has_more = len(rows) == max_rows
         return Response(
-            media_type, pack_columns(rows, has_more=has_more, is_running=running)
+            media_type, pack_columns(rows, has_more=has_more, is_running=is_running)
         )
 
     def _read_body(self) -> bytes:
@@ -781,8 +796,8 @@ def _parse_after(query: Query) -> int:
 
 
 def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
-    """Return status and text of the response to an error; of an error of others only
-    its type is told.
+    """Return status and text of the response to an error; of an error that is not one
+    of advsearch's the text has only the type.
     """
     if isinstance(error, RequestRejected):
         return error.status, str(error)
@@ -865,6 +880,8 @@ def _add_navigation(
         make_element("nav", *anchors, aria_label="back"),
         make_element("p", remark, class_="remarks") if remark else None,
     )
-    # behind the start of the body, or at the beginning of a page without one
-    start = page.find(b"<body>") + len(b"<body>") if b"<body>" in page else 0
+    # at the beginning of the body, or of a page without one
+    start = 0
+    if b"<body>" in page:
+        start = page.find(b"<body>") + len(b"<body>")
     return page[:start] + navigation.encode("utf-8", "replace") + page[start:]

@@ -51,7 +51,7 @@ def make_thumbnail(picture: object) -> bytes:
 
 def make_cover(run: Path) -> bytes:
     """Return a small image of a run as a JPEG: its adversarial picture, or else another
-    one; gray if it has none.
+    one; gray if it has none that can be read.
     """
     preferred = ("adversarial", "clean", "worst")
     files = [run / IMAGES / f"{name}.png" for name in preferred]
@@ -59,6 +59,7 @@ def make_cover(run: Path) -> bytes:
     for file in files:
         if not file.is_file():
             continue
+        # a file that cannot be read is passed over
         with suppress(*BAD_PICTURE), Image.open(file, formats=("PNG",)) as image:
             if image.width * image.height <= MAX_COVER_PIXELS:
                 return _encode_jpeg(image.convert("RGB"))
@@ -193,15 +194,17 @@ def find_thumbnails(run: Path) -> Thumbnails | None:
     if next(_list_numbers(run), None) is None:
         return None
     settings = read_yaml(run / CONFIG) if (run / CONFIG).is_file() else {}
-    # every model predicts each image, so that so many configurations share one; without
-    # the setting there is a single model
+    # Each image is evaluated once by every model, so that as many consecutive
+    # configurations share it. Without the setting there is a single model.
     model_names = split_names(str(settings.get("model", "default")))
     is_subset = settings.get("keep_pictures") != "all"
     return Thumbnails(run, len(model_names), is_subset)
 
 
 def _list_numbers(run: Path) -> Iterator[int]:
-    """Yield the numbers of the images that have thumbnails; links are ignored."""
+    """Yield the numbers of the images that have thumbnails, in any order; links are
+    ignored.
+    """
     root = run / SMALL_PICTURES
     if not root.is_dir():
         return
