@@ -673,7 +673,7 @@ FINISHES = {
 def car(sampler: ParameterSampler) -> Instance:
     """Make a car of random proportions and paint."""
     color = sampler.sample_color(
-        "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", wild=0.2
+        "2a5fa8", "b3202a", "d9dadb", "2f6f4f", "e0a02c", "3a3f45", p_random=0.2
     )
     stretch = np.array(
         [
@@ -683,7 +683,7 @@ def car(sampler: ParameterSampler) -> Instance:
         ]
     )
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
-    metal = sampler.sample_color("c4c7ca", "8d9094", "2d2f31", wild=0.0)
+    metal = sampler.sample_color("c4c7ca", "8d9094", "2d2f31", p_random=0.0)
     paints: dict[str, Paint] = {
         "paint": _lacquer(color),
         "glass": _panes,
@@ -692,15 +692,21 @@ def car(sampler: ParameterSampler) -> Instance:
         "rubber": solid("1c1c1d"),
         "rim": solid(metal),
         "trim": _slats,
-        "plate": _plate(sampler.sample_color("f2f2ec", "f0d264", wild=0.0)),
+        "plate": _plate(sampler.sample_color("f2f2ec", "f0d264", p_random=0.0)),
         "well": solid("0a0a0b"),
     }
-    detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
+    texel_density = {
+        "rubber": 0.3,
+        "well": 0.15,
+        "rim": 0.35,
+        "trim": 0.7,
+        "plate": 3.0,
+    }
     return Instance(
         shapes.stretch_patches(patches, stretch),
         paints,
         material=FINISHES["paint"],
-        detail=detail,
+        texel_density=texel_density,
         finishes=FINISHES,
         drives=True,
     )

@@ -257,7 +257,7 @@ class Instance:
         patches: the surface.
         paints: a paint for every tag of the patches.
         material: the other surface parameters.
-        detail: width of texels by tag, relative to the rest of the object, for parts
+        texel_density: width of texels by tag, relative to the rest of the object, for parts
             that are hardly visible.
         finishes: materials by tag, of an object of several materials; its tags are then
             names of materials.
@@ -268,7 +268,7 @@ class Instance:
     patches: Sequence[Patch]
     paints: Mapping[str, Paint]
     material: assets.Material
-    detail: Mapping[str, float] = field(default_factory=dict)
+    texel_density: Mapping[str, float] = field(default_factory=dict)
     finishes: Mapping[str, assets.Material] = field(default_factory=dict)
     rig: assets.MeshRig | None = None
     drives: bool = False
@@ -307,8 +307,10 @@ class ObjectFamily:
         patches = instance.patches
         chart_sizes = []
         for patch in patches:
-            detail = instance.detail.get(patch.tag, 1.0)
-            chart_sizes.append((patch.size[0] * detail, patch.size[1] * detail))
+            texel_density = instance.texel_density.get(patch.tag, 1.0)
+            chart_sizes.append(
+                (patch.size[0] * texel_density, patch.size[1] * texel_density)
+            )
         rectangles = pack_charts(chart_sizes, self.texels)
         mesh = join_patches(patches, rectangles, self.texels)
         surface = None

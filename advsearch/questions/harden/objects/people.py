@@ -260,22 +260,22 @@ def person(sampler: ParameterSampler) -> Instance:
         ),
         "trousers": _jeans(
             sampler.sample_color(
-                "31374a", "4a4640", "1f2226", "6b6152", "5a6270", wild=0.15
+                "31374a", "4a4640", "1f2226", "6b6152", "5a6270", p_random=0.15
             )
         ),
         "skin": _face(skin, hair),
         "hair": _strands(hair),
         "shoes": _leather(
-            sampler.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", wild=0.15)
+            sampler.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", p_random=0.15)
         ),
         "eyes": _irises(parse_hex_color(sampler.pick("4a3424", "5a7a94", "5f6f4a"))),
     }
-    detail = {"skin": 0.8, "shoes": 0.8, "shirt": 1.15}
+    texel_density = {"skin": 0.8, "shoes": 0.8, "shirt": 1.15}
     return Instance(
         _patches(body),
         paints,
         material=FINISHES["shirt"],
-        detail=detail,
+        texel_density=texel_density,
         finishes=FINISHES,
         rig=body,
     )

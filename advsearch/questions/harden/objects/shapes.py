@@ -640,7 +640,7 @@ def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
 def sphere(
     tag: str,
     radius: float,
-    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    center: Sequence[float] = (0.0, 0.0, 0.0),
     rows: int = 24,
     columns: int = 40,
 ) -> list[Patch]:
@@ -649,7 +649,7 @@ def sphere(
     Args:
         tag: tag of the paint.
         radius: radius of the sphere.
-        centre: centre of the sphere.
+        center: center of the sphere.
         rows: faces from pole to pole.
         columns: faces around the z axis.
     """
@@ -664,7 +664,7 @@ def sphere(
         (tag, curve[cut : rows - cut + 1]),
         (tag, curve[rows - cut :]),
     ]
-    return transform_patches(lathe(pieces, columns=columns), offset=centre)
+    return transform_patches(lathe(pieces, columns=columns), offset=center)
 
 
 def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
@@ -702,27 +702,27 @@ def sweep(
 
     Args:
         tag: tag of the paint.
-        path: the centres of the section.
+        path: the centers of the section.
         section: (M, 2) counter-clockwise, coordinates along the first and second
             normal.
-        scale: one number, (N,) or (N, 2): the section's scale at each centre; 0 closes
+        scale: one number, (N,) or (N, 2): the section's scale at each center; 0 closes
             the surface in a point.
         first: direction (3,) of the section's first axis at the start of the path.
         caps: close both ends with flat faces and a hard edge.
         frame: tangents and normals to use in place of `compute_frames(path, first)`.
     """
-    centres = np.asarray(path, dtype=np.float64)
+    centers = np.asarray(path, dtype=np.float64)
     tangent, first_normal, second_normal = (
-        compute_frames(centres, first) if frame is None else frame
+        compute_frames(centers, first) if frame is None else frame
     )
     scales = np.asarray(scale, dtype=np.float64)
     if scales.ndim < 2:
         scales = scales.reshape(-1, 1)
-    scales = np.broadcast_to(scales, (len(centres), 2))
+    scales = np.broadcast_to(scales, (len(centers), 2))
     points = _sweep_points(
         section=section,
         scales=scales,
-        centres=centres,
+        centers=centers,
         first_normal=first_normal,
         second_normal=second_normal,
     )
@@ -754,17 +754,17 @@ def sweep(
 def _sweep_points(
     section: Array,
     scales: Array,
-    centres: Array,
+    centers: Array,
     first_normal: Array,
     second_normal: Array,
 ) -> Array:
-    """Return the points (N, M, 3) of a section (M, 2) at each of the centres (N, 3).
+    """Return the points (N, M, 3) of a section (M, 2) at each of the centers (N, 3).
 
     There it is scaled by `scales` (N, 2), and its two axes are the normals (N, 3).
     """
     scaled_section = section[None] * scales[:, None]
     return (
-        centres[:, None]
+        centers[:, None]
         + scaled_section[..., :1] * first_normal[:, None]
         + scaled_section[..., 1:] * second_normal[:, None]
     )
@@ -809,20 +809,20 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
     bounding rectangle, with u in the direction from the middle to the first point of
     the ring.
     """
-    centre = ring.mean(axis=0)
-    x = normalize(ring[0] - centre)
+    center = ring.mean(axis=0)
+    x = normalize(ring[0] - center)
     x = normalize(x - (x @ normal) * normal)
     y = np.cross(normal, x)
-    plane_points = np.stack([(ring - centre) @ x, (ring - centre) @ y], axis=1)
+    plane_points = np.stack([(ring - center) @ x, (ring - center) @ y], axis=1)
     lower = plane_points.min(axis=0)
     extent = plane_points.max(axis=0) - plane_points.min(axis=0)
     uvs = (np.concatenate([[[0.0, 0.0]], plane_points]) - lower) / extent
-    vertices = np.concatenate([centre[None], ring])
+    vertices = np.concatenate([center[None], ring])
 
     def rest(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at chart coordinates (N,)."""
         return np.asarray(
-            centre
+            center
             + (u * extent[0] + lower[0])[:, None] * x
             + (v * extent[1] + lower[1])[:, None] * y
         )
@@ -841,7 +841,7 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
 
 def box(
     tag: str,
-    centre: Sequence[float],
+    center: Sequence[float],
     size: Sequence[float],
     bevel: float,
     steps: int = 2,
@@ -851,7 +851,7 @@ def box(
 
     Args:
         tag: tag of the paint.
-        centre: centre of the box.
+        center: center of the box.
         size: along x, y and z.
         bevel: radius of the edges.
         steps: cells across half of an edge's rounding.
@@ -878,7 +878,7 @@ def box(
             patches.append(
                 grid(
                     tag,
-                    points + np.asarray(centre, dtype=np.float64),
+                    points + np.asarray(center, dtype=np.float64),
                     normal,
                     size=(2 * float(half[i]), 2 * float(half[j])),
                     down=down,
