@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.extend.assets import IntArray
+from advsearch.extend import assets
 from advsearch.questions.harden.objects.family import Instance, family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch, Points
 from advsearch.questions.harden.objects.textures import (
@@ -61,7 +61,7 @@ def _spout(sampler: ParameterSampler, radius: float, height: float) -> list[Patc
     )
 
 
-def _spout_rings(outer_radii: Array) -> tuple[IntArray, Array, Array]:
+def _spout_rings(outer_radii: Array) -> tuple[assets.IntArray, Array, Array]:
     """Return the rings of a spout: its outside, its lip, and its hollow inside.
 
     Args:
