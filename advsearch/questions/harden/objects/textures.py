@@ -389,56 +389,65 @@ def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
     b = sampler.sample_color("808080", p_random=1.0)
     cell = size * sampler(0.1, low=0.05, high=0.2)
     offset = sampler.offset()
-
-    def sample_fraction() -> float:
-        """Return the fraction of the area that color b takes."""
-        return sampler(0.5, low=0.2, high=0.8)
-
-    def sample_axis() -> int:
-        """Return a coordinate axis."""
-        return int(sampler.pick(0, 1, 2))
-
-    def sample_wood() -> Paint:
-        """Return wood; it has a color of its own."""
-        timber = sampler.sample_color("9a6a3c", "c89b62", "5b3a22")
-        return wood(timber, scale=0.5 * cell, offset=offset, axis=sample_axis())
-
-    # only the chosen one is called, as each takes other samples
-    make_paint: dict[str, Callable[[], Paint]] = {
-        "solid": lambda: solid(a),
-        "rings": lambda: rings(
-            a, b, period=cell, fraction=sample_fraction(), axis=sample_axis()
-        ),
-        "stripes": lambda: stripes(
+    kind = sampler.pick(
+        "solid",
+        "rings",
+        "stripes",
+        "checks",
+        "dots",
+        "zigzag",
+        "mottled",
+        "speckled",
+        "gradient",
+        "wood",
+    )
+    if kind in ("mottled", "speckled", "wood"):
+        return _sample_irregular_paint(sampler, kind, a, b, cell, offset)
+    if kind in ("rings", "gradient"):
+        return _sample_paint_along_axis(sampler, kind, a, b, cell, size)
+    if kind == "stripes":
+        return stripes(
             a,
             b,
             cell=cell,
-            fraction=sample_fraction(),
+            fraction=sampler(0.5, low=0.2, high=0.8),
             slant=int(sampler.pick(0, 1, 3)),
-        ),
-        "checks": lambda: checks(a, b, cell=cell),
-        "dots": lambda: dots(
-            solid(a), b, cell=cell, radius=sampler(0.3, low=0.18, high=0.42)
-        ),
-        "zigzag": lambda: zigzag(a, b, cell=cell),
-        "mottled": lambda: mottled(
-            a,
-            b,
-            scale=1.5 * cell,
-            offset=offset,
-            contrast=sampler(2.0, low=1.0, high=4.0),
-        ),
-        "speckled": lambda: speckled(
-            solid(a),
-            b,
-            scale=0.4 * cell,
-            offset=offset,
-            amount=sampler(0.2, low=0.1, high=0.4),
-        ),
-        "gradient": lambda: gradient(a, b, low=0.0, high=size, axis=sample_axis()),
-        "wood": sample_wood,
-    }
-    return make_paint[sampler.pick(*make_paint)]()
+        )
+    if kind == "dots":
+        radius = sampler(0.3, low=0.18, high=0.42)
+        return dots(solid(a), b, cell=cell, radius=radius)
+    if kind == "checks":
+        return checks(a, b, cell=cell)
+    if kind == "zigzag":
+        return zigzag(a, b, cell=cell)
+    return solid(a)
+
+
+def _sample_irregular_paint(
+    sampler: ParameterSampler, kind: str, a: Color, b: Color, cell: float, offset: Array
+) -> Paint:
+    """Sample clouds or specks of two colors, or wood, which has a color of its own."""
+    if kind == "mottled":
+        contrast = sampler(2.0, low=1.0, high=4.0)
+        return mottled(a, b, scale=1.5 * cell, offset=offset, contrast=contrast)
+    if kind == "speckled":
+        amount = sampler(0.2, low=0.1, high=0.4)
+        return speckled(solid(a), b, scale=0.4 * cell, offset=offset, amount=amount)
+    timber = sampler.sample_color("9a6a3c", "c89b62", "5b3a22")
+    axis = int(sampler.pick(0, 1, 2))
+    return wood(timber, scale=0.5 * cell, offset=offset, axis=axis)
+
+
+def _sample_paint_along_axis(
+    sampler: ParameterSampler, kind: str, a: Color, b: Color, cell: float, size: float
+) -> Paint:
+    """Sample rings, or a gradient over the size of the instance, along an axis."""
+    if kind == "rings":
+        fraction = sampler(0.5, low=0.2, high=0.8)
+        axis = int(sampler.pick(0, 1, 2))
+        return rings(a, b, period=cell, fraction=fraction, axis=axis)
+    axis = int(sampler.pick(0, 1, 2))
+    return gradient(a, b, low=0.0, high=size, axis=axis)
 
 
 def paint_or_random(
