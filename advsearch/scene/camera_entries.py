@@ -103,15 +103,14 @@ class Entries:
         Args:
             name: the entry.
             default: the default; None if the entry is required.
-            aliases: plain names for the entry, if there are several.
+            aliases: plain names for the entry, see `normalize_key`, if there are
+                several; otherwise that of `name`.
 
         Raises:
             FileFormatError: it is no number, or is required and missing.
         """
-        if (
-            default is not None
-            and self.get(*(aliases or (normalize_key(name),))) is None
-        ):
+        is_missing = self.get(*(aliases or (normalize_key(name),))) is None
+        if is_missing and default is not None:
             return default
         return parse_number(self.path, name, self.require(name, aliases))
 
@@ -147,7 +146,7 @@ class Entries:
         them.
 
         Args:
-            prefix: prefix for the entry that they are within, with a dot.
+            prefix: name, with a dot, of the entry that all of these stand in.
 
         Raises:
             FileFormatError: one of them changes the image.
@@ -158,20 +157,7 @@ class Entries:
         ):
             name = normalize_key(spelling)
             value = self._keys.peek(name)
-            is_matrix = isinstance(value, (list, Mapping))
-            is_coefficient = name in COEFFICIENTS and not is_matrix
-            # an entry such as M2 beside M1, of a stereo pair; k2 is no such entry
-            is_of_second_camera = (
-                name.endswith("2")
-                and f"{name[:-1]}1" in self._keys
-                and not is_coefficient
-            )
-            changes_image = (
-                IMAGE_CHANGING_KEYS.fullmatch(name)
-                and not RECTIFICATION_KEYS.fullmatch(name)
-                and not is_of_second_camera
-            )
-            if not changes_image:
+            if not self._may_change_image(name, value):
                 unread.append(prefix + spelling)
             elif not is_neutral(value):
                 raise FileFormatError(
@@ -181,6 +167,23 @@ class Entries:
                     "docs/cameras.md"
                 )
         return unread
+
+    def _may_change_image(self, name: str, value: object) -> bool:
+        """Return whether an entry of a plain name would change the image if it were
+        read.
+
+        Entries about rectified images would not; nor would those of the second camera
+        of a stereo pair, which have a 2 at the end, as M2 beside M1.
+        """
+        if not IMAGE_CHANGING_KEYS.fullmatch(name):
+            return False
+        if RECTIFICATION_KEYS.fullmatch(name):
+            return False
+        is_matrix = isinstance(value, (list, Mapping))
+        # k2 beside k1 is of the same camera
+        is_coefficient = name in COEFFICIENTS and not is_matrix
+        has_first_camera = name.endswith("2") and f"{name[:-1]}1" in self._keys
+        return is_coefficient or not has_first_camera
 
 
 def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> Any:
@@ -214,11 +217,12 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
 
 
 def is_neutral(value: object) -> bool:
-    """Return whether a value changes nothing: it is zero, empty or none.
+    """Return whether an entry changes nothing: it is zero, empty or none.
 
     Of a matrix, a list or a mapping all values have to be.
     """
     if isinstance(value, Mapping):
+        # a matrix has its numbers as `data`
         value = value.get("data", list(value.values()))
     return all(
         cell in (None, False, "", "none") or _to_float(str(cell)) == 0.0

@@ -49,6 +49,9 @@ from advsearch.trust.yaml_text import MAX_YAML_BYTES, parse_yaml
 
 # Limit of the bytes of a JSON file, which may have the pose of every image.
 MAX_JSON_SIZE = 1 << 25
+# The coordinates of the center of the first pixel, where 0 is its corner; added to a
+# principal point of a tool that counts from that center.
+FIRST_PIXEL_CENTER = 0.5
 MAX_BINNING = 64  # limit of the pixels along a side that a sensor bins into one
 # Coefficients in the order of OpenCV and ROS.
 OPENCV_COEFFICIENTS = (
@@ -382,9 +385,9 @@ def _read_nerfstudio(
     numbers["cx"] = entries.get_number("cx", width / 2.0)
     numbers["cy"] = entries.get_number("cy", height / 2.0)
     if kind == FISHEYE:
-        numbers |= _read_coefficients(entries, COEFFICIENTS[:4])
+        numbers |= _read_optional_numbers(entries, COEFFICIENTS[:4])
     else:
-        numbers |= _read_coefficients(entries, ("k1", "k2", "k3", "p1", "p2"))
+        numbers |= _read_optional_numbers(entries, ("k1", "k2", "k3", "p1", "p2"))
     model = make_camera_model(spec, kind, (height, width), numbers)
     unread = entries.find_unread()
     frame_entries = Entries(path, _select_other_entries(frames))
@@ -436,27 +439,29 @@ def _read_focal_lengths(
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
-    A length wins. fy is fx where the file has neither its length nor its angle.
+    A length wins over an angle. fy is fx where the file has neither for y.
 
     Args:
         path: the file, for messages.
-        data: all entries of the file, which have the angles, radians.
-        entries: those of the camera, which have the lengths.
+        data: all entries of the file, which may have the angles, radians.
+        entries: those of the camera, which may have the lengths.
         width: width of the image in pixels.
         height: likewise.
 
     Raises:
-        FileFormatError: the two contradict each other.
+        FileFormatError: length and angle along x contradict each other, or both are
+            missing.
     """
-    x_focal = _compute_focal_length(path, data.get("camera_angle_x"), width)
-    y_focal = _compute_focal_length(path, data.get("camera_angle_y"), height)
-    fx = entries.get_number("fl_x", x_focal or None)
-    if x_focal and abs(fx - x_focal) > MAX_FOCAL_MISMATCH * fx:
+    fx_by_angle = _compute_focal_length(path, data.get("camera_angle_x"), width)
+    fy_by_angle = _compute_focal_length(path, data.get("camera_angle_y"), height)
+    fx = entries.get_number("fl_x", fx_by_angle)
+    if fx_by_angle is not None and abs(fx - fx_by_angle) > MAX_FOCAL_MISMATCH * fx:
         raise FileFormatError(
-            f"{path}: fl_x: expected {x_focal:g}, as camera_angle_x says, got {fx:g}; "
-            "leave one out"
+            f"{path}: fl_x: expected {fx_by_angle:g}, as camera_angle_x says, got "
+            f"{fx:g}; leave one out"
         )
-    return {"fx": fx, "fy": entries.get_number("fl_y", y_focal or fx)}
+    default_fy = fx if fy_by_angle is None else fy_by_angle
+    return {"fx": fx, "fy": entries.get_number("fl_y", default_fy)}
 
 
 def _select_lens(
@@ -474,7 +479,9 @@ def _select_lens(
     """
     lenses = [
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
-    ] or [{}]  # without frames, all is said once for the file
+    ]
+    if not lenses:
+        lenses = [{}]  # a file without frames has all of its lens outside of them
     first_lens: dict[str, Any] = lenses[0]
     if not camera_name and all(lens == first_lens for lens in lenses):
         return first_lens
@@ -483,11 +490,18 @@ def _select_lens(
     return selected
 
 
-def _compute_focal_length(path: str, angle: object, side: float) -> float:
-    """Return the focal length in pixels of a field of view in radians; 0 for None."""
+def _compute_focal_length(path: str, angle: object, side: float) -> float | None:
+    """Return the focal length, in pixels, of a field of view; None without an angle.
+
+    Args:
+        path: the file, for messages.
+        angle: an entry of the file, radians; None if it is missing.
+        side: side of the image, in pixels, that the angle spans.
+    """
     if angle is None:
-        return 0.0
+        return None
     half_angle = parse_number(path, "camera_angle", angle) / 2.0
+    # 1e-9: an angle of 0 or less becomes a very long focal length
     return side / 2.0 / max(math.tan(half_angle), 1e-9)
 
 
@@ -495,8 +509,6 @@ def _read_kalibr(
     spec: str, entries: Entries, unread: Sequence[str] = ()
 ) -> CameraModel:
     """Return the model of a camera of Kalibr.
-
-    Principal points count from the center of the first pixel there, hence the half.
 
     Args:
         spec: the file, and perhaps the camera in it.
@@ -525,50 +537,33 @@ def _read_kalibr(
     )
     numbers = _read_distortion(entries, names, (0, 4))
     numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
-    camera = make_camera_model(spec, kind, (height, width), numbers, 0.5)
+    camera = make_camera_model(spec, kind, (height, width), numbers, FIRST_PIXEL_CENTER)
     return add_notes(camera, [*unread, *entries.find_unread()])
 
 
 def _read_opencv(spec: str, entries: Entries) -> CameraModel:
     """Return the model of a camera of OpenCV or ROS.
 
-    Principal points count from the center of the first pixel. The calibration is of the
-    sensor's pixels, before ROS bins them: the model has the size after that. A tilted
-    sensor is rejected, a region of interest too.
+    The calibration is of the sensor's pixels; ROS may bin several of them into one
+    pixel of the image, and the model has the size of that image. A tilted sensor is
+    rejected, a region of interest too. `spec` is the file, and perhaps the camera in
+    it.
     """
     path = entries.path
     kind = _find_opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:
-        return add_notes(
-            make_camera_model(spec, kind, _read_size(entries), {}),
-            entries.find_unread(),
-        )
+        panorama = make_camera_model(spec, kind, _read_size(entries), {})
+        return add_notes(panorama, entries.find_unread())
     matrix = _read_camera_matrix(path, entries)
     height, width = _read_size(entries)
     unread = _check_roi(entries, (height, width))
-    if kind == FISHEYE:
-        numbers = _read_distortion(entries, COEFFICIENTS[:4], (0, 4))
-    else:
-        numbers = _read_distortion(
-            entries, OPENCV_COEFFICIENTS, OPENCV_COEFFICIENT_COUNTS
-        )
-    if numbers.pop("tauX", 0.0) or numbers.pop("tauY", 0.0):
-        raise FileFormatError(
-            f"{path}: expected no tilt of the sensor (tauX, tauY), got one; calibrate "
-            "without CALIB_TILTED_MODEL"
-        )
-    numbers |= {
-        "fx": matrix[0],
-        "skew": matrix[1],
-        "cx": matrix[2],
-        "fy": matrix[4],
-        "cy": matrix[5],
-    }
+    numbers = _read_opencv_distortion(entries, kind) | _name_matrix_entries(matrix)
     y_binning, x_binning = _read_binning(entries)
     # Pixels that fill no bin are cut off; the model is in fractions of what is left.
-    binned_size = (height - height % y_binning, width - width % x_binning)
-    model = make_camera_model(spec, kind, binned_size, numbers, 0.5)
-    model = replace(model, size=(int(height // y_binning), int(width // x_binning)))
+    used_size = (height - height % y_binning, width - width % x_binning)
+    model = make_camera_model(spec, kind, used_size, numbers, FIRST_PIXEL_CENTER)
+    binned_size = (int(height // y_binning), int(width // x_binning))
+    model = replace(model, size=binned_size)
     rectified = _find_rectified(entries, matrix)
     return add_notes(model, unread + entries.find_unread(), rectified)
 
@@ -625,6 +620,12 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
     return matrix
 
 
+def _name_matrix_entries(matrix: Sequence[float]) -> dict[str, float]:
+    """Return the numbers of a camera matrix, nine row by row, that are not fixed."""
+    fx, skew, cx, _, fy, cy = matrix[:6]
+    return {"fx": fx, "skew": skew, "cx": cx, "fy": fy, "cy": cy}
+
+
 def _read_distortion(
     entries: Entries, names: Sequence[str], counts: Sequence[int]
 ) -> dict[str, float]:
@@ -636,8 +637,10 @@ def _read_distortion(
         counts: the lengths that the list may have.
     """
     distortion = entries.get(*DISTORTION_KEYS)
-    if is_neutral(distortion) and not isinstance(distortion, Mapping):
-        coefficients = _read_coefficients(entries, names)
+    # a matrix (a mapping) is a list even if it is all zeros
+    has_list = isinstance(distortion, Mapping) or not is_neutral(distortion)
+    if not has_list:
+        coefficients = _read_optional_numbers(entries, names)
     else:
         values = entries.parse_numbers("distortion_coefficients", distortion, counts)
         coefficients = dict(zip(names, values, strict=False))
@@ -651,8 +654,28 @@ def _read_distortion(
     return coefficients
 
 
-def _read_coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
-    """Return entries of single coefficients; 0 for those that are missing."""
+def _read_opencv_distortion(entries: Entries, kind: str) -> dict[str, float]:
+    """Return the distortion coefficients of a camera of OpenCV or ROS, by name.
+
+    Raises FileFormatError: the sensor is tilted, for which our models have no numbers.
+    """
+    if kind == FISHEYE:
+        return _read_distortion(entries, COEFFICIENTS[:4], (0, 4))
+    coefficients = _read_distortion(
+        entries, OPENCV_COEFFICIENTS, OPENCV_COEFFICIENT_COUNTS
+    )
+    x_tilt = coefficients.pop("tauX", 0.0)
+    y_tilt = coefficients.pop("tauY", 0.0)
+    if x_tilt or y_tilt:
+        raise FileFormatError(
+            f"{entries.path}: expected no tilt of the sensor (tauX, tauY), got one; "
+            "calibrate without CALIB_TILTED_MODEL"
+        )
+    return coefficients
+
+
+def _read_optional_numbers(entries: Entries, names: Sequence[str]) -> dict[str, float]:
+    """Return entries that are numbers, by name; 0 for those that are missing."""
     return {name: entries.get_number(name, 0.0) for name in names}
 
 
@@ -695,10 +718,11 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     if not isinstance(value, Mapping):
         value = {}
     roi = Entries(entries.path, {str(key): value[key] for key in value})
-    numbers = _read_coefficients(roi, ("x_offset", "y_offset", "height", "width"))
-    x, y, height, width = numbers.values()
+    numbers = _read_optional_numbers(roi, ("x_offset", "y_offset", "height", "width"))
     roi.get("dorectify")  # counts as read: it changes nothing in a full image
-    if (x, y) != (0.0, 0.0) or (height, width) not in ((0.0, 0.0), size):
+    offset = (numbers["x_offset"], numbers["y_offset"])
+    roi_size = (numbers["height"], numbers["width"])
+    if offset != (0.0, 0.0) or roi_size not in ((0.0, 0.0), size):
         raise FileFormatError(
             f"{entries.path}: expected a camera_info of whole pictures, got one of a "
             "part (roi); set it to 0"
@@ -709,7 +733,7 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
 def _find_kind(path: str, model: object) -> str:
     """Return the kind of a distortion model by the name that a tool gives it."""
     name = re.sub(r"[-\s]", "_", str(model or "").strip().lower())
-    if name == "pinhole":
+    if name == "pinhole":  # without distortion, or with this one
         return BROWN_CONRADY
     if name not in KIND_OF_DISTORTION:
         advice = describe_projection(name) or "; calibrate with one of these"
