@@ -365,13 +365,13 @@ def compute_car_pose(camera: Tensor) -> Tensor:
     It is level, with its +x ahead and +z up, at the height 0 below the camera;
     differentiable. A camera looks along its own +z, the third column of its pose.
     """
-    forward = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
-    zero = torch.zeros_like(forward[0])
-    unit = torch.ones_like(forward[0])
-    axes = torch.stack(
-        [forward[0], -forward[1], zero, forward[1], forward[0], zero, zero, zero, unit]
-    ).reshape(3, 3)
-    return make_affine(axes, torch.cat([camera[:2, 3], zero[None]]))
+    x, y = camera[:2, 2] / camera[:2, 2].norm().clamp_min(1e-6)
+    zero = torch.zeros_like(x)
+    unit = torch.ones_like(x)
+    # the columns of the rotation: ahead (x, y, 0), to the left (-y, x, 0), and up
+    rotation = torch.stack([x, -y, zero, y, x, zero, zero, zero, unit]).reshape(3, 3)
+    position = torch.cat([camera[:2, 3], zero[None]])
+    return make_affine(rotation, position)
 
 
 def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
@@ -443,6 +443,7 @@ def make_euler_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     (cz, sz), (cy, sy), (cx, sx) = (
         (torch.cos(a), torch.sin(a)) for a in map(torch.deg2rad, (yaw, pitch, roll))
     )
+    # row by row
     about_z = torch.stack([cz, -sz, zero, sz, cz, zero, zero, zero, unit]).reshape(3, 3)
     about_y = torch.stack([cy, zero, sy, zero, unit, zero, -sy, zero, cy]).reshape(3, 3)
     about_x = torch.stack([unit, zero, zero, zero, cx, -sx, zero, sx, cx]).reshape(3, 3)

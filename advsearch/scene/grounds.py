@@ -213,6 +213,8 @@ MAX_SCALE_ERROR = 2.0  # how much too large, or too high, what stands around may
 DEFAULT_EMPTY_RADIUS = 5.0
 # degrees that a street's map may be turned by: its houses then stand beside its road
 MAX_MAP_ROTATION = 2.0
+# the range of distance and height of a picture that fits no camera
+NO_RANGE = (0.0, 0.0)
 Box = tuple[float, float, float, float]
 """From and to in x, from and to in y, metres or object sizes, with the object at (0,
 0).
@@ -255,22 +257,23 @@ def find_valid_range(
 ) -> tuple[float, float]:
     """Return up to which distance and height an environment's picture fits a camera.
 
-    In the lengths of `surroundings`, infinite without a bound; 0 and 0 where the
-    picture is turned against the ground, so that it fits nowhere. The distance has two
-    bounds, as said above: what stands around becomes too large, or the end of the
-    ground comes into sight. The camera's own distance does not count, its height and
-    angles do.
+    In the lengths of `surroundings`, infinite without a bound; `NO_RANGE` where the
+    picture is turned against the ground. The distance has two bounds, as said above:
+    what stands around becomes too large, or the end of the ground comes into sight. The
+    camera's own distance does not count, its height and angles do.
     """
-    if abs((surroundings.rotation + 180.0) % 360.0 - 180.0) > MAX_MAP_ROTATION:
-        return 0.0, 0.0
+    # from -180 to 180 degrees
+    rotation = (surroundings.rotation + 180.0) % 360.0 - 180.0
+    if abs(rotation) > MAX_MAP_ROTATION:
+        return NO_RANGE
     max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
         surroundings.nearest_distance, camera.towards
     )
-    hidden_ground_distance = (
-        math.inf
-        if camera.lower_angle <= 0.0
-        else camera.height / math.tan(math.radians(min(camera.lower_angle, 179.0)))
-    )
+    # how much of the ground below the camera its image does not show
+    hidden_ground_distance = math.inf
+    if camera.lower_angle > 0.0:
+        lower_angle = math.radians(min(camera.lower_angle, 179.0))
+        hidden_ground_distance = camera.height / math.tan(lower_angle)
     ground_distance = _reach_of_area(surroundings.ground_extent, camera.azimuth)
     max_distance = min(max_scale_distance, ground_distance + hidden_ground_distance)
     return max(0.0, max_distance), MAX_SCALE_ERROR * surroundings.height
@@ -362,23 +365,20 @@ def make_camera_view(
     if fov is None:
         fov = scene.get_number("camera.fov")
     half_fov = math.radians(fov) / 2.0
+    # the height of an image is its larger side, or smaller than that by the aspect
     half_height_angle = math.degrees(
         math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
     )
-    # A lens of the user's may show anything down to straight below.
+    # A lens of the user's, which has a name, may show anything down to straight below.
     if scene.camera_model is not None and scene.camera_model.name:
         half_height_angle = 90.0
     azimuth = math.degrees(math.atan2(y, x))
-    level_length = math.hypot(forward[0], forward[1])
-    view_azimuth = (
-        math.degrees(math.atan2(forward[1], forward[0]))
-        if level_length > 1e-6
-        else azimuth + 180.0
-    )
-    # half the picture's angle, minus how far above the horizon its middle is
-    lower_angle = half_height_angle - math.degrees(
-        math.asin(float(np.clip(forward[2], -1.0, 1.0)))
-    )
+    view_azimuth = azimuth + 180.0  # straight down counts as towards the object
+    if math.hypot(forward[0], forward[1]) > 1e-6:
+        view_azimuth = math.degrees(math.atan2(forward[1], forward[0]))
+    # how far above the horizon the middle of the image is
+    view_elevation = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
+    lower_angle = half_height_angle - view_elevation
     return CameraView(
         azimuth=azimuth,
         towards=view_azimuth,
@@ -427,16 +427,25 @@ def list_view_remarks(
     outside = () if place is None else list_outside_remarks(scene, place, views)
     if outside or surroundings is None:
         return outside
-    name = scene.environment_name
-    is_against_road = find_valid_range(surroundings, views[0]) == (0.0, 0.0)
-    if is_against_road or (
-        rotates_map and isinstance(surroundings.nearest_distance, tuple)
-    ):
+    is_against_road = find_valid_range(surroundings, views[0]) == NO_RANGE
+    # houses are a box beside the road, other surroundings are equally far all around
+    has_houses = isinstance(surroundings.nearest_distance, tuple)
+    if is_against_road or (rotates_map and has_houses):
         return (
-            f"{name}: its houses are a picture, which `environment.rotation` turns "
-            "against the road: they then stand "
+            f"{scene.environment_name}: its houses are a picture, which "
+            "`environment.rotation` turns against the road: they then stand "
             "across it; leave the rotation out",
         )
+    return _list_range_remarks(scene, surroundings, views)
+
+
+def _list_range_remarks(
+    scene: SceneData, surroundings: Surroundings, views: Sequence[CameraView]
+) -> tuple[str, ...]:
+    """Return a remark where views are too far, or too high, for an environment's picture.
+
+    Arguments are as for `list_view_remarks`; empty if no view is.
+    """
     limits = [find_valid_range(surroundings, view) for view in views]
     views_beyond = [
         view
@@ -450,7 +459,8 @@ def list_view_remarks(
     farthest = max(view.distance for view in views_beyond)
     highest = max(view.height for view in views_beyond)
     return (
-        f"{name}: the place around the object is a picture, which fits a camera up to "
+        f"{scene.environment_name}: the place around the object is a picture, which "
+        "fits a camera up to "
         f"{_describe_limits(limits, unit)}; {subject} "
         f"{farthest:.3g} {unit} away and {highest:.3g} {unit} high. There what stands "
         "around is more than twice too large or "

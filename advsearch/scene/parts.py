@@ -202,6 +202,7 @@ class SpotLamp(_Point):
         The irradiance is that of a surface that faces the lamp.
         """
         to_lamp, irradiance = super().compute_lighting(position)
+        # Degrees from the axis: full light up to `beam`, falling to none at `cutoff`.
         cutoff, beam = self.cone
         distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
         cosine = -to_lamp @ self.to_world[:3, 2] / distance
@@ -338,6 +339,8 @@ class PosedCamera:
 
         `aspect` is its width over its height.
         """
+        # `fov` is along the larger side already, unless it is along the height of an
+        # image that is wider than high
         if not self.upright or aspect <= 1.0:
             return self.fov
         return math.degrees(

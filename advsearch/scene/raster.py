@@ -423,24 +423,26 @@ class MeshSurface:
     def __init__(self, mesh: Mesh) -> None:
         """Compute boxes and normals of the faces, and which faces are neighbours.
 
-        Neighbours have an edge in common, by the positions of its ends.
+        Neighbours have an edge in common, by the positions of its ends: across a UV
+        seam too, where the vertices are not the same.
         """
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
         self.normals = _compute_face_normals(mesh)
         self._lower = self._corners.min(axis=1)
         self._upper = self._corners.max(axis=1)
-        # Pairs (E, 2) of faces with an edge in common, across UV seams too.
+        # (F, 3) the same index for vertices at one position
         corners = weld_vertices(mesh)[0][mesh.faces]
+        # (3 F, 2) edges in three blocks, each with one edge of all faces
         edges = np.concatenate(
             [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
         )
-        # Each edge is listed once for each of its faces. Sorted by their vertices,
-        # equal edges follow one another, and their faces are neighbours.
+        # Sorted by their ends, equal edges follow one another: their faces are
+        # neighbours.
         edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
         is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-        # The edges are in three blocks, of one edge of each face.
         face = order % len(mesh.faces)
+        # (E, 2) pairs of faces
         self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 
     def find_hit(

@@ -175,22 +175,22 @@ class SkeletonRig:
     def _add_targets(self, parts: Sequence[Movable], vertices: IntArray) -> None:
         """Store the morph targets of parts, for the vertices (V,) of the mesh.
 
-        A target names the vertices of its part that it moves. The mesh has some of
-        them, perhaps several times and in another order: for each the rows of the mesh
-        are found, and the offsets are put into that order.
+        A morph target moves some vertices of its part by offsets. The mesh has the
+        part's vertices in another order, some several times and some not at all: the
+        offsets are put into the order of the mesh.
 
         Args:
             parts: parts of the file.
             vertices: (V,) for each vertex of the mesh its index in the concatenated
                 vertices of all parts.
         """
-        counts = [len(part.vertices) for part in parts]
-        vertex_starts = np.cumsum([0, *counts])
-        for part, start, count in zip(parts, vertex_starts, counts, strict=False):
+        start = 0  # index of the part's first vertex among those of all parts
+        for part in parts:
+            count = len(part.vertices)
             is_of_part = (vertices >= start) & (vertices < start + count)
             mesh_rows = np.flatnonzero(is_of_part)
             for index, target in enumerate(part.targets):
-                # of each vertex of the part, its row in the target; -1: it stays
+                # for each vertex of the part its row in the target; -1 if it stays
                 row_of_vertex = np.full(count, -1)
                 row_of_vertex[target.rows] = np.arange(len(target.rows))
                 target_rows = row_of_vertex[vertices[mesh_rows] - start]
@@ -205,6 +205,7 @@ class SkeletonRig:
                         offsets=torch.from_numpy(target.offsets[target_rows[is_moved]]),
                     )
                 )
+            start += count
 
     # ---- Parameters ----
 
@@ -259,7 +260,7 @@ class SkeletonRig:
     # ---- Vertices ----
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return how far vertices move from the mesh at rest, (V, 3) float32.
+        """Return how far the vertices of the mesh move from rest, (V, 3) float32.
 
         The result is in the unit of the mesh, and differentiable.
 
@@ -272,9 +273,9 @@ class SkeletonRig:
             InputError: the file's numbers are so large that vertices are not finite.
         """
         posed = self.pose(values, clip)
-        offsets = (posed - self._rest.to(posed.device)) @ self._to_mesh.to(
-            posed.device
-        ).T
+        device = posed.device
+        # `_to_mesh` is the linear map from the file's coordinates to the mesh's
+        offsets = (posed - self._rest.to(device)) @ self._to_mesh.to(device).T
         if not bool(torch.isfinite(offsets.detach()).all()):
             cause = f"the clip {clip}" if clip else "such turns"
             raise InputError(

@@ -85,7 +85,11 @@ class Parameter:
         periodic: bool = False,
         log: bool = False,
     ) -> Parameter:
-        """Make a number that moves no outlines; see `moving` for one that does."""
+        """Make a parameter that is one number and moves no outlines.
+
+        See `moving` for one that does, and `Parameter` for the arguments: `text` is its
+        description.
+        """
         return cls(
             name=name,
             shape=(),
@@ -397,6 +401,7 @@ RAINDROPS = (
 )
 # what the lamps of a car may be: with either beam its tail lamps shine too
 LAMPS = ("off", "low", "high")
+LAMPS_OFF = LAMPS[0]
 
 
 def _make_lamp_parameter(whose: str) -> Parameter:
@@ -411,7 +416,7 @@ def _make_lamp_parameter(whose: str) -> Parameter:
         unit="name",
         low=0.0,
         high=len(LAMPS) - 1.0,
-        default=LAMPS[0],
+        default=LAMPS_OFF,
         description=text,
         options=LAMPS,
         estimators=(),
