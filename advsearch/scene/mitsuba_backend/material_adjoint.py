@@ -153,14 +153,16 @@ def material_adjoint(
 
 
 def _is_rough(cotangent: Tensor) -> bool:
-    """Return whether neighbouring pixels of a cotangent are hardly correlated.
+    """Return whether neighbouring pixels of a cotangent (H, W, 3) are hardly correlated.
 
-    The mean square of a difference is twice the variance times one minus the
-    correlation; the sum of both directions is compared with that at `ROUGH_COTANGENT`.
+    That is, by less than `ROUGH_COTANGENT`. The mean square of the difference of two
+    neighbours is 2 v (1 - c), where v is the mean square of the values and c their
+    correlation.
     """
     values = cotangent.detach().to(torch.float64)
     right_square = torch.diff(values, dim=1).square().mean()
     down_square = torch.diff(values, dim=0).square().mean()
+    # 4: twice for each of the two directions
     return bool(
         right_square + down_square
         > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean()
@@ -355,9 +357,10 @@ def _sample_incoming(
 ) -> tuple[Any, Any, Any]:
     """Sample a direction by the BSDF, and the light that arrives along it.
 
+    Direct light is sampled at emitters too, and counts here by its MIS weight alone.
+
     Returns:
-        The BSDF sample; its weight times the radiance, without the part of direct light
-        that is sampled at emitters; and where there is a sample.
+        The BSDF sample; its weight times the radiance; and where there is a sample.
     """
     bsdf_sample, bsdf_weight = si.bsdf().sample(
         mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
@@ -365,13 +368,13 @@ def _sample_incoming(
     active = active & dr.any(bsdf_weight != 0.0)
     is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
-    # with all of what the next surface emits
+    # all of what the next surface emits is in it
     L = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
     si_next = view.scene.ray_intersect(ray, active)
     ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
     em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & is_smooth)
     mis = mi.ad.integrators.common.mis_weight(bsdf_sample.pdf, em_pdf)
-    # Direct light along it counts by its MIS weight alone.
+    # the part that the samples at emitters have
     L -= (1.0 - mis) * ds_next.emitter.eval(si_next, active & is_smooth)
     return bsdf_sample, bsdf_weight * L, active
 
@@ -382,9 +385,9 @@ def _reflect_light(
     """Return the reflected light of emitters that were sampled, attached to the moving
     point.
 
-    The point on the emitter stays. With the moving point the direction to it, the
-    falloff with distance and the BSDF change; of an infinitely far emitter only the
-    BSDF does.
+    The point on the emitter stays. As the reflecting point moves, three factors change:
+    the direction to the emitter, the falloff with distance, and the BSDF; of an
+    infinitely far emitter only the BSDF does.
 
     Args:
         view: the scene.

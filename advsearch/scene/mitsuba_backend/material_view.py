@@ -140,10 +140,14 @@ class FilmView:
         cotangent: Tensor,
         max_depth: int,
     ) -> None:
-        """Sort the scene's meshes into those that move and others, as `TriMesh`."""
+        """Sort the scene's meshes into those that move and others, as `TriMesh`.
+
+        Arguments are those of the class.
+        """
         self.scene = scene
         self.camera = Camera(sensor)
         self.max_depth = max_depth
+        # one pixel wider on each side, and no channel more
         self.padded_cotangent = to_drjit_array(
             torch.nn.functional.pad(cotangent.detach(), (0, 0, 1, 1, 1, 1))
         )
@@ -165,6 +169,7 @@ class FilmView:
                 self.still_meshes.append(
                     _make_mesh(shape, parameters, positions, normals)
                 )
+        # `moving` has the names of normals too
         self.moving_meshes = [
             moving_meshes[name] for name in moving if name in moving_meshes
         ]
@@ -194,7 +199,9 @@ class FilmView:
         return dr.lerp(top, bottom, fraction.y) & active
 
     def attach_hit(self, hit: Any) -> tuple[Any, Any, Any, Any]:
-        """Return the surface point of a hit, attached to the vertices.
+        """Return the surface point of a hit, attached to the vertices of moving meshes.
+
+        It stays at the same barycentric coordinates of its triangle.
 
         Returns:
             The point; the normal of its triangle, times twice the area; the shading
@@ -217,13 +224,14 @@ class FilmView:
             mesh_point = dr.fma(b - a, u, dr.fma(c - a, v, a))
             point = dr.select(on_mesh, mesh_point, point)
             scaled_normal = dr.select(on_mesh, face_normal, scaled_normal)
+            mesh_shading_normal = face_normal
             if mesh.is_smooth:
                 a, b, c = (
                     dr.gather(mi.Normal3f, mesh.normals, corner, on_mesh)
                     for corner in corners
                 )
-                face_normal = dr.fma(b - a, u, dr.fma(c - a, v, a))
-            shading_normal = dr.select(on_mesh, face_normal, shading_normal)
+                mesh_shading_normal = dr.fma(b - a, u, dr.fma(c - a, v, a))
+            shading_normal = dr.select(on_mesh, mesh_shading_normal, shading_normal)
             is_moving = is_moving | on_mesh
         return point, scaled_normal, shading_normal, is_moving
 
@@ -464,15 +472,17 @@ def _sample_outline(
     Returns:
         The samples; None if no outline is in the image.
     """
+    # Dr.Jit's points have one entry for each axis, of one lane each
     eye = torch.tensor([axis[0] for axis in camera.eye], dtype=torch.float64)
     forward = torch.tensor([axis[0] for axis in camera.forward], dtype=torch.float64)
     ends, outwards = _find_outline(mesh, eye)
     if len(ends) == 0 or len(random) == 0:
         return None
-    a = project_to_film(camera, mesh.vertices[ends[:, 0]])
-    b = project_to_film(camera, mesh.vertices[ends[:, 1]])
+    first_on_film = project_to_film(camera, mesh.vertices[ends[:, 0]])
+    second_on_film = project_to_film(camera, mesh.vertices[ends[:, 1]])
     depth = (mesh.vertices[ends] - eye) @ forward
-    length = _measure_on_film(camera, a, b, depth)
+    length = _measure_on_film(camera, first_on_film, second_on_film, depth)
+    # no edge is on the film
     if not float(length.sum()) > 0.0:
         return None
     edge_index, film_fraction = _sample_along(length, random)
@@ -482,9 +492,8 @@ def _sample_outline(
     outwards_on_film = project_to_film(
         camera, midpoints + 1e-3 * mesh.extent * outwards
     ) - project_to_film(camera, midpoints)
-    normal = _find_film_normals(
-        b[edge_index] - a[edge_index], outwards_on_film[edge_index]
-    )
+    edge_on_film = second_on_film[edge_index] - first_on_film[edge_index]
+    normal = _find_film_normals(edge_on_film, outwards_on_film[edge_index])
     # even on the film is not even in space
     fraction = _to_space_fraction(film_fraction, depth[edge_index])
     pixels_per_sample = float(length.sum()) / len(random)
@@ -492,10 +501,10 @@ def _sample_outline(
 
 
 def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the edges that the eye (3,) may see as an outline.
+    """Find the edges of a mesh that an eye at a position (3,) may see as its outline.
 
-    All faces of such an edge lie on one side of the plane through the edge and the eye,
-    be it one face or several; edges that something hides are among them.
+    All faces of such an edge, one or several, lie on one side of the plane through the
+    edge and the eye. Edges that something hides are among them.
 
     Returns:
         (E, 2) vertices of the edges, and (E, 3) that plane's unit normal, away from the
@@ -507,8 +516,9 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
         mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
     )
     plane = torch.nn.functional.normalize(plane, dim=1)
-    # (3 F,) on which side of its edge's plane the third corner of each face lies
+    # (3 F,) signed distance of the third corner of each face from its edge's plane
     offset_from_plane = (plane[owner] * (mesh.vertices[across] - eye)).sum(dim=1)
+    # (E,) the smallest and the largest over the faces of an edge
     min_offset = torch.full(
         (len(ends),), torch.inf, dtype=offset_from_plane.dtype
     ).scatter_reduce(0, owner, offset_from_plane, "amin")
@@ -516,6 +526,7 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
         (len(ends),), -torch.inf, dtype=offset_from_plane.dtype
     ).scatter_reduce(0, owner, offset_from_plane, "amax")
     on_outline = (min_offset > 0.0) | (max_offset < 0.0)
+    # away from the faces
     sign = torch.where(min_offset[on_outline] > 0.0, -1.0, 1.0)[:, None]
     return ends[on_outline], plane[on_outline] * sign
 
@@ -545,7 +556,9 @@ def _sample_along(length: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the edges of a mesh; vertices at the same position count as one.
+    """Find the edges of a mesh, each with all faces on it.
+
+    Vertices at the same position count as one.
 
     Args:
         vertices: (V, 3) positions.
@@ -556,14 +569,16 @@ def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tens
         index of its edge and (3 F,) the vertex across, which is the face's third
         corner.
     """
+    # (V,) the same number for vertices at one position
     position_id = torch.unique(vertices, dim=0, return_inverse=True)[1]
     face_sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     across = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
     lower, higher = position_id[face_sides].aminmax(dim=1)
+    # one number for each pair of positions, in either direction
     edge_keys, owner = torch.unique(lower * len(vertices) + higher, return_inverse=True)
     side_index = torch.arange(len(owner))
-    # The vertices of an edge are those of the first side that lies on it. Assigning by
-    # index would take any side's, not the same one in each call.
+    # An edge has the vertices of the first side that lies on it. To assign them by index
+    # would take those of any side, not the same one in each call.
     first_side = torch.full((len(edge_keys),), len(owner)).scatter_reduce(
         0, owner, side_index, "amin"
     )
@@ -597,7 +612,8 @@ def compute_shadow_term(
     if shadow is None:
         return mi.Float(0)
     lit_point, _, _, lit_point_moves = view.attach_hit(shadow.hit)
-    # of the angle between each line and its edge: an edge along the line sweeps no area
+    # sine of the angle between each line and its edge: an edge along the line sweeps no
+    # area
     sine = torch.linalg.cross(
         sampled.direction, _compute_edge_directions(mesh.vertices, sampled.ends)
     ).norm(dim=1)
@@ -607,12 +623,10 @@ def compute_shadow_term(
     speed = dr.dot(
         shadow.edge_normal, edge_point - dr.select(lit_point_moves, lit_point, 0.0)
     )
-    return (
-        # minus: where the edge moves outwards, light is blocked; the last factor is the
-        # measure of lines that one sample stands for
-        dr.sum(shadow.strength * to_drjit_float(sine[shadow.sample_index]) * speed)
-        * -sampled.measure_per_sample
-    )
+    strength = shadow.strength * to_drjit_float(sine[shadow.sample_index])
+    # minus: where the edge moves outwards, light is blocked; and each sample stands for
+    # a measure of lines
+    return dr.sum(strength * speed) * -sampled.measure_per_sample
 
 
 class _ShadowBorders(NamedTuple):

@@ -186,8 +186,9 @@ class MitsubaScene:
     def _set_integrator(self, integrator: str | None) -> None:
         """Set the integrator of images, and the lengths from which paths may end early.
 
-        In a room light is reflected many times: Russian roulette pays there alone.
-        `integrator` is Mitsuba's type, None for the default.
+        Among walls light is reflected many times: there Russian roulette saves more time
+        than its noise costs. `integrator` is Mitsuba's type; None takes "path" there, and
+        "prb" elsewhere.
         """
         self.integrator = integrator or "prb"
         self.roulette_depth = NO_ROULETTE_DEPTH
@@ -227,8 +228,7 @@ class MitsubaScene:
         return inputs
 
     def _declare_inputs(self, inputs: Sequence[parts.SceneInput]) -> None:
-        """Set `declared_inputs` and what follows from it, by the inputs that the scene
-        really has.
+        """Set `declared_inputs`, the inputs that the scene really has, and sets of them.
 
         An input is left out if Mitsuba has no parameter for it.
         """
@@ -249,6 +249,7 @@ class MitsubaScene:
             for name, (key, _) in self.declared_inputs.items()
             if key.endswith((POSITIONS, NORMALS))
         )
+        # Numbers that Mitsuba compiles into its kernels, as constants.
         self._literals = frozenset(
             name
             for name, (_, scene_input) in self.declared_inputs.items()
@@ -268,14 +269,14 @@ class MitsubaScene:
         What may change is `max_depth`, `sampler`, `integrator` and `leave_out`.
         """
         description, filter_name = self.definition
-        settings = {
+        arguments = {
             "max_depth": self.max_depth,
             "leave_out": self._leave_out,
             "sampler": self.sampler,
             **changes,
         }
         other = MitsubaScene(
-            description, self.resolution, filter=filter_name, **settings
+            description, self.resolution, filter=filter_name, **arguments
         )
         # Load both now: one that is loaded later makes the recordings of all scenes stale.
         for method in ("path", "guides"):
@@ -544,13 +545,14 @@ class MitsubaScene:
         derivative here; and with a plane in a photograph also the 3 of its change.
         """
         gradient = cotangent.detach().to(torch.float32)
-        color_gradient = gradient[..., :3]
+        image_gradient = gradient[..., :3]
         if self._backdrop:
+            # coverage, and behind it the change of a plane
             n_others = 1 if self.plane_radiance is None else 4
             others = torch.zeros(*gradient.shape[:2], n_others)
             others[..., 1:] = gradient[..., 4:]
-            color_gradient = torch.cat([color_gradient, others], dim=-1)
-        return color_gradient.contiguous()
+            image_gradient = torch.cat([image_gradient, others], dim=-1)
+        return image_gradient.contiguous()
 
     @contextmanager
     def _tracked(
@@ -754,11 +756,10 @@ class MitsubaScene:
         return changes
 
     def _write(self, name: str, fresh: Tensor | None) -> None:
-        """Write the value of an input, or its base value if `fresh` is None, to
-        Mitsuba.
+        """Write a value of an input, or its base value if `fresh` is None, to Mitsuba.
 
         At the first write the base value is stored. Vertices and normals are written
-        into the memory that they have.
+        into the memory that they have, to which recordings refer.
         """
         key, scene_input = self.declared_inputs[name]
         current = self.parameters[key]
@@ -783,7 +784,8 @@ class MitsubaScene:
             address = current.torch().data_ptr()
             dr.scatter(current, value, dr.arange(mi.UInt32, len(current)))
             dr.eval(current)
-            # Dr.Jit copies what has a second owner; then recordings know another memory
+            # Dr.Jit has copied the memory if something else had it too: then recordings
+            # refer to the old one, and are stale
             population.changes += current.torch().data_ptr() != address
             self.parameters.set_dirty(key)
         else:
