@@ -79,13 +79,15 @@ def read_scene(path: Path) -> Plugin:
     text.fill_element(root)
     root.set("version", "3.0.0")
     state = _parse_with_mitsuba(path, text, root)
-    referred: set[str] = set()
-    scene = _convert_plugin(path, state, 0, referred)  # 0 is the scene itself
-    # plugins with ids that stand within others, to which the rest of the file may refer
-    for name in sorted(referred):
-        if _make_plain_name(name) not in scene and name in state.id_to_index:
-            index = state.id_to_index[name]
-            scene[_make_plain_name(name)] = _convert_plugin(path, state, index, set())
+    referred_ids: set[str] = set()
+    scene = _convert_plugin(path, state, 0, referred_ids)  # 0 is the scene itself
+    # What is referred to has to stand at the top: plugins within others are put there.
+    for plugin_id in sorted(referred_ids):
+        name = _make_plain_name(plugin_id)
+        if name not in scene and plugin_id in state.id_to_index:
+            index = state.id_to_index[plugin_id]
+            # ids that it refers to in turn are not followed
+            scene[name] = _convert_plugin(path, state, index, referred_ids=set())
     return scene
 
 
@@ -108,11 +110,11 @@ def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element)
                 config, ElementTree.tostring(root, encoding="unicode")
             )
     except RuntimeError as error:
-        position = _ERROR_LINE.match(str(error))
+        line_match = _ERROR_LINE.match(str(error))
         where = ""
-        # lines are the file's as long as nothing is included
-        if position and not text.included:
-            where = f"line {int(position[1]) + text.lines_before}: "
+        # with included files in it, the lines of the text are not those of the file
+        if line_match and not text.included:
+            where = f"line {int(line_match[1]) + text.lines_before}: "
         raise FileFormatError(
             f"{path}: {where}{_ERROR_LINE.sub('', str(error))}; correct it"
         ) from error
@@ -139,10 +141,12 @@ class _SceneText:
     lines_before: int = 0
 
     def parse(self, data: bytes) -> ElementTree.Element:
-        """Parse a file, and return the root of its tree.
+        """Parse the bytes of a file, and return the root of its tree.
 
-        Comments and blanks stay in the tree, so that the numbers of lines stay the
-        same. The sizes of all parsed files count together.
+        The sizes of all parsed files count together.
+
+        Raises:
+            FileFormatError: they are too large, no XML, or a scene of another version.
         """
         self.size += len(data)
         if self.size > scale_limit(MAX_BYTES):
@@ -151,6 +155,21 @@ class _SceneText:
                 f"a scene of at most {scale_limit(MAX_BYTES):,} bytes",
                 f"{self.size:,}",
             )
+        root = self._parse_tree(data)
+        version = root.get("version", "3.0.0")
+        if root.tag == "scene" and not re.match(r"[23]\.", version):
+            raise FileFormatError(
+                f"{self.path}: expected a scene of Mitsuba 2 or 3, got version "
+                f"{format_name(version)}; convert it"
+            )
+        return root
+
+    def _parse_tree(self, data: bytes) -> ElementTree.Element:
+        """Parse bytes as XML, and return the root of the tree.
+
+        Comments and blanks stay in the tree, so that the numbers of lines stay the
+        same.
+        """
         parser = expat.ParserCreate()
         tree = ElementTree.TreeBuilder(insert_comments=True)
         self._set_handlers(parser, tree)
@@ -169,14 +188,7 @@ class _SceneText:
                 "an XML file",
                 f"one in an unknown encoding ({format_name(str(error))})",
             ) from error
-        root = tree.close()
-        version = root.get("version", "3.0.0")
-        if root.tag == "scene" and not re.match(r"[23]\.", version):
-            raise FileFormatError(
-                f"{self.path}: expected a scene of Mitsuba 2 or 3, got version "
-                f"{format_name(version)}; convert it"
-            )
-        return root
+        return tree.close()
 
     def _set_handlers(
         self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
@@ -292,31 +304,33 @@ class _SceneText:
         return filled
 
 
-def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> Plugin:
+def _convert_plugin(
+    path: Path, state: Any, index: int, referred_ids: set[str]
+) -> Plugin:
     """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it.
 
     Args:
         path: path of the file, for errors.
         state: what Mitsuba's parser returns.
         index: index of the plugin in it; 0 is the scene.
-        referred: is extended by the ids that the plugin refers to.
+        referred_ids: is extended by the ids that the plugin refers to.
     """
     types = mi.Properties.Type
     props = state.nodes[index].props
     entries: Plugin = {"type": props.plugin_name()}
-    last_suffix: dict[str, int] = {}
+    last_number: dict[str, int] = {}  # the last number behind each name
 
-    def put(wanted_name: str, entry: object) -> None:
+    def put(plain_name: str, entry: object) -> None:
         """Add an entry, with a number behind its name if there is one already."""
-        name = wanted_name
-        suffix = last_suffix.get(wanted_name, 1)
+        name = plain_name
+        number = last_number.get(plain_name, 1)
         while name in entries:
-            suffix += 1
-            name = f"{wanted_name}-{suffix}"
-        last_suffix[wanted_name] = suffix
+            number += 1
+            name = f"{plain_name}-{number}"
+        last_number[plain_name] = number
         entries[name] = entry
 
-    # Entries are plugins that stand inside, references to others, and plain values.
+    # Entries are inner plugins, references to other plugins, and plain values.
     for key in props.keys():
         kind = props.type(key)
         value = props[key]
@@ -325,21 +339,15 @@ def _convert_plugin(path: Path, state: Any, index: int, referred: set[str]) -> P
         if kind == types.ResolvedReference:
             node = state.nodes[value.index()]
             name = _get_node_name(node, argument, at_top=index == 0)
-            put(
-                _make_plain_name(name),
-                _convert_plugin(path, state, value.index(), referred),
-            )
+            inner_plugin = _convert_plugin(path, state, value.index(), referred_ids)
+            put(_make_plain_name(name), inner_plugin)
         elif kind == types.Reference:
-            referred.add(str(value.id()))
+            referred_ids.add(str(value.id()))
             reference = {"type": "ref", "id": _make_plain_name(str(value.id()))}
             put(argument or "ref", reference)
         else:
-            put(
-                key,
-                _convert_value(
-                    f"{path}: {format_name(key, quoted=False)}", kind, value
-                ),
-            )
+            where = f"{path}: {format_name(key, quoted=False)}"
+            put(key, _convert_value(where, kind, value))
     return entries
 
 

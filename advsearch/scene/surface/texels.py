@@ -59,7 +59,7 @@ class LitTexels:
     cells: IntArray  # (n,) index of the cell of all grids that each lies in
     # (cells of all grids,) index of the texel whose light each cell has, the nearest
     texel_of_cell: IntArray
-    # First texels of each grid its first texel, and the number of all.
+    # index of the first texel of each grid, and last the number of all texels
     first_texels: tuple[int, ...]
 
     def select_grid(self, grid_index: int) -> slice:
@@ -72,6 +72,7 @@ def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
 
     Cells and texels are numbered on from one surface to the next.
     """
+    # index of each surface's first texel and first cell, and last the number of all
     texel_bounds = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
     cell_bounds = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
     grids = []
@@ -127,7 +128,8 @@ def make_ground_texels(
 ) -> LitTexels:
     """Return the texels over a level plane, small under the object and large far off.
 
-    An axis position p from -1 to 1 lies `scale * sinh(rate * p)` from the center.
+    Along each axis of the grid, the position p from -1 to 1 lies at the distance
+    `scale * sinh(rate * p)` from the center.
 
     Args:
         name: name of the ground.
@@ -136,7 +138,7 @@ def make_ground_texels(
         center: x and y of the object's center.
     """
     reach = min(reach, MAX_GROUND_REACH)
-    # the ratio of an even texel's width to that at the center, `MIN_TEXEL_WIDTH`
+    # by how much even texels would be wider than `MIN_TEXEL_WIDTH`, that at the center
     rate = _find_warp_rate(reach / (MIN_TEXEL_WIDTH * GROUND_TEXELS / 2.0))
     scale = reach / math.sinh(rate)
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
@@ -163,11 +165,12 @@ def make_ground_texels(
 def _find_warp_rate(ratio: float) -> float:
     """Find the rate with sinh(rate) / rate = ratio, by bisection.
 
-    A ratio of 1 or less gives the lower end, 0.001: a grid that is all but even.
+    A ratio of 1 or less has no such rate: the result is then the lower bound, 0.001,
+    for which a grid is all but even.
     """
     lower = 1e-3
     upper = 20.0
-    for _ in range(60):
+    for _ in range(60):  # halved so often, the interval is below rounding
         rate = 0.5 * (lower + upper)
         if math.sinh(rate) / rate < ratio:
             lower = rate
@@ -201,7 +204,8 @@ def _weigh_neighbours(
     """
     y, x = grid_position
     n_rows, n_columns = charts.is_covered.shape
-    # (rows, columns) texel of each cell: covered cells are counted row by row
+    # (rows, columns) index of the texel in each cell, -1 outside of the charts: covered
+    # cells are counted row by row
     texel_at = np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
     texel_at = np.where(charts.is_covered, texel_at, -1)
 
@@ -211,7 +215,7 @@ def _weigh_neighbours(
         offset = texels.positions[texel] - points
         distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
         cosine = (texels.normals[texel] * normals).sum(axis=1)
-        # a neighbour that faces elsewhere, round an edge, has other light
+        # a neighbour round an edge, which faces elsewhere, has other light
         similarity = np.clip(cosine, 0.0, 1.0) ** 8
         weight = np.exp(-grid_distance - distance) * similarity
         is_used = (texel >= 0) & ~buried[texel]
@@ -235,10 +239,10 @@ def _use_nearest_texel(
     texel_index: IntArray,
     weights: Float64Array,
 ) -> None:
-    """Give all the weight to the nearest texel where no neighbour has any.
+    """Give all the weight to the nearest texel where no neighbour of a point has any.
 
-    The first columns of `texel_index` and `weights`, the results of
-    `_weigh_neighbours`, are overwritten in these rows. Other arguments are those of
+    The first columns of `texel_index` and `weights` (N, neighbours), the results of
+    `_weigh_neighbours`, are overwritten for these points. Other arguments are those of
     `_weigh_neighbours`.
     """
     y, x = grid_position
@@ -368,12 +372,15 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
         Sparse, (cells, texels).
     """
     width = ground.grids[0].shape[0]
-    # if no texel sees the sky, all of `~sees_sky` is true
-    is_used = (sees_sky if sees_sky.any() else ~sees_sky).reshape(width, width)
+    if not sees_sky.any():
+        sees_sky = np.ones_like(sees_sky)
+    is_used = sees_sky.reshape(width, width)
     nearest_used = _find_nearest(is_used)
+    # along one axis: each texel and two neighbours on each side
     axis_weights = scipy.sparse.diags_array(
         BINOMIAL, offsets=range(-2, 3), shape=(width, width), dtype=np.float64
     )
+    # along both; columns of texels that are not used are 0, and rows add up to 1
     weights = scipy.sparse.csr_array(
         scipy.sparse.kron(axis_weights, axis_weights)
         @ scipy.sparse.diags_array(is_used.ravel().astype(float))
@@ -628,10 +635,11 @@ def compute_irradiance(
 def make_view_matrices(
     met_cells: npt.NDArray[np.int32], texel_of_cell: IntArray, n_texels: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the sparse matrices that `compute_irradiance` needs, from what rays met.
+    """Return the matrices from radiance to irradiance, by what the rays of texels met.
 
-    A texel's rays have the density of the cosine, so that its irradiance is pi times
-    the mean radiance of what they meet.
+    They are sparse: from the sky's cells (n, cells), and from texels (n, n_texels). A
+    texel's rays have the density of the cosine, so that its irradiance is pi times the
+    mean radiance of what they meet.
 
     Args:
         met_cells: (n, rays) of `trace_texel_rays`: a cell of the grids, from

@@ -102,17 +102,14 @@ class Lighting:
 def find_lighting(renderer: Renderer) -> Lighting:
     """Find the groups of coordinates that change only light and the finished image.
 
-    Each group is varied alone, the others staying in the middle between the start and
-    the center of the unit cube, and the scene inputs are compared: so it holds for
-    whatever sets them. Some lights of a Mitsuba scene are no inputs. They cannot be
-    switched off, and would count again in the image of every single light; with such
-    lights only the groups are returned that change the finished image alone.
+    Each group is varied alone, and the scene inputs are compared: so it holds for
+    whatever sets them.
 
-    Returns:
-        The inputs that each group changes, the groups that add spherical harmonics to
-        the environment, and the coordinates with which each other group makes the
-        environment brightest.
+    Some lights of a Mitsuba scene are no inputs. They cannot be switched off, and would
+    count again in the image of each light that is traced by itself; with such lights
+    only the groups are returned that change nothing but the finished image.
     """
+    # other groups stay half way between the start and the center of the unit cube
     reference = 0.5 * renderer.start + 0.25
     groups = {}
     harmonic_groups = set()
@@ -121,11 +118,10 @@ def find_lighting(renderer: Renderer) -> Lighting:
         base_inputs = renderer.scene.assembly(renderer.space.inputs(reference))
         for group in renderer.space.groups:
             effect = _measure_effect(renderer, group, reference, base_inputs)
-            # the group changes something else than light
-            if effect is None:
+            if effect is None:  # the group changes more than light
                 continue
-            # it changes light, not only the finished image
-            if not effect.changed <= IMAGE_INPUTS and has_fixed_lights(renderer):
+            changes_light = not effect.changed <= IMAGE_INPUTS
+            if changes_light and has_fixed_lights(renderer):
                 continue
             groups[group.name] = effect.changed
             if effect.is_harmonic:
@@ -147,15 +143,15 @@ class _Effect(NamedTuple):
 def _measure_effect(
     renderer: Renderer, group: Group, reference: Tensor, base_inputs: Inputs
 ) -> _Effect | None:
-    """Return which inputs a group changes; None if that is more than light.
+    """Return what a group of coordinates changes; None if that is more than light.
 
     Several configurations, which differ from `reference` in this group alone, are
-    compared with `base_inputs`, the scene inputs at `reference`. The brightest is the
-    one whose environment has most light.
+    compared with `base_inputs`, the scene inputs at `reference`. The brightest one has
+    the environment with most light.
     """
     changed: set[str] = set()
     is_harmonic = False
-    max_power = -1.0
+    max_power = -1.0  # below that of any environment
     brightest = reference
     for configuration in _sample_configurations(group, reference):
         inputs = renderer.scene.assembly(renderer.space.inputs(configuration))
@@ -305,8 +301,13 @@ class BasisMaps:
 
     @cached_property
     def _inverse(self) -> Tensor:
-        """(3, k, H W): the pseudo-inverse of each channel, weighted by solid angle."""
+        """(3, k, H W) matrices from a map to the weights of the basis maps.
+
+        Of each channel it is the pseudo-inverse of the basis maps, weighted by solid
+        angle: the least squares fit.
+        """
         count, height, width, _ = self.maps.shape
+        # the solid angle of a texel goes by the sine of its angle from straight up
         polar = (torch.arange(height) + 0.5) * torch.pi / height
         sine = torch.sin(polar)[:, None].expand(height, width).reshape(-1)
         channel_maps = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
@@ -337,10 +338,7 @@ class LightBasis:
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
         """Split the light of scene inputs into lights of which each has its own image.
 
-        The first is what does not change (with the patterns of projectors); then comes
-        each lamp that changes, with a power of 1; then the basis maps of a changing
-        environment. For each `inputs_of_light` has the inputs with which it shines
-        alone.
+        Arguments and what is set are those of the class.
         """
         patterns = {
             name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
@@ -364,13 +362,12 @@ class LightBasis:
         }
         self._lamps = sorted(changed_names & names - {ENVIRONMENT_INPUT})
         changes_environment = ENVIRONMENT_INPUT in changed_names
-        # Without any light at all there is one, which is dark.
-        self._has_fixed_light = bool(fixed_values) or not (
-            self._lamps or changes_environment
-        )
-        self.inputs_of_light: list[Inputs] = (
-            [{**dark, **fixed_values}] if self._has_fixed_light else []
-        )
+        is_unlit = not (fixed_values or self._lamps or changes_environment)
+        # without any light at all there is one, which is dark
+        self._has_fixed_light = bool(fixed_values) or is_unlit
+        self.inputs_of_light = list[Inputs]()
+        if self._has_fixed_light:
+            self.inputs_of_light.append({**dark, **fixed_values})
         self.inputs_of_light += [{**dark, name: torch.ones(3)} for name in self._lamps]
         self._basis_maps: BasisMaps | None = None
         if changes_environment:
@@ -445,29 +442,37 @@ class BasisRenderer(Predictor):
                 brightest[coordinates] = values
             inputs = traced.scene.assembly(traced.space.inputs(brightest))
             self._lights = LightBasis(traced, changing, inputs)
-            set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
-            linear = set_inputs & find_linear_inputs(traced)
-            # patterns of projectors shine in the first light alone
-            base_colors = {name for name in linear if not name.endswith(PATTERN_SUFFIX)}
-            self._renderers: list[LinearRenderer] = []
-            for index, light_inputs in enumerate(self._lights.inputs_of_light):
-                noise_seed = seeds.stream(seed, "light", index)
-                self._renderers.append(
-                    LinearRenderer(
-                        traced,
-                        u,
-                        noise_seed,
-                        tick,
-                        names=linear if index == 0 else base_colors,
-                        light=light_inputs,
-                    )
-                )
+            self._renderers = self._trace_lights(traced, u, seed, tick)
         self.non_finite = sum(renderer.non_finite for renderer in self._renderers)
 
     @property
     def n_traced_images(self) -> int:
         """Number of basis images, each traced with its matrices."""
         return len(self._renderers)
+
+    def _trace_lights(
+        self, traced: Renderer, u: Tensor, seed: int, tick: ProgressCallback
+    ) -> list[LinearRenderer]:
+        """Trace the image and the matrices under each light; arguments as of the class."""
+        set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
+        linear_names = set_inputs & find_linear_inputs(traced)
+        # patterns of projectors shine in the first light alone
+        base_colors = {
+            name for name in linear_names if not name.endswith(PATTERN_SUFFIX)
+        }
+        renderers = []
+        for index, light_inputs in enumerate(self._lights.inputs_of_light):
+            renderers.append(
+                LinearRenderer(
+                    traced,
+                    u,
+                    seeds.stream(seed, "light", index),
+                    tick,
+                    names=linear_names if index == 0 else base_colors,
+                    light=light_inputs,
+                )
+            )
+        return renderers
 
     @property
     def n_entries(self) -> int:
@@ -572,10 +577,12 @@ def count_samples(renderer: Renderer) -> int:
     Each light needs the samples of all its matrices, or without a matrix those of one
     image.
     """
-    inputs: set[str] = set()
+    changed_inputs: set[str] = set()
     for group in renderer.plan.groups:
-        inputs |= renderer.routes.get(group.name, frozenset())
-    n_matrices = len(inputs & find_linear_inputs(renderer))
-    samples, n_passes = plan_passes(renderer, COLLECTED_SPP)
-    per_light = samples * n_passes * n_matrices if n_matrices else COLLECTED_SPP
-    return count_lights(renderer) * per_light
+        changed_inputs |= renderer.routes.get(group.name, frozenset())
+    n_matrices = len(changed_inputs & find_linear_inputs(renderer))
+    samples_per_light = COLLECTED_SPP
+    if n_matrices:
+        samples, n_passes = plan_passes(renderer, COLLECTED_SPP)
+        samples_per_light = samples * n_passes * n_matrices
+    return count_lights(renderer) * samples_per_light
