@@ -350,7 +350,7 @@ def make_backdrop(
 def compute_photograph_gain(
     description: SceneData, photograph: BackdropPhotograph
 ) -> float:
-    """Return the factor from radiance to display-linear values of a photograph.
+    """Return the factor from a scene's radiance to a photograph's display-linear values.
 
     By it a level surface of reflectance `GREY_CARD`, lit by the environment, gets the
     mean luminance of the photograph. 1 where no environment lights the scene.
@@ -358,15 +358,18 @@ def compute_photograph_gain(
     irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
     if not irradiance > 0.0:
         return 1.0
-    counts = [
+    # how many pixels have each of the 256 levels
+    histograms = [
         np.bincount(photograph.levels[..., channel].reshape(-1), minlength=256)
         for channel in range(len(CHANNELS))
     ]
     decoded = decode_all_levels()
-    means = np.array([np.average(decoded, weights=count) for count in counts])
-    mean = max(float(means @ LUMINANCE), 1e-3)
+    channel_means = np.array(
+        [np.average(decoded, weights=histogram) for histogram in histograms]
+    )
+    mean_luminance = max(float(channel_means @ LUMINANCE), 1e-3)
     # a matt surface has the radiance reflectance * irradiance / pi
-    return mean * math.pi / (GREY_CARD * irradiance)
+    return mean_luminance * math.pi / (GREY_CARD * irradiance)
 
 
 def compute_level_irradiance(description: SceneData) -> Float64Array:
@@ -501,21 +504,23 @@ def make_matrix_camera(
         InputError: it is no such matrix.
     """
     matrix = np.asarray(camera_matrix, np.float64)
-    has_form = (
+    is_camera_matrix = (
         matrix.shape == (3, 3)
         and bool(np.isfinite(matrix).all())
         and matrix[1, 0] == 0.0
         and matrix[2].tolist() == [0.0, 0.0, 1.0]
         and min(matrix[0, 0], matrix[1, 1]) > 0.0
     )
-    if not has_form:
+    if not is_camera_matrix:
         raise InputError(
             "camera_matrix: expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in "
             f"pixels, got {matrix.tolist()}"
         )
     height, width = size
-    # The order of `LINEAR_PARAMETERS`, as fractions of the image. Half a pixel is added
-    # since our (0, 0) is the corner of the first pixel, not its center.
+    # In the order of `LINEAR_PARAMETERS`: fx, fy, cx, cy and skew, lengths along x as
+    # fractions of the width, those along y of the height. Half a pixel is added to the
+    # principal point, since our (0, 0) is the corner of the first pixel, not its
+    # center.
     linear = (
         matrix[0, 0] / width,
         matrix[1, 1] / height,
@@ -734,7 +739,9 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     y down, z ahead). Angles in degrees. Raises InputError: it looks straight up or
     down.
     """
-    outwards = -world_axes[:, 2]  # from the object to the camera
+    # from the object to the camera, in the axes of the world: the camera looks along
+    # its own z
+    outwards = -world_axes[:, 2]
     elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
     if abs(elevation) > MAX_ELEVATION:
         raise InputError(
@@ -742,10 +749,11 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
             f"{MAX_ELEVATION:g} degrees from level, which no camera does that orbits "
             "the object; give another `up`"
         )
+    # to the left and up of a camera without roll
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
-    # Roll is the angle of the camera's left against that of a camera without roll.
     upright = np.cross(-outwards, level_left)
+    # roll is the angle of the camera's own left against that
     left = -world_axes[:, 0]
     return {
         "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
@@ -776,7 +784,8 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
 def _make_world_axes(up: Float64Array) -> Float64Array:
     """Return world axes (3, 3), rows in camera coordinates, with z along `up`.
 
-    +x points from the object to the camera as far as that is level.
+    +x points from the object to the camera as far as that is level. `up` is a direction
+    (3,) in camera coordinates: x to the right, y down, z ahead.
     """
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise InputError(f"up: expected a direction of three numbers, got {up!r}")
@@ -784,6 +793,7 @@ def _make_world_axes(up: Float64Array) -> Float64Array:
     towards_camera = np.array([0.0, 0.0, -1.0])
     x_axis = towards_camera - (towards_camera @ z_axis) * z_axis
     if np.linalg.norm(x_axis) < 1e-6:  # the camera looks straight up or down
+        # towards the lower border of the image instead
         x_axis = np.array([0.0, 1.0, 0.0]) - z_axis[1] * z_axis
     x_axis /= np.linalg.norm(x_axis)
     return np.stack([x_axis, np.cross(z_axis, x_axis), z_axis])

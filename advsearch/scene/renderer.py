@@ -267,6 +267,8 @@ class Renderer:
         u = _to_tensor(u)
         if u.ndim == 2 and len(u):
             return torch.stack([self(row, seed, spp) for row in u])
+        # `through` is what is rendered; it is not `u` where a part of the derivative
+        # comes from differences
         u, through = self._check_arguments(u, spp)
         with _leave_inference_mode():
             image = self._render_image(through, seed, spp)
@@ -502,11 +504,15 @@ class Renderer:
         """
         renders_before = self.renders
         images = list[Tensor]()
+        # without a rig there is one camera, with no mount
         for index, mount in enumerate(self.scene.definition[0].rig or (None,)):
-            camera_seed = seeds.stream(seed, "camera", index) if index else seed
+            # the first camera has the noise of a scene without a rig
+            camera_seed = seed
+            if index > 0:
+                camera_seed = seeds.stream(seed, "camera", index)
             inputs = self._camera_inputs(mount, u)
             hide = "backdrop.color" in inputs
-            if self.moments:
+            if self.moments:  # an exposure of some time
                 rendered = self._render_exposure(mount, u, camera_seed, spp, hide)
             else:
                 rendered = self.render_radiance(
@@ -651,6 +657,7 @@ class Renderer:
         n_points = depth.shape[0] // self.formation.resolution[0]
         surfaces = self.scene.find_surfaces(_select_scene_inputs(inputs), n_points)
         blur = float(inputs["backdrop.blur"]) if "backdrop.blur" in inputs else 0.0
+        # pixels that a blur of this standard deviation reaches, and the one itself
         radius = 1 + math.ceil(3.0 * blur)
         front_inputs["backdrop.front"] = compute_front(
             surfaces, depth, n_points, radius
@@ -869,7 +876,8 @@ class _Radiance(torch.autograd.Function):
                     inputs, image_seeds, spp
                 )
         rendered = renderer.replace_non_finite(rendered)
-        for guide in guides:  # one if it is to be denoised, otherwise none
+        # one image of guides if the result is to be denoised, otherwise none
+        for guide in guides:
             rendered = denoise_image(
                 rendered,
                 guide[..., :3],

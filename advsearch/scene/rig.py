@@ -620,7 +620,7 @@ def _measure_scale(path: str, applied_transform: Any) -> float:
     numbers = _parse_numbers(path, "applied_transform", cells, count, MAX_DISTANCE)
     linear = np.reshape(numbers, (-1, 4))[:3, :3]
     # a rotation times s has the determinant s^3, and times its transpose it is s^2
-    scale = abs(float(np.linalg.det(linear))) ** (1.0 / 3.0)
+    scale = float(abs(float(np.linalg.det(linear))) ** (1.0 / 3.0))
     if not np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-3 * scale**2):
         raise FileFormatError(
             f"{path}: applied_transform: expected a rotation, a shift and a scale, "

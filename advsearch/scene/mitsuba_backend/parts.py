@@ -212,7 +212,7 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
 
 
 def _load_user_surface(
-    part: parts.MeshPart, surface: Plugin
+    part: parts.MeshPart, surface: Mapping[str, object]
 ) -> tuple[Plugin, list[SceneInput]]:
     """Return a surface in Mitsuba's words with its base color loaded; and its inputs.
 

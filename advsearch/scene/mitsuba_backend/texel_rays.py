@@ -117,7 +117,7 @@ def _spread_points(count: int) -> Float64Array:
     unreasonable effectiveness of quasirandom sequences).
     """
     increments = np.array([0.7548776662466927, 0.5698402909980532])
-    return (np.arange(1, count + 1)[:, None] * increments) % 1.0
+    return np.asarray((np.arange(1, count + 1)[:, None] * increments) % 1.0)
 
 
 def _find_sky_cell(
