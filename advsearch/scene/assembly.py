@@ -117,10 +117,11 @@ class MovingMesh:
 
     @cached_property
     def _shared_groups(self) -> tuple[Tensor, Tensor]:
-        """The faces (F, 3), and for each vertex (V,) its group that shares a normal.
+        """The faces (F, 3), and the group (V,) of vertices that each vertex is in.
 
-        Vertices are in one group if their positions and their normals are the same, the
-        positions to 1e-5 of the mesh's unit and the normals to 1e-3.
+        The vertices of a group have their normal in common. They are in one group if
+        their positions and their normals are the same, the positions to 1e-5 of the
+        mesh's unit and the normals to 1e-3.
         """
         rounded = np.round(
             np.concatenate(
@@ -403,7 +404,8 @@ class Motion:
         aspect = resolution[1] / resolution[0]
         pose = camera_to_world(description, aspect)
         self._camera = torch.from_numpy(pose).double()
-        # `_ground` is half the side of the ground square, `_edge` (n, 3) points on it.
+        # Half the side of the square that the ground is, and points (n, 3) on its edge;
+        # of a photographed ground all of its vertices.
         if description.photograph is None:
             self._ground = description.get_number("ground.size") / 2.0
             self._edge = _sample_square_edge(self._ground)
@@ -414,6 +416,7 @@ class Motion:
         # Points of the environment; none if nothing shows them.
         hidden = description.backdrop or description.environment is None
         self._far = _sample_sphere(0 if hidden else N_DIRECTIONS) * ENVIRONMENT_DISTANCE
+        # which vertices of each mesh are followed
         self._picks = {
             name: torch.from_numpy(_spread_indices(len(mesh.vertices), N_VERTICES))
             for name, mesh in assembly.meshes.items()

@@ -381,14 +381,14 @@ def compute_level_irradiance(description: SceneData) -> Float64Array:
     if environment is None:
         return np.zeros(len(CHANNELS))
     rows = environment.radiance.shape[0]
+    # of the angle from straight up at the edges of rows, 0 below the horizon
     edge_cosines = np.cos(np.arange(rows + 1) * math.pi / rows)
-    # Of the angle from straight up at each row's two edges; 0 below the horizon. The
-    # integral of cosine times solid angle over a row is pi (upper^2 - lower^2).
     upper_cosines = np.maximum(edge_cosines[:-1], 0.0)
     lower_cosines = np.maximum(edge_cosines[1:], 0.0)
     row_means = environment.radiance.mean(axis=1, dtype=np.float64)
+    # the integral of cosine times solid angle over each row
     weights = math.pi * (upper_cosines**2 - lower_cosines**2)
-    # no BLAS, whose last bits depend on its threads
+    # by a sum, not by BLAS, whose last bits depend on the number of threads
     return np.asarray((weights[:, None] * row_means).sum(axis=0))
 
 
@@ -609,7 +609,7 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     """
     height, width = photograph.size
     film_height, film_width = resolution
-    # photograph pixels in one pixel of the film
+    # pixels of the photograph in one of the film: what rounding to whole pixels explains
     rounding = max(width / film_width, height / film_height)
     if abs(film_width / film_height * height - width) <= rounding:
         return
@@ -687,6 +687,7 @@ def compute_view_settings(
     )
     rotation = world_axes @ mesh_to_camera[:3, :3]
     offset = world_axes @ (center - np.array([0.0, 0.0, distance]))
+    # height of the lowest vertex, from the middle of the object
     lowest = float(((vertices - middle) @ rotation.T)[:, 2].min())
     return {
         **_compute_orbit(world_axes),

@@ -364,11 +364,10 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     if kind in ("kannala_brandt4", "kannala_brandt"):
         kind = "kannala_brandt"
         # the model has four; the list may be longer
-        entries["coeffs"] = (
-            coefficients[:4] if isinstance(coefficients, list) else coefficients
-        )
+        if isinstance(coefficients, list):
+            coefficients = coefficients[:4]
+        entries["coeffs"] = coefficients
     elif is_zero and kind in ("inverse_brown_conrady", "modified_brown_conrady"):
-        # all of Brown's polynomials are the same where their coefficients are 0
         kind = "none"
     entries["distortion_model"] = kind
     return entries

@@ -276,9 +276,10 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
     if path.lower().endswith(".json"):
         data = parse_text(path, text, "JSON", parse_json)
     else:
-        # OpenCV's YAML has a directive and tags that are not standard.
+        # OpenCV's YAML begins with a directive, and has tags, that are not standard.
         text = re.sub(r"\A%YAML[^\n]*\n", "", text)
         text = re.sub(r"!!opencv-(nd-)?matrix", "", text)
+        # only the first document
         text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
         data = parse_text(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):

@@ -58,6 +58,7 @@ MAX_TANGENT = math.tan(
     math.radians(80.0)
 )  # tangent of the widest half angle that is framed
 MAX_RAY_TANGENT = 1e6  # limit of the tangents of rays
+BORDER_POINTS = 512  # points on a line from the axis to a border of the image
 VectorFunction = Callable[[Tensor], Tensor]
 
 
@@ -424,35 +425,40 @@ class CameraModel:
     def _compute_edge_tangents(self) -> list[float]:
         """Return the tangents at which the image ends along x and along y.
 
-        A tangent is that of the angle to the axis. It is found on the row and the
-        column of pixels through the axis: of both edges the nearer one counts, at most
-        `MAX_TANGENT`. Where the view ends before the edge, that is the edge.
+        A tangent is that of the angle to the axis. Of both edges along an axis the
+        nearer one counts, at most `MAX_TANGENT`.
         """
         center, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
         edge_tangents = []
         for axis in (0, 1):
-            # 512 points from the axis to one edge, then to the other
-            line_points = center.repeat(512, 1)
-            border_tangents = []
-            for border in (0.0, 1.0):
-                line_points[:, axis] = torch.linspace(
-                    float(center[0, axis]), border, 512, dtype=torch.float64
-                )
-                directions, margin = self.compute_rays(line_points)
-                # 0.1: rays almost aside, at more than about 84 degrees, do not count
-                is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
-                line_tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(
-                    0.1
-                )
-                border_tangents.append(
-                    float(
-                        torch.where(
-                            is_visible, line_tangents, torch.zeros_like(line_tangents)
-                        ).max()
-                    )
-                )
+            border_tangents = [
+                self._compute_border_tangent(center, axis, border)
+                for border in (0.0, 1.0)
+            ]
             edge_tangents.append(max(1e-3, min(MAX_TANGENT, *border_tangents)))
         return edge_tangents
+
+    def _compute_border_tangent(
+        self, center: Tensor, axis: int, border: float
+    ) -> float:
+        """Return the largest tangent on the line from the axis to a border of the image.
+
+        Args:
+            center: (1, 2) image coordinates of the axis.
+            axis: 0 for a line along x, 1 along y.
+            border: image coordinate of the border, 0 or 1.
+        """
+        line_points = center.repeat(BORDER_POINTS, 1)
+        line_points[:, axis] = torch.linspace(
+            float(center[0, axis]), border, BORDER_POINTS, dtype=torch.float64
+        )
+        directions, margin = self.compute_rays(line_points)
+        # 0.1: rays almost aside, at more than about 84 degrees, do not count
+        is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
+        tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
+        return float(
+            torch.where(is_visible, tangents, torch.zeros_like(tangents)).max()
+        )
 
     @cached_property
     def black_fraction(self) -> float:

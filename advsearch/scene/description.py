@@ -274,6 +274,7 @@ class SceneDescription(SceneData):
         to_world = pose @ AXES
         to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)
+        # of half the width and half the height; the larger one is that of the larger side
         tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
         cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}

@@ -125,6 +125,10 @@ class _SrgbDisplay(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, radiance: Tensor, gain: float) -> Tensor:
+        """Return the sRGB image of radiance times a gain.
+
+        As `linear_to_srgb`, but in place where that saves memory.
+        """
         ctx.save_for_backward(radiance)
         ctx.gain = gain
         clipped = (radiance * gain).clamp_(0.0, 1.0)
@@ -413,14 +417,16 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     camera. The image has `METERING_SIZE` pixels along its longer side.
     """
     camera = camera_to_world(scene)
+    # in the camera's coordinates: left, up and ahead
     points = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
     faces = scene.object.mesh.faces.astype(np.int64)
     faces = faces[(points[faces][..., 2] > MIN_DEPTH).all(axis=1)]
     frame = Frame.of(scene.get_number("camera.fov"), scene.aspect)
-    pixel, shape = _choose_metering_shape(frame)
+    pixel_width, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
+    # the raster has the center of its first pixel at 0
     face, row, column, weights = rasterize_triangles(
-        (tangents - (frame.left, frame.low)) / pixel - 0.5, shape
+        (tangents - (frame.left, frame.low)) / pixel_width - 0.5, shape
     )
     # 1 / depth, unlike depth, may be interpolated linearly over the image
     nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)

@@ -272,18 +272,13 @@ def camera_to_world(
     if requested_distance is not None:
         distance = requested_distance / description.size_in_metres
     else:
-        distance = float(
-            compute_framing_distance(
-                description,
-                torch.tensor(get_number("camera.fov"), dtype=torch.float64),
-                aspect,
-            )
-        )
+        fov = torch.tensor(get_number("camera.fov"), dtype=torch.float64)
+        distance = float(compute_framing_distance(description, fov, aspect))
     elevation = get_number("camera.elevation")
     height = description.values.get("camera.height")
     if height is not None:
         center_height = float(compute_center(description)[2])
-        # from the middle of the object at this distance to the height
+        # of the elevation at which the camera has the height, at this distance
         sine = (height / description.size_in_metres - center_height) / distance
         sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
         elevation = math.degrees(math.asin(sine))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from advsearch.scene import settings
-from advsearch.scene.assets import Float64Array
+from advsearch.scene.assets import EnvironmentAsset, Float64Array
 from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.parts import MeshPart, Place
 from advsearch.scene.photographed_ground import compute_irradiance
@@ -149,10 +149,10 @@ def load_requested_place(scene: SceneData) -> Place | None:
 
 
 def with_requested_ground(scene: AnyScene) -> AnyScene:
-    """Return the scene with the road or the place that its settings ask for.
+    """Return the scene with the road or the place that its settings request.
 
-    Another one that it had is left out. The place's lamps are on at dusk: where the
-    environment has a unit, and less illuminance than `DUSK_ILLUMINANCE`.
+    Another one that it had is left out. The place's lamps are on where the light is
+    dark, see `_is_dark`.
     """
     other_parts = tuple(
         part
@@ -168,17 +168,23 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
         return replace(scene, parts=other_parts)
     environment = scene.environment
     radiance_unit = None if environment is None else environment.candelas
-    is_dark = False
-    if environment is not None and radiance_unit is not None and place.file.lamps:
-        irradiance = compute_irradiance(torch.from_numpy(environment.radiance.copy()))
-        is_dark = (
-            radiance_unit * float(irradiance @ torch.tensor(LUMINANCE))
-            < DUSK_ILLUMINANCE
-        )
+    is_dark = bool(place.file.lamps) and _is_dark(environment)
     place_parts = make_place_parts(
         place, scene.size_in_metres, radiance_unit, is_dark=is_dark
     )
     return replace(scene, parts=(*other_parts, *place_parts))
+
+
+def _is_dark(environment: EnvironmentAsset | None) -> bool:
+    """Return whether level ground has less illuminance than `DUSK_ILLUMINANCE`.
+
+    False where that is not known: without an environment, or if it has no unit.
+    """
+    if environment is None or environment.candelas is None:
+        return False
+    irradiance = compute_irradiance(torch.from_numpy(environment.radiance.copy()))
+    luminance = float(irradiance @ torch.tensor(LUMINANCE))
+    return environment.candelas * luminance < DUSK_ILLUMINANCE
 
 
 DUSK_ILLUMINANCE = (
@@ -294,13 +300,9 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
 
 
 def find_surroundings(scene: SceneData) -> Surroundings | None:
-    """Return what is known of the place in a scene's environment.
+    """Return what is known of the place that a scene's environment is a picture of.
 
-    In metres; the first of these that holds. If the scene has a place as geometry and
-    the environment shows the picture of one, the picture's limits hold. A photographed
-    environment over a ground has the limits of its camera's height and of its empty
-    radius. Otherwise only the end of a paved ground counts. None where there is none,
-    or nothing of the environment's picture has to fit it.
+    In metres. None if nothing of the picture has to fit a ground.
     """
     environment = scene.environment
     # what encloses the object is geometry, true from everywhere
@@ -313,25 +315,27 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
     captured_site = (
         environment.place if bundled is None else load_bundled_place(*bundled)
     )
-    if (
-        place is not None
-        and captured_site is not None
-        and captured_site.file.picture is not None
-    ):
-        picture = captured_site.file.picture
+    picture = None if captured_site is None else captured_site.file.picture
+    # the place stands around as geometry too: the limits of its picture hold
+    if place is not None and picture is not None:
         return Surroundings(
             height=picture.height,
             nearest_distance=(*picture.x, *picture.y),
             ground_extent=extent,
             rotation=scene.get_number("environment.rotation"),
         )
+    # a photograph over a ground, with the limits of its camera's height and of the
+    # empty floor around it
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
         height = scene.capture_height * scene.size_in_metres
         radius = scene.values.get("ground.radius")
         if radius is None:
             radius = DEFAULT_EMPTY_RADIUS * height
         return Surroundings(height, radius, extent)
-    return Surroundings(math.inf, math.inf, extent) if is_paved(scene) else None
+    if not is_paved(scene):
+        return None
+    # only the end of the ground counts
+    return Surroundings(math.inf, math.inf, extent)
 
 
 def bound_ground(place: Place) -> Box:

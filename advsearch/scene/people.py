@@ -434,17 +434,14 @@ class Person:
             zip(self._bones, self._parents, strict=True)
         ):
             rotation = rotation_by_bone.get(bone, identity)
-            joint_rotations.append(
-                rotation if parent < 0 else joint_rotations[parent] @ rotation
-            )
-            rotations.append(
-                joint_rotations[-1] @ straight_rotations.get(bone, identity)
-            )
-            if parent < 0:
-                positions.append(joints[index])
-            else:
+            position = joints[index]
+            if parent >= 0:  # the root has no parent
+                rotation = joint_rotations[parent] @ rotation
                 bone_vector = joints[index] - joints[parent]
-                positions.append(positions[parent] + rotations[parent] @ bone_vector)
+                position = positions[parent] + rotations[parent] @ bone_vector
+            joint_rotations.append(rotation)
+            rotations.append(rotation @ straight_rotations.get(bone, identity))
+            positions.append(position)
         all_rotations = torch.stack(rotations)
         # so that the joint itself moves to its position
         return all_rotations, torch.stack(positions) - torch.einsum(
@@ -490,13 +487,14 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     They sum to 1 from the first node to the last, and beyond these the nearest node has
     all of the weight.
     """
-    # How far the value is through each of the n - 1 intervals: 1 for those before it, 0
-    # for those after it. A node's weight is how far the interval before it is filled
-    # (the first: 1) minus how far the one after it is.
+    # how far the value is through each of the n - 1 intervals
     fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
-    # At a node the derivative is that of one side, not the sum of both.
+    # 1 for intervals before the value, 0 for those after it. At a node the derivative is
+    # that of one side, not the sum of both.
     is_within = (fraction >= 0.0) & (fraction < 1.0)
     fraction = torch.where(is_within, fraction, (fraction >= 1.0).to(fraction.dtype))
+    # A node's weight is the fraction of the interval before it (1 for the first node)
+    # minus that of the interval after it (0 for the last).
     return torch.cat([torch.ones_like(fraction[:1]), fraction]) - torch.cat(
         [fraction, torch.zeros_like(fraction[:1])]
     )

@@ -54,7 +54,7 @@ def rasterize_triangles(
         For each pixel of each triangle, triangle by triangle, the triangle, row and
         column (N,), and the corners' barycentric weights (N, 3).
     """
-    # Wide: which of the candidates lie in a triangle is decided by their weights.
+    # Candidates from a wider range, as their weights decide which lie in a triangle.
     face, row, column = find_candidate_pixels(corners, shape, 10.0 * PIXEL_TOLERANCE)
     weights = compute_barycentric(corners[face], row, column)
     inside = (weights >= -tolerance).all(axis=1)

@@ -397,9 +397,9 @@ class Renderer:
             )
             if "backdrop.front" in inputs:
                 is_hidden = inputs["backdrop.front"][..., 0] > 0.5
-                for dim in (0, 1):
+                for dim in (0, 1):  # a pixel's value for all of its points
                     is_hidden = is_hidden.repeat_interleave(subdivision, dim)
-                surfaces.id[is_hidden] = 0
+                surfaces.id[is_hidden] = 0  # no surface
         metres = self.scene.definition[0].size_in_metres
         return replace(
             surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
@@ -746,6 +746,7 @@ class Renderer:
         speeds = torch.zeros(len(self.start))
         coordinates: list[int] = []
         for group in groups:
+            # the two estimators are valid only for what moves no outline
             may_move = {*group.valid} - {"adjoint", "image"}
             if may_move and group.size <= MAX_MEASURED_SIZE:
                 coordinates += range(group.begin, group.begin + group.size)

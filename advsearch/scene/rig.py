@@ -132,6 +132,7 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
         return _read_colmap(path, camera_names)
     if Path(path).suffix.lower() == ".json" and "," in camera_names:
         return _read_transforms(path, camera_names)
+    # a single camera is named, or the format has no rigs
     if camera_names or Path(spec).suffix.lower() not in (".yaml", ".yml"):
         return ()
     try:
@@ -141,7 +142,7 @@ def read_rig(spec: str) -> tuple[Mount, ...]:
     if not isinstance(data, dict):
         return ()
     entries = data.get("cameras")
-    if isinstance(entries, list):
+    if isinstance(entries, list):  # our own format
         if set(data) != {"cameras"}:
             raise FileFormatError(
                 f"{spec}: expected `cameras` alone, got "

@@ -143,6 +143,7 @@ class SkeletonRig:
             return np.pad(values, ((0, 0), (0, max_joints - values.shape[1])))
 
         points = np.concatenate([part.vertices for part in parts])
+        # counted on from the nodes of the parts before
         joints = np.concatenate(
             [
                 pad_joints(part.joints + start)
@@ -165,10 +166,10 @@ class SkeletonRig:
             torch.cat([nodes for nodes, _ in self._nodes_by_depth])
         )
         self._local_matrices = torch.from_numpy(self.skeleton.local_matrices)
-        # The rotation nearest to each node's matrix in the scene, without its scale and
-        # shear.
+        # The axes of each node at rest: the rotation nearest to its matrix, without its
+        # scale and shear (polar decomposition).
         world = self._compute_world(self._local_matrices)[:, :3, :3].numpy()
-        left, _, right = np.linalg.svd(world)  # polar decomposition
+        left, _, right = np.linalg.svd(world)
         self._axes = torch.from_numpy(left @ right)
         self._rest = self.pose({})
 
@@ -301,7 +302,8 @@ class SkeletonRig:
                 playing_clip, seconds.to(device)
             )
         local_matrices = self._turn_joints(local_matrices, number_by_name)
-        # (joints, 3, 4) from the rest pose to the scene, without the last row
+        # (joints, 3, 4) from the rest pose to the scene, without the last row, which is
+        # 0 0 0 1
         joint_matrices = (
             self._compute_world(local_matrices)[self._nodes.to(device)]
             @ self._inverse_binds.to(device)
@@ -404,6 +406,7 @@ class SkeletonRig:
         """
         device = local_matrices.device
         rotation_to_mesh = self._rotation_to_mesh.to(device)
+        # the joints of which a turn about any axis is set, each once
         joints = dict.fromkeys(
             name.rpartition(".")[0]
             for name in number_by_name
@@ -418,9 +421,9 @@ class SkeletonRig:
                         make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
                         @ rotation
                     )
-            # A turn about the object's axes is R. Conjugation brings it to the axes of
-            # the file, then to those of the parent node at rest, in which local
-            # matrices are.
+            # It is about the axes of the object; local matrices are in those of the
+            # parent node. The same turn in other axes: first in those of the file, then
+            # in those of the parent at rest.
             rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
             parent = int(self.skeleton.parents[node])
             if parent >= 0:
@@ -462,12 +465,13 @@ def _group_by_depth(parents: IntArray) -> list[tuple[Tensor, Tensor]]:
     """
     levels = list[tuple[Tensor, Tensor]]()
     nodes = np.flatnonzero(parents < 0)
+    # position of each node among those of its depth, once that is known
     row_in_level = np.zeros(len(parents), np.int64)
     while len(nodes):
         parent_rows = row_in_level[parents[nodes]]
         levels.append((torch.from_numpy(nodes), torch.from_numpy(parent_rows)))
         row_in_level[nodes] = np.arange(len(nodes))
-        nodes = np.flatnonzero(np.isin(parents, nodes))
+        nodes = np.flatnonzero(np.isin(parents, nodes))  # their children
     return levels
 
 

@@ -164,13 +164,14 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     """
     normals: Float64Array = normalize_vectors(soup.compute_face_vectors())
     count = len(normals)
+    # the two faces of each shared edge; their corners are numbered 3 face + k
     left, right, _ = find_shared_edges(soup.faces)
-    # faces of both corners (3 face + k) of an edge
     face = left // 3
     neighbour = right // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
     plane = find_components(count, face[is_flush], neighbour[is_flush])
     patch = np.zeros(count, dtype=np.int64)
+    # whether both faces of an edge stay in one patch
     is_same = np.ones(len(face), np.bool_)
     if count > _FACES_PER_ATLAS or not _are_straight(normals, plane):
         direction = _find_directions(normals, face, neighbour)
@@ -309,7 +310,8 @@ class SurfaceParts:
         self.corners = _unwrap_mesh(mesh) if self.is_unwrapped else self._mesh_uvs
         charts = _rasterise_map(mesh, self.corners)
         self.counts_faces = len(mesh.faces) <= MAX_FACES
-        faces = np.arange(len(mesh.faces) if self.counts_faces else 0)
+        n_face_parts = len(mesh.faces) if self.counts_faces else 0
+        faces = np.arange(n_face_parts)  # indices of the faces that are parts
         self.count = MAP_SIZE * MAP_SIZE + len(faces)
         self.is_covered = charts.is_covered
         self.face = np.concatenate([charts.face.reshape(-1), faces])

@@ -36,6 +36,7 @@ first hit and its shadow ray only; see `LIMITS`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -172,9 +173,9 @@ def _is_rough(cotangent: Tensor) -> bool:
 def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     """Return a value whose gradient by the vertices is the interior term.
 
-    The chain is taken in two steps: first back to the points and normals of each
-    sample, where gradients that are not finite are set to zero, then on to the
-    vertices. `spp` and `tile` are as for `_sample_first_hits`.
+    The derivative is taken in two steps, as some samples have one that is not finite:
+    first back to the point and the normals of each sample, and from those that are
+    finite on to the vertices. `spp` and `tile` are as for `_sample_first_hits`.
     """
     with dr.suspend_grad():
         film, hit, sampler = _sample_first_hits(view, seed, spp, tile)
@@ -183,13 +184,14 @@ def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> An
         si = hit.compute_surface_interaction(
             view.camera.make_ray(film), mi.RayFlags.All
         )
+    # point, normal and shading normal, and copies at which the first step ends
     attached = view.attach_hit(hit)[:3]
     local_values = [type(value)(dr.detach(value)) for value in attached]
     dr.enable_grad(local_values)
-    # local copies, at which the first step ends
     point, scaled_normal, shading_normal = local_values
 
-    # Sum of W L J / J over all samples, attached to these points and normals.
+    # Over all samples the sum of cotangent W, radiance L and the relative change of the
+    # film area J that a piece of the surface covers.
     jacobian = (
         dr.dot(scaled_normal, point - view.camera.eye)
         / view.camera.compute_depth(point) ** 3
@@ -232,9 +234,8 @@ def _sample_first_hits(
     column = cell % n_columns
     row = cell // n_columns
 
-    # twice negated, so that quotients are rounded up
-    tiles_across = -(-n_columns // tile)
-    n_tiles = tiles_across * -(-n_rows // tile)
+    tiles_across = math.ceil(n_columns / tile)
+    n_tiles = tiles_across * math.ceil(n_rows / tile)
     tile_index = row // tile * tiles_across + column // tile
     sampler = make_sampler(
         make_stream(seed, 0), n_tiles * spp, tile_index * spp + sample

@@ -182,6 +182,8 @@ class FilmView:
         width = self.camera.width
         height = self.camera.height
         active = active & self.camera.is_in_frame(dr.detach(film))
+        # From the center of the first pixel of the padded image, which is half a pixel
+        # outside of the film. Cells lie between pixel centers.
         padded_film = film + 0.5
         cell_position = dr.floor(dr.detach(padded_film))
         cell = mi.Point2u(
@@ -733,7 +735,7 @@ def _sample_radiance_difference(
     occluder = view.scene.ray_intersect_preliminary(
         make_ray(p + offset), coherent=False
     )
-    # Shorter by a tolerance, so that the mesh at the edge itself is no occluder.
+    # shorter by a tolerance, so that the mesh at the edge itself does not count
     distance_to_edge = dr.norm(p - si.p) * (1.0 - DEPTH_TOLERANCE) - 2.0 * dr.norm(
         offset
     )
@@ -891,7 +893,9 @@ def _measure_between_faces(
         angle.
     """
     cosine = (along_first * along_second).sum(dim=1, keepdim=True)
+    # the part of the first direction that is perpendicular to the second
     perpendicular = along_first - cosine * along_second
+    # away from the first face; of a single face either side will do
     opening = torch.where(
         is_single[:, None],
         torch.linalg.cross(axis, along_second),

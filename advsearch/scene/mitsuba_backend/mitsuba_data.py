@@ -93,11 +93,11 @@ def _find_numbers(
     other_types: dict[str, str] = {}
     for key in scene.parameters.keys():
         value = scene.parameters[key]
-        is_plain = isinstance(value, float)
-        is_number = isinstance(value, mi.Float) and len(value) == 1
+        is_plain = isinstance(value, float)  # a constant of Mitsuba's
+        is_single_number = isinstance(value, mi.Float) and len(value) == 1
         if is_plain:
             values: tuple[float, ...] = (value,)
-        elif is_number or isinstance(value, mi.Color3f):
+        elif is_single_number or isinstance(value, mi.Color3f):
             values = tuple(map(float, np.array(value).reshape(-1)))
         else:
             other_types[key] = f"a {type(value).__name__}"

@@ -341,10 +341,12 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
     ) -> tuple[Any, Any, Any, Any, Any]:
         """Sample how far light flies through the haze before it is scattered.
 
+        `haze_length` is the length of the segment in the haze.
+
         Returns:
-            Whether it is scattered within the haze; the distance; the weight (attached
-            to the haze's parameters; only its relative gradient counts); the detached
-            albedo per channel; and the extinction, which is grey.
+            Whether it is scattered within the haze; the distance; a weight, attached to
+            the haze's parameters, of which only the relative gradient counts; the
+            detached albedo per channel; and the extinction, which is grey.
         """
         scattering, _, extinction = self.haze.get_scattering_coefficients(
             dr.zeros(mi.MediumInteraction3f)
@@ -500,7 +502,8 @@ class _PlaneHits:
             light = scene.eval_emitter_direction(self._si, ds, is_sampled)
             light *= dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
             if dr.grad_enabled(light):
-                # The path goes along the same edges later: they are kept.
+                # Derivatives of the rest of the path go back through the same lights
+                # later: what leads to them is kept.
                 change = cotangent * self._factor * light
                 dr.backward_from(change, dr.ADFlag.ClearInterior)
 
@@ -668,17 +671,25 @@ def _refract_through_drop(
     )
 
     # From the center of curvature: where the ray enters, and where it leaves.
-    entry = mi.Vector3f(dx, dy, dr.safe_sqrt(drop.w * drop.w - drop.z * drop.z))
+    radius = drop.z
+    curvature_radius = drop.w
+    entry = mi.Vector3f(
+        dx,
+        dy,
+        dr.safe_sqrt(curvature_radius * curvature_radius - radius * radius),
+    )
     entry_cosine = dr.dot(entry, inside_direction)
     # along the ray inside, to the sphere of the cap
     exit_distance = (
         dr.safe_sqrt(
-            entry_cosine * entry_cosine - dr.squared_norm(entry) + drop.w * drop.w
+            entry_cosine * entry_cosine
+            - dr.squared_norm(entry)
+            + curvature_radius * curvature_radius
         )
         - entry_cosine
     )
     exit_point = entry + inside_direction * exit_distance
-    normal = exit_point / drop.w
+    normal = exit_point / curvature_radius
 
     cos_inside = dr.dot(inside_direction, normal)
     # Snell's law at the cap; below 0 is total reflection
@@ -802,7 +813,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         Ground truth such as depth is that of the scene behind the drops.
         """
         half_width = self._sheet_half_width
-        self._sheet_half_width = 0.0
+        self._sheet_half_width = 0.0  # no sheet, so no drops
         try:
             return self.sample_ray(time, 0.5, position, mi.Point2f(0.5))
         finally:
@@ -858,7 +869,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         drop = dr.gather(mi.Vector4f, self._drops, drop_index)
         dx = x - drop.x
         dy = y - drop.y
-        is_hit = on_grid & (drop.z > 0.0) & (dx * dx + dy * dy < drop.z * drop.z)
+        radius = drop.z  # below 0 in a cell without a drop, see `NO_DROP`
+        is_hit = on_grid & (radius > 0.0) & (dx * dx + dy * dy < radius * radius)
         return drop, dx, dy, is_hit
 
     def _make_rays(self) -> None:

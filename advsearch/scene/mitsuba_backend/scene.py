@@ -214,7 +214,8 @@ class MitsubaScene:
             for translation in translations:
                 plugins |= translation.plugins
                 self._path |= translation.integrator
-            # A path that meets a dark lamp by chance still counts, should it be lit.
+            # No light is sampled from lamps that are dark by default. One that an input
+            # lights is found by paths that meet it by chance.
             if "emitters" in self._leave_out:
                 for part in description.parts:
                     if isinstance(part, Lamp) and part.dark:
@@ -402,7 +403,7 @@ class MitsubaScene:
                 if self._freeze:
                     key = (method, spp, self.depth, self.window)
                     function = self._recorded.get_or_record(key, render, media)
-                # opaque: a literal seed would be part of the kernel
+                # opaque: a literal seed would be a constant of the recorded kernel
                 drjit_image = function(
                     self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
                 )
@@ -506,16 +507,18 @@ class MitsubaScene:
         """
         with mitsuba_lock:
             requested = tuple(inputs if wrt is None else wrt)
-            # inputs that are differentiated although nobody asks for it
-            extra = (
-                set() if "gradients" in self._leave_out else set(self.interior_inputs)
-            )
+            # inputs that are differentiated although they are not requested
+            extra = set[str]()
+            if "gradients" not in self._leave_out:
+                extra = set(self.interior_inputs)
             # the projective integrator knows no lens and no medium
-            has_boundary = method == "path" and self._pinhole and not self.is_volumetric
-            if "boundary" not in self._leave_out and has_boundary:
+            can_be_projective = (
+                method == "path" and self._pinhole and not self.is_volumetric
+            )
+            if can_be_projective and "boundary" not in self._leave_out:
                 method = "boundary"
                 extra = extra | self._buffers
-            # What renders the images may have no adjoint; `prb` has.
+            # the integrator of images may have no adjoint; `prb` has
             if method == "path" and self.integrator != "prb":
                 method = "adjoint"
             image_gradient = self._make_image_gradient(cotangent)
@@ -588,7 +591,9 @@ class MitsubaScene:
             yield tracked
         finally:
             mi.set_log_level(level)
-            while old_values:  # what is put back must have no second owner, see `_set`
+            # taken out of the dictionary: what is put back must have no second owner,
+            # see `_set`
+            while old_values:
                 self.parameters.__setitem__(*old_values.popitem())
             self.parameters.update()
 
@@ -674,6 +679,8 @@ class MitsubaScene:
                 projector,
                 self._find_plane(),
             )
+            # Coordinates are converted to those of a repeating texture, which a principled
+            # surface of ours has already.
             size = self.parameters[key].shape[:2]
             surface = None
             if projector is None:
@@ -800,6 +807,7 @@ class MitsubaScene:
         """
         key = method, self.depth
         if key not in self._integrators:
+            # `_path` has what a part of the scene needs, such as haze
             adjoint = {
                 "type": "prb",
                 "max_depth": self.depth,

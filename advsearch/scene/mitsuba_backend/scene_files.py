@@ -585,13 +585,15 @@ class _ObjectFrame:
         """
         kind = plugin["type"]
         if kind in MEDIUM_TYPES:
+            # density is per length, and the object's unit of length is `size` times as
+            # long as the scene's
             scale = float(np.asarray(plugin.get("scale", 1.0)))
             entries = {**plugin, "scale": scale * self.size}
         elif kind in ("gridvolume", "constvolume"):
             entries = self._with_pose(plugin)
         elif not at_top:
             entries = dict(plugin)
-        elif kind == "merge":
+        elif kind == "merge":  # its shapes count as standing at the top
             return map_inner_plugins(plugin, self.move_plugin)
         elif kind in SHAPE_TYPES - {"shapegroup"}:
             entries = self._with_pose(plugin)

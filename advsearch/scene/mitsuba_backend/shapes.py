@@ -319,9 +319,9 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     length = float(np.linalg.norm(end - start))
     axis = (end - start) / max(length, 1e-30)  # not by 0
     x, y, z = axis
+    # two axes perpendicular to it, as in Mitsuba's `coordinate_system` (Duff et al.
+    # 2017), which has float32 alone; the sign keeps the divisor away from 0
     sign = np.copysign(1.0, z)
-    # axes as in Mitsuba's `coordinate_system` (Duff et al. 2017), which has float32
-    # alone
     factor = -1.0 / (sign + z)
     x_axis = np.array([1.0 + sign * x * x * factor, sign * x * y * factor, -sign * x])
     y_axis = np.array([x * y * factor, sign + y * y * factor, -y])
@@ -637,11 +637,11 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
 def _apply_uv_transform(
     surface: Plugin, transform: object
 ) -> tuple[Plugin, Float64Array]:
-    """Apply a base color's transform of texture coordinates.
+    """Apply a base color's transform of texture coordinates to those of the mesh.
 
-    The mesh's texture coordinates can be transformed where that can be undone, and
-    where tangents along u stay as they are. Otherwise the base color keeps its
-    transform.
+    All other textures of the surface get the inverse before theirs. That is possible
+    only if the transform can be undone, and if tangents along u stay as they are where
+    the surface uses them. Otherwise the base color keeps its transform.
 
     Returns:
         The surface with changed transforms, and the (3, 3) transform of the mesh's
@@ -652,7 +652,7 @@ def _apply_uv_transform(
         plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
         for plugin in iterate_plugins(surface)
     )
-    # u grows along the same direction as before
+    # v does not depend on u, which grows in the same direction as before
     keeps_tangents = to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0
     is_invertible = abs(np.linalg.det(to_uv)) > 1e-12
     if not is_invertible or (uses_tangents and not keeps_tangents):

@@ -199,7 +199,7 @@ def compute_visible_cosines(
     Returns:
         (n, k) cosines; 0 where something is in between.
     """
-    # the transpose turns back
+    # a row times the rotation is turned by its inverse: from the map to the world
     world_directions = (directions @ np.array(world_to_map(scene))).astype(np.float32)
     lane = dr.arange(mi.UInt32, len(positions) * len(world_directions))
     texel = lane // len(world_directions)
@@ -519,6 +519,7 @@ def _sample_bsdf(
     weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
     weight = dr.select(dr.isfinite(weight), weight, 0.0)
 
+    # with which the directions of `grey` and `black` were sampled
     density = _to_table(cosine_direction.z.numpy() / math.pi)
     return _BsdfSamples(
         grey=_to_table(grey.numpy()) / density,

@@ -199,7 +199,7 @@ class _SceneText:
         deeper elements than the limits. Texts and comments outside of the root are left
         out.
         """
-        depth = 0
+        depth = 0  # how many elements are open
 
         def refuse(*_: object) -> None:
             raise FileFormatError(
@@ -269,6 +269,7 @@ class _SceneText:
         try:
             root = self.parse(self.references.get(name))
         except FileNotFoundError:
+            # why the file that was requested last was refused
             reason = next(reversed(self.references.refused.values()))
             raise FileFormatError(
                 f"{self.path}: includes {format_name(name)}, which {reason}"

@@ -110,7 +110,8 @@ def make_mesh_texels(
         side: side of its faces, as `TexelGrid` has it.
     """
     position, normal = _interpolate(charts, vertices, normals)
-    # number of the texel in each covered cell: row by row; elsewhere it means nothing
+    # index of the texel in each covered cell, which are counted row by row; in other
+    # cells it means nothing
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
     rows, columns = np.nonzero(charts.is_covered)
     return LitTexels(
@@ -280,7 +281,8 @@ def make_lookup_matrix(
     Returns:
         Sparse, (cells of the finer grid, texels of the first surface).
     """
-    buried = buried & ~buried.all()  # if all are buried, none counts as such
+    if buried.all():
+        buried = np.zeros_like(buried)  # then none counts as such
     fine_charts = rasterize_charts(charts.mesh, shape)
     position, normal = _interpolate(fine_charts, vertices, normals)
     rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
@@ -469,11 +471,12 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, n_rows)
-    # the solid angle of a texel; at the poles it is not zero
+    # the solid angle of a texel goes by this; at the poles it is not zero
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE_WEIGHTS
     mean_luminance = float((luminance * sine).sum() / sine.sum())
+    # the part of each texel's light that is above the limit
     hot_fraction = (
         1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
     ).clamp_min(0.0)
@@ -568,8 +571,7 @@ def blur_map(radiance: Tensor) -> Tensor:
 
     A width is the root mean square angle over both directions, hence each direction has
     it divided by the square root of 2. Columns are blurred first, by a Gaussian over
-    the polar angle. Rows go round, and are blurred in the frequency domain: by more
-    columns towards the poles, where a row is short.
+    the polar angle; then rows, by a Gaussian over the angle along them.
 
     Returns:
         (widths, h, w, 3).
@@ -584,6 +586,8 @@ def blur_map(radiance: Tensor) -> Tensor:
         # rows near the poles have less solid angle, and count less
         column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
         column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
+        # A row goes round, and is blurred in the frequency domain, by a Gaussian too:
+        # over more columns towards the poles, where a row is short.
         row_filter = torch.exp(
             -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
         )

@@ -224,7 +224,7 @@ def _find_change(
         return _Change.OTHER
     if _is_explained(before[None], after):
         return _Change.POWER
-    if n_coordinates == 1:  # one number adds no harmonics of a choice
+    if n_coordinates == 1:  # harmonics are added by several numbers
         return _Change.OTHER
     harmonic_basis = torch.cat([before[None], _make_harmonic_maps(before)])
     # rejects most other changes in a tenth of the time
@@ -253,14 +253,14 @@ def _is_explained(basis: Tensor, target: Tensor) -> bool:
 def _make_harmonic_maps(like: Tensor) -> Tensor:
     """Return spherical harmonics of degrees 0 to 2 as maps (9, H, W, 3).
 
-    Each is lifted to at least zero by a multiple of the first, which is constant, since
-    light cannot be negative. Size and mean are those of the map `like`, with its copied
-    columns at both ends.
+    Light cannot be negative: each harmonic is lifted to at least zero by a multiple of
+    the first, which is constant. Size and mean are those of the map `like`, with its
+    copied columns at both ends.
     """
     basis = compute_real_harmonics(like.shape[0], like.shape[1] - 2)
     # (9, H, W): the last column before the first, and the first after the last
     padded = torch.cat([basis[:, -1:], basis, basis[:, :1]], dim=1).permute(2, 0, 1)
-    # The first is 1 everywhere, so that subtracting the minimum adds a multiple of it.
+    # the first is 1 everywhere: to subtract the minimum is to add a multiple of it
     lifted = padded - padded.amin(dim=(1, 2), keepdim=True).clamp_max(0.0)
     scaled = lifted * float(like.mean().clamp_min(1e-12))
     return scaled[..., None].expand(-1, -1, -1, 3).contiguous()
@@ -396,7 +396,8 @@ def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> T
         return first[None]
     start_inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
     start_map = start_inputs[ENVIRONMENT_INPUT]
-    # harmonics are added where the environment is not cut off at zero
+    # Harmonics are added where the environment is not cut off at zero. A texel that is
+    # black at the start too counts as one that is not.
     is_added = first > 0.0
     if start_map.shape == first.shape:
         is_added = is_added | (start_map <= 0.0)

@@ -119,7 +119,8 @@ class ColoredRows:
 
         Packed, an entry has a fraction (2 bytes) and its column, a row its start (4)
         and color (6). If it is not small, the unpacked matrix and its transpose are
-        kept as well, 10 bytes more for each entry, and float32 colors.
+        stored as well: 10 bytes more for each entry, float32 colors (12), and the
+        starts of the transpose's rows (4).
         """
         n_rows, n_columns = self._shape
         packed = (2 + self._column_type.itemsize) * self.entries + (4 + 6) * n_rows
@@ -735,6 +736,7 @@ def _fill_transports(
             )
             transport.add_pass(paths.vertices, 1.0 / n_passes)
             size = sum(filled.bytes for filled in transports.values())
+            # the base image has up to four channels of 16 bits
             if size + 8 * height * width > scale_limit(MAX_BYTES):
                 raise TransportTooLargeError(
                     f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
