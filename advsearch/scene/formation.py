@@ -166,9 +166,10 @@ def round_sample_count(sampler: str, samples: float) -> int:
     ones in products of two near numbers, orthogonal arrays in squares of primes, the
     low-discrepancy sequence in powers of four.
     """
-    # 1e-9: rounding must not add a sample
+    # less 1e-9, here and below: a number just above an integer by rounding is that
+    # integer, and needs no further sample
     count = max(1, math.ceil(samples - 1e-9))
-    root = math.isqrt(count - 1) + 1  # rounded up
+    root = math.isqrt(count - 1) + 1  # the square root of the count, rounded up
     if sampler == "stratified":
         return root**2
     if sampler == "multijitter":
@@ -177,7 +178,8 @@ def round_sample_count(sampler: str, samples: float) -> int:
     if sampler == "orthogonal":
         return next((prime for prime in PRIMES if prime >= root), PRIMES[-1]) ** 2
     if sampler == "ldsampler":
-        return int(4 ** math.ceil(math.log(max(4, count), 4) - 1e-9))
+        exponent = math.ceil(math.log(max(4, count), 4) - 1e-9)
+        return int(4**exponent)
     return count
 
 

@@ -326,13 +326,13 @@ def _plan_group(
             group, estimator=forced_by_name, reason="forced by name", is_forced=True
         )
     forced_for_all = forced.get(ALL_GROUPS)
-    # It may also be one that is always valid, but what is differentiated on the
-    # picture, without a render, stays as it is.
-    has_alternative = (
+    # Some estimators are valid for every group, and not listed as such. But what is
+    # differentiated on the picture, without a render, stays as it is.
+    is_always_valid = (
         forced_for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
     )
     if forced_for_all is not None and (
-        forced_for_all in group.valid or has_alternative
+        forced_for_all in group.valid or is_always_valid
     ):
         return replace(
             group, estimator=forced_for_all, reason="forced for all", is_forced=True

@@ -57,15 +57,15 @@ def make_finished_surface(
             finish.metallic,
             finish.clearcoat,
         )
-    texel_values = face_values[rasterize_charts(mesh, MATERIAL_MAP_SIDE).face].astype(
-        np.float32
-    )
+    face_of_texel = rasterize_charts(mesh, MATERIAL_MAP_SIDE).face
+    texel_values = face_values[face_of_texel].astype(np.float32)
     surface: dict[str, object] = {
         "type": "principled",
         "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
         "specular": main.specular,
         "clearcoat_gloss": 1.0,
     }
+    # in the order of the face values
     for channel, name in enumerate(("roughness", "metallic", "clearcoat")):
         texel_channel = texel_values[:, :, channel : channel + 1]
         surface[name] = {

@@ -214,9 +214,10 @@ class Person:
         }
         # Points of the left and of the right shoe; `points` is how many vertices each
         # piece of clothing has, and `tags` what it is.
-        is_shoe = np.repeat(data["tags"], data["points"]) == "shoes"
+        tag_of_vertex = np.repeat(data["tags"], data["points"])
+        is_shoe = tag_of_vertex == "shoes"
         shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
-        is_left = data["mean"][shoe_points, 1] > 0
+        is_left = data["mean"][shoe_points, 1] > 0  # y points to the person's left
         self._tensors["shoe_l"] = torch.from_numpy(shoe_points[is_left])
         self._tensors["shoe_r"] = torch.from_numpy(shoe_points[~is_left])
         self.standing_points = self.pose({})
@@ -373,6 +374,7 @@ class Person:
         age_weights = compute_interpolation_weights(
             number_by_name["age"], number_by_name["age"].new_tensor(AGES)
         )
+        # the extremes are thin, average and heavy, at equal steps of the parameter
         weight_weights = compute_interpolation_weights(
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),

@@ -505,8 +505,8 @@ class MeshSurface:
 
         Their bounding boxes reach within a radius of the point (3,), they face a
         direction (3,), and are reached from the face, which always counts, over edges
-        between such faces. The other wall of a cup, or the next slat of a chair, are
-        not.
+        between such faces. So the other wall of a cup is not among them, and neither is
+        the next slat of a chair.
         """
         box_gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
         is_near = np.linalg.norm(box_gap, axis=1) <= radius

@@ -237,9 +237,8 @@ def _sample_first_hits(
     tiles_across = math.ceil(n_columns / tile)
     n_tiles = tiles_across * math.ceil(n_rows / tile)
     tile_index = row // tile * tiles_across + column // tile
-    sampler = make_sampler(
-        make_stream(seed, 0), n_tiles * spp, tile_index * spp + sample
-    )
+    stream = make_stream(seed, 0)  # 0: the interior term, whatever the mesh
+    sampler = make_sampler(stream, n_tiles * spp, tile_index * spp + sample)
 
     # A cell has as many strata as samples, in an almost square grid.
     strata_across = _find_largest_divisor(spp)

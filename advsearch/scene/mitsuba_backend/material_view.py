@@ -316,7 +316,10 @@ def make_stream(seed: int, purpose: int, index: int = 0) -> int:
     (Fibonacci hashing). `purpose` is one of the streams above, and `index` that of a
     mesh.
     """
-    return (((seed * 64 + index) * 4 + purpose + 1) * 0x9E3779B97F4A7C15) % 2**63
+    # Different for each: a seed has up to 64 meshes, and a mesh up to 4 purposes, which
+    # count from 0. With the 1, it is never 0, whose product would be 0.
+    number = (seed * 64 + index) * 4 + purpose + 1
+    return (number * 0x9E3779B97F4A7C15) % 2**63
 
 
 def sample_uniform(stream: int, count: int, dimensions: int) -> Tensor:
@@ -672,9 +675,9 @@ def _sample_shadow_borders(
         dr.gather(type(value), value, lit_index)
         for value in (lit, hit, si, edge_position, offset, edge_normal)
     )
-    strength = dr.sum(
-        lit * _sample_radiance_difference(view, si, edge_position, offset, stream)
-    )
+    # how much the loss changes as the lit point passes the shadow's border
+    difference = _sample_radiance_difference(view, si, edge_position, offset, stream)
+    strength = dr.sum(lit * difference)
     strength = dr.select(dr.isfinite(strength), strength, 0.0)
     dr.eval(strength, hit)
     return _ShadowBorders(
@@ -708,8 +711,10 @@ def _eval_lit_points(view: FilmView, si: Any, d: Any) -> Any:
     pixel_area = abs(
         float(matrix[0, 0][0]) * camera.width * float(matrix[1, 1][0]) * camera.height
     )
-    scale = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixel_area
-    value *= scale / dr.maximum(dr.abs(dr.dot(si.n, d)), MIN_COSINE)
+    film_area = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixel_area
+    # A line's spread is measured across it, and covers more of a surface that it meets
+    # at a grazing angle: hence over the cosine, which is also a factor of the value.
+    value *= film_area / dr.maximum(dr.abs(dr.dot(si.n, d)), MIN_COSINE)
     return dr.select(active, value * view.interpolate_cotangent(film, active), 0.0)
 
 

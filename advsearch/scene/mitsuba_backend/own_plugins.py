@@ -296,7 +296,11 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         return (L if primal else δL, bounces + scatterings != 0, [], L)
 
     def _intersect(self, scene: Any, ray: Any, is_first: Any, active: Any) -> Any:
-        """Return the next surface, behind visible emitters where those are hidden."""
+        """Return what a ray hits first.
+
+        Where the integrator hides emitters, a ray from the camera goes on through the
+        surfaces that emit, and hits what is behind them.
+        """
         si = scene.ray_intersect(ray, mi.RayFlags.All, is_first, active)
         if self.hide_emitters:
             is_emitter = si.shape.emitter() != None  # noqa: E711 (for each lane)
@@ -790,7 +794,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         if self._sheet_half_width > 0.0:
             direction, transmitted = self._bend_by_drops(direction, sample3)
         weight = dr.select(is_inside, transmitted, 0.0)
-        # Every field is set: a ragged ray has no derivatives.
+        # Every field is set: Dr.Jit differentiates no ray with fields of different
+        # lengths.
         ray = dr.zeros(mi.RayDifferential3f)
         ray.time = time
         ray.o = self.pose @ mi.Point3f(self._near * direction)

@@ -649,6 +649,7 @@ def _make_lens(description: SceneDescription) -> Plugin:
         }
         # Aperture and focus are inputs, which are set later.
         thin_lens = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
+        # the thin lens has the pinhole's field of view
         return pinhole | thin_lens if description.thin_lens else pinhole
     _check_background(description, model, drops)
     camera: Plugin = {
@@ -662,12 +663,12 @@ def _make_lens(description: SceneDescription) -> Plugin:
             name: description.get_number(f"camera.{name}")
             for name in ("drops", "drop_size", "drop_seed")
         }
-        half_fov = math.radians(description.get_number("camera.fov")) / 2.0
         # Drops cover what the lens sees; a searched lens, without a name, is taken for
         # the pinhole with the same field of view.
         if model.name:
             camera["drop_tangent"] = max(model.visible_tangents)
         else:
+            half_fov = math.radians(description.get_number("camera.fov")) / 2.0
             camera["drop_tangent"] = math.tan(half_fov)
     return camera
 

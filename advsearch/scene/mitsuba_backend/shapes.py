@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -214,16 +214,28 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
         )
     normals = get_rows(NORMALS, 3) if mesh.has_vertex_normals() else None
     uvs = get_rows(TEXCOORDS, 2) if mesh.has_vertex_texcoords() else None
+    attributes = _read_attributes(parameters, len(vertices), len(faces))
+    return Buffers(vertices, faces, normals, uvs, attributes)
+
+
+def _read_attributes(
+    parameters: Any, n_vertices: int, n_faces: int
+) -> dict[str, Float32Array]:
+    """Return the attributes (vertices or faces, c) of a mesh, such as colors, by name.
+
+    Names of attributes begin with what they belong to, such as "vertex_color"; so do
+    Mitsuba's own arrays. Parameters of the mesh's surface and light have a dot in
+    their names.
+    """
     attributes: dict[str, Float32Array] = {}
-    counts = {"vertex": len(vertices), "face": len(faces)}
+    count_by_prefix = {"vertex": n_vertices, "face": n_faces}
     for key in parameters.keys():
-        # Names of attributes begin with what they belong to, such as "vertex_color".
-        count = counts.get(key.split("_")[0], 0)
+        count = count_by_prefix.get(key.split("_")[0], 0)
         is_attribute = key not in (POSITIONS, NORMALS, TEXCOORDS) and "." not in key
         if count and is_attribute:
             values = np.array(parameters[key], np.float32)
             attributes[str(key)] = values.reshape(count, -1)
-    return Buffers(vertices, faces, normals, uvs, attributes)
+    return attributes
 
 
 def _normalize(vectors: Float64Array) -> Float64Array:
@@ -273,8 +285,8 @@ def _make_unit_shape(
     Returns:
         Vertices (V, 3), faces (F, 3), normals (V, 3) and texture coordinates (V, 2).
     """
-    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)
-    normals = None
+    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # of a turn, for a round kind
+    normals = None  # up, for a flat kind
     if kind == "sphere":
         # half as many segments from pole to pole as around
         uvs, faces = _make_grid(fractions, fractions[::2])
@@ -288,7 +300,8 @@ def _make_unit_shape(
         uvs, faces = _make_grid(fractions, np.array([0.0, 1.0]))
         vertices = np.stack([*_compute_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
-    elif kind == "disk":  # u is the radius, which needs few segments
+    elif kind == "disk":
+        # u is the radius, along which it is flat: an eighth of the segments is enough
         uvs, faces = _make_grid(fractions[::8], fractions)
         vertices = np.stack(
             [*(uvs[:, 0] * _compute_circle_points(uvs[:, 1])), np.zeros(len(uvs))],

@@ -22,6 +22,7 @@ from xml.parsers import expat
 import numpy as np
 
 from advsearch.errors import FileFormatError
+from advsearch.scene.assets import Float64Array
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     damaged,
@@ -372,36 +373,47 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     transform that is not affine or cannot be inverted.
     """
     types = mi.Properties.Type
-    entry: object = value
-    numbers: Any = value if kind in (types.Float, types.Integer) else ()
-    if kind == types.Color:
-        numbers = list(value)
-        entry = {"type": "rgb", "value": numbers}
-    elif kind == types.Vector:
-        entry = numbers = list(value)
-    elif kind == types.Transform:
-        entry = numbers = np.array(value.matrix, np.float64)
-    elif kind == types.Spectrum:
+    if kind == types.Transform:
+        matrix = np.array(value.matrix, np.float64)
+        _check_finite(where, matrix)
+        _check_affine(where, matrix)
+        return matrix
+    if kind == types.Spectrum:
+        # without wavelengths it is one value for all of them
         pairs = list(zip(value.wavelengths, value.values, strict=False))
-        numbers = pairs or value.values
-        entry = {"type": "spectrum", "value": pairs or value.values[0]}
+        _check_finite(where, pairs or value.values)
+        return {"type": "spectrum", "value": pairs or value.values[0]}
+    if kind in (types.Color, types.Vector):
+        numbers = list(value)
+        _check_finite(where, numbers)
+        return {"type": "rgb", "value": numbers} if kind == types.Color else numbers
+    if kind in (types.Float, types.Integer):
+        _check_finite(where, value)
+    return value
+
+
+def _check_finite(where: str, numbers: Any) -> None:
+    """Raise FileFormatError for a number that is not finite or near float32's limit."""
     # NaN is not below either
     if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
         raise FileFormatError(
             f"{where}: expected a finite number, got "
             f"{format_name(str(np.asarray(numbers)))}; correct it"
         )
-    if kind == types.Transform and not abs(np.linalg.det(numbers[:3, :3])) > 0.0:
+
+
+def _check_affine(where: str, matrix: Float64Array) -> None:
+    """Raise FileFormatError for a matrix (4, 4) not affine or without an inverse."""
+    if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise FileFormatError(
             f"{where}: expected a transform that can be undone, got "
             "one that squashes; correct it"
         )
-    if kind == types.Transform and not np.array_equal(numbers[3], (0.0, 0.0, 0.0, 1.0)):
+    if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
         raise FileFormatError(
             f"{where}: expected an affine transform, whose last row "
             "is 0 0 0 1; correct it"
         )
-    return entry
 
 
 def _make_plain_name(name: str) -> str:
@@ -535,6 +547,7 @@ class _FileReader:
             # checks that the name is allowed; its content is not needed
             self._references.get(str(name))
         except FileNotFoundError:
+            # why the file that was requested last was refused
             refused = self._references.refused
             reason = refused.get(next(reversed(refused)), "is missing")
             raise FileFormatError(

@@ -281,9 +281,11 @@ class BasisMaps:
         """
         flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)
         if len(self.maps) == 1:
-            # of each channel; the quotient at one texel is the factor of all
+            # A proportional target is the map times one factor in each channel: the
+            # quotient at any texel, of which the brightest has the least rounding.
             texel, brightness = self._brightest
-            return (flat_target[..., 0].gather(1, texel) / brightness.clamp_min(TINY)).T
+            target_value = flat_target[..., 0].gather(1, texel)
+            return (target_value / brightness.clamp_min(TINY)).T
         weights: Tensor = (self._inverse @ flat_target)[..., 0].T
         return weights
 
