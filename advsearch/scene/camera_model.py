@@ -532,15 +532,12 @@ def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
     has all directions.
     """
     focal = 1.0 / math.pi  # an angle of pi / 2 reaches half of the side
+    # focal lengths as fractions of width and height
+    focal_x = focal * min(1.0, 1.0 / aspect)
+    focal_y = focal * min(1.0, aspect)
     no_distortion = [0.0] * len(COEFFICIENTS)
-    fisheye = (
-        focal * min(1.0, 1.0 / aspect),
-        focal * min(1.0, aspect),
-        0.5,
-        0.5,
-        0.0,
-        *no_distortion,
-    )
+    # in the order of `NUMBER_NAMES`: fx, fy, cx, cy, skew and the coefficients
+    fisheye = (focal_x, focal_y, 0.5, 0.5, 0.0, *no_distortion)
     panorama = (1.0, 1.0, 0.5, 0.5, 0.0, *no_distortion)
     return {
         FISHEYE: CameraModel(FISHEYE, fisheye, FISHEYE, max_angle=90.0),

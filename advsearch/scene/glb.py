@@ -295,7 +295,7 @@ def _add_texture(
 ) -> dict[str, int]:
     """Add an image file as a texture, and return the reference to it.
 
-    Each texture has an entry and an image of its own, with the same index.
+    Each texture has an image of its own, which has the same index in its list.
     """
     document["images"].append(
         {
@@ -303,8 +303,9 @@ def _add_texture(
             "bufferView": buffer.add_view(image_file),
         }
     )
-    document["textures"].append({"source": len(document["textures"]), "sampler": 0})
-    return {"index": len(document["textures"]) - 1}
+    index = len(document["textures"])
+    document["textures"].append({"source": index, "sampler": 0})
+    return {"index": index}
 
 
 def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:

@@ -142,10 +142,13 @@ def load_requested_place(scene: SceneData) -> Place | None:
         if kind not in PLACE_BY_GROUND_KIND:
             return None
         return load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
+    if scene.environment is None:
+        return None
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
-    is_described = scene.get_number("ground.size") <= 0.0 or has_table_settings
-    environment = scene.environment
-    return None if environment is None or is_described else environment.place
+    has_no_ground = scene.get_number("ground.size") <= 0.0
+    if has_table_settings or has_no_ground:
+        return None
+    return scene.environment.place
 
 
 def with_requested_ground(scene: AnyScene) -> AnyScene:
@@ -295,8 +298,10 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
         return area
     x = math.cos(math.radians(azimuth))
     y = math.sin(math.radians(azimuth))
-    x_reach = (area[1] if x > 0.0 else -area[0]) / max(abs(x), 1e-12)
-    return min(x_reach, (area[3] if y > 0.0 else -area[2]) / max(abs(y), 1e-12))
+    x_from, x_to, y_from, y_to = area
+    x_side = x_to if x > 0.0 else -x_from
+    y_side = y_to if y > 0.0 else -y_from
+    return min(x_side / max(abs(x), 1e-12), y_side / max(abs(y), 1e-12))
 
 
 def find_surroundings(scene: SceneData) -> Surroundings | None:
@@ -480,14 +485,18 @@ def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
         limits: distance and height of each view, see `find_valid_range`.
         unit: unit of these.
     """
-    smallest = min(limits)[0]
-    largest = max(limits)[0]
-    distance = f"{smallest:.3g} {unit}"
-    if largest >= 1.05 * smallest:
-        distance = f"{smallest:.3g} to {largest:.3g} {unit} (by where it looks)"
+    distances = [distance for distance, _ in limits]
+    smallest = min(distances)
+    largest = max(distances)
+    text = f"{smallest:.3g} {unit}"
+    if largest >= 1.05 * smallest:  # else they are the same, for a reader
+        text = f"{smallest:.3g} to {largest:.3g} {unit} (by where it looks)"
+    text += " away"
+    # the height does not depend on the view
     max_height = limits[0][1]
-    height = f" and {max_height:.3g} {unit} high" if math.isfinite(max_height) else ""
-    return f"{distance} away{height}"
+    if math.isfinite(max_height):
+        text += f" and {max_height:.3g} {unit} high"
+    return text
 
 
 def _describe_position(position: Float64Array) -> str:

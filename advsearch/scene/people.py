@@ -627,7 +627,7 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     About the body's axes: x ahead, y to its left, z up. Bones without a parameter are
     left out. `angle` are degrees by parameter.
     """
-    # The back bends in three equal parts, neck and head share the nod.
+    # The back bends in three equal parts; neck and head have a half each.
     spine, side, turn = (
         angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
     )

@@ -335,7 +335,8 @@ def put_into_photograph(
         for name, value in view.settings.items()
         if name not in description.requested
     }
-    # A control may vary the pose, and may not vary the ground.
+    # As if the user had requested them: a control may not vary the ground, say. It may
+    # vary the pose.
     fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
     scene = replace(
         description,

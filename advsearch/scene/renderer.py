@@ -422,8 +422,8 @@ class Renderer:
         Args:
             loss: loss from an image (H, W, 3) sRGB to a number.
             u, seed, spp: as for a call.
-            free: leave out what needs primal renders of its own; coordinates that use
-                differences then have a derivative of zero.
+            free: leave out what costs more renders, that is all differences: their
+                coordinates then have a derivative of zero.
 
         Returns:
             The loss without graph, and (d,) float32.
@@ -937,9 +937,9 @@ def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
     reached: frozenset[str] = frozenset()
     for group in renderer.plan.select_groups(estimator):
         reached |= renderer.routes.get(group.name, frozenset())
-    return (
-        reached & renderer.scene.interior_inputs if estimator == "adjoint" else reached
-    )
+    if estimator == "adjoint":
+        return reached & renderer.scene.interior_inputs
+    return reached
 
 
 class _Differences(torch.autograd.Function):

@@ -207,7 +207,8 @@ def ensure_llvm() -> LibraryFile:
         return library
     path = Path(variable)
     advice = "Correct it, or unset it to let advsearch look for one."
-    # the dynamic loader looks it up; only the library itself knows its version
+    # A plain name: the dynamic loader finds the file, and only the library itself knows
+    # its version.
     if os.sep not in variable:
         version = query_version(variable)
         library = LibraryFile(path, version, explain_refusal(version))
@@ -225,7 +226,7 @@ def ensure_llvm() -> LibraryFile:
             "later, got "
             f"{library}. {advice}"
         )
-    return replace(library, path=path)
+    return replace(library, path=path)  # as the variable has it, not resolved
 
 
 def get_install_command(

@@ -323,7 +323,7 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
     direct = _reflect_light(view, moving_si, si, ds, em_weight, active_em)
 
     # Light along the sampled direction is a constant, of which the BSDF passes more or
-    # less; a mirror's stays.
+    # less as the surface moves; what a mirror reflects stays the same.
     bsdf_value = si.bsdf().eval(
         mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & is_smooth
     )

@@ -848,10 +848,10 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     """
     vertices = mesh.vertices
     ends, owner, across = _find_edges(vertices, mesh.corners)
-    # sides of faces, edge by edge
-    order = torch.argsort(owner, stable=True)
+    # Sides of faces, sorted by their edge: those of one edge follow one another.
+    sorted_sides = torch.argsort(owner, stable=True)
     n_faces = torch.bincount(owner, minlength=len(ends))
-    # of each edge, in that order
+    # where the last side of each edge is among the sorted ones
     last_entry = n_faces.cumsum(dim=0) - 1
     length = (vertices[ends[:, 1]] - vertices[ends[:, 0]]).norm(dim=1)
     is_measured = (n_faces <= 2) & (length > 0.0)
@@ -861,11 +861,13 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
 
     def along_face(entry: Tensor) -> Tensor:
         """Return unit vectors along one of an edge's faces, perpendicular to it."""
-        vector = vertices[across[order[entry[is_measured]]]] - vertices[ends[:, 0]]
+        side = sorted_sides[entry[is_measured]]
+        vector = vertices[across[side]] - vertices[ends[:, 0]]
         return torch.nn.functional.normalize(
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
 
+    # of an edge with a single face both are the same
     along_first = along_face(last_entry - n_faces + 1)
     along_second = along_face(last_entry)
     opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)

@@ -290,7 +290,8 @@ class MitsubaScene:
         None.
         """
         depth_before = self.depth
-        self.depth = self.depth if depth is None else min(depth, self.max_depth)
+        if depth is not None:
+            self.depth = min(depth, self.max_depth)
         try:
             yield
         finally:
@@ -468,7 +469,8 @@ class MitsubaScene:
                 self._scene, self._sensor, (height * subdivision, width * subdivision)
             )
             for part in self.definition[0].parts:
-                if isinstance(part, LampGlass):  # it counts as what carries it
+                if isinstance(part, LampGlass):
+                    # it counts as the face of the carrier that it was cut out of
                     on_glass = hits.visible_mask(part.name)
                     carrier_face = torch.from_numpy(part.face_of_carrier)
                     hits.face[on_glass] = carrier_face[hits.face[on_glass]]
@@ -866,6 +868,7 @@ def _to_repeating(
         size: rows and columns of the texture.
     """
     if surface is None:
+        # to the centers of the outer texels, beyond which the image stays the same
         half_texel = 0.5 / torch.tensor(size[::-1])
         return uv.clamp(half_texel, 1.0 - half_texel)
     options = next(

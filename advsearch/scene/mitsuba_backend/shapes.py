@@ -588,6 +588,7 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
     is_constant = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE) and not bool(
         np.ptp(linear, axis=(0, 1)).any()
     )
+    # whether it looks different on a mesh with other texture coordinates
     is_bound = any(
         plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
         for plugin in iterate_plugins(surface)

@@ -465,15 +465,17 @@ def measure_lobes(
         no_gloss, -np.sqrt(1.0 - cosine**2), mean_x / np.maximum(length, 1e-12)
     )
     up = np.where(no_gloss, cosine, mean_z / np.maximum(length, 1e-12))
-    # the square of the chord, which is that of the angle where it is small
+    # Squared distance of unit vectors, 2 - 2 cos, which is the squared angle where that
+    # is small: from each sample to the mean direction.
     squared_angle = 2.0 * np.maximum(
         0.0, 1.0 - samples.x * along[:, None] - samples.z * up[:, None]
     )
     core, tail = _measure_spreads(samples.weight, squared_angle)
-    # the base colors were 0.5 and 0: their difference is what the color reflects
-    diffuse = (
-        np.maximum(samples.grey.mean(axis=1) - samples.black.mean(axis=1), 0.0) / 0.5
-    )
+    # The base colors were 0.5 and 0: what reflects more with the grey one is the diffuse
+    # part, and per base color it is twice that.
+    by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
+    diffuse = np.maximum(by_color, 0.0) / 0.5
+    # the viewer is at positive x, and `Lobes.along` is away from the viewer
     tables = (diffuse, gloss, up, -along, core, tail)
     return Lobes(*(table.astype(np.float32) for table in tables))
 

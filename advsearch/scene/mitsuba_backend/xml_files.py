@@ -297,8 +297,9 @@ class _SceneText:
                     f"{self.path}: ${name} has no value: no <default> has that name"
                 )
             filled += self.values[piece] if is_name else piece
-            # a <default> may name others twice, and so on
-            if index and len(filled) > MAX_TEXT_LENGTH:
+            # Values may be long: a <default> may name others twice, and those others. A
+            # text that is long by itself, the first piece, is no error.
+            if index > 0 and len(filled) > MAX_TEXT_LENGTH:
                 limit = f"expected at most {MAX_TEXT_LENGTH:,} letters, got more"
                 raise FileFormatError(
                     f"{self.path}: {format_name(text)}: {limit}; write the value out"

@@ -365,11 +365,13 @@ class Arrangement:
         """
         cells = met_cells[self.texels.select_grid(side)]
         if self.n_sides == 1:
-            return np.asarray((cells < 0).mean(axis=1) > BURIED_FRACTION)
+            is_back = cells < 0
+            return np.asarray(is_back.mean(axis=1) > BURIED_FRACTION)
         back_grid = self.texels.grids[1]
         is_back = (cells >= back_grid.first_cell) & (
             cells < back_grid.first_cell + back_grid.n_cells
         )
+        # cells of the sky follow those of texels
         sees_sky = (cells >= len(self.texels.texel_of_cell)).any(axis=1)
         return np.asarray((is_back.mean(axis=1) > BURIED_FRACTION) & ~sees_sky)
 

@@ -216,7 +216,8 @@ def _weigh_neighbours(
         offset = texels.positions[texel] - points
         distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
         cosine = (texels.normals[texel] * normals).sum(axis=1)
-        # a neighbour round an edge, which faces elsewhere, has other light
+        # A neighbour round an edge, which faces elsewhere, has other light. The power
+        # lets it count for half at 24 degrees, and for nothing at a right angle.
         similarity = np.clip(cosine, 0.0, 1.0) ** 8
         weight = np.exp(-grid_distance - distance) * similarity
         is_used = (texel >= 0) & ~buried[texel]
@@ -471,7 +472,8 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, n_rows)
-    # the solid angle of a texel goes by this; at the poles it is not zero
+    # The solid angle of a texel goes by this, and is 1 at the horizon. The texels at the
+    # poles reach half a texel from it: they take the sine in the middle of that.
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE_WEIGHTS
@@ -505,7 +507,8 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         radiance: (H, W, 3) of what is hot.
-        power: (H, W) luminance times solid angle.
+        power: (H, W) luminance times solid angle, in the solid angle of a texel at the
+            horizon.
 
     Returns:
         (k, 3) unit directions in the map's axes, and (k, 3) radiance times solid angle;
@@ -524,6 +527,7 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     column_offset = _to_tent((index * HOT_LATTICE[1] % HOT_RAYS + 0.5) / HOT_RAYS)
     polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
     azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
+    # of a texel at the horizon
     solid_angle = math.pi / (n_rows - 1) * 2.0 * math.pi / n_columns
     power_per_ray = float(power.sum()) * solid_angle / HOT_RAYS
     color = _normalize_luminance(radiance[row, column])

@@ -532,7 +532,7 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
             name.startswith(haze_prefixes) for name in changed_inputs
         )
         if group.estimator == "image" or group.name in light_groups or is_haze:
-            continue
+            continue  # needs no matrix of base colors
         if changed_inputs & find_light_inputs(renderer) and has_fixed_lights(renderer):
             return Refusal(
                 f"{group.name} changes light, and the scene has other lights of its own"
@@ -540,6 +540,18 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
         if group.estimator != "adjoint" or not changed_inputs <= linear_inputs:
             allowed = "base colours" if varying else "base colours and light"
             return Refusal(f"{group.name} changes more than {allowed}")
+    return _find_general_refusal(renderer, searched_groups, light_groups)
+
+
+def _find_general_refusal(
+    renderer: Renderer,
+    searched_groups: Sequence[Group],
+    light_groups: Mapping[str, object],
+) -> Refusal | None:
+    """Return why images cannot be predicted though each searched group allows it.
+
+    `light_groups` has what the groups change that change light, by their names.
+    """
     if not any(
         renderer.routes.get(group.name) or light_groups.get(group.name)
         for group in searched_groups

@@ -308,7 +308,7 @@ class TextureTransport:
             column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
             row = np.floor(uv[:, 1] * n_rows).astype(np.int64)
             cell = row.clip(0, n_rows - 1) * n_columns + column.clip(0, n_columns - 1)
-            cell = cell[:, None]
+            cell = cell[:, None]  # (n, 1): one for each vertex, of weight 1
             self._scattered.add(
                 scattered.pixel.numpy(),
                 cell,
@@ -377,14 +377,14 @@ class TextureTransport:
             *self._cell_shape, 3
         )
         cell_values = cell_values / self._texels_in_cell
+        # each cell's value in all of its texels
         spread_cells = cell_values[:, None, :, None].expand(
             -1, CELL_SIZE, -1, CELL_SIZE, -1
         )
         spread_cells = spread_cells.reshape(self._cell_shape[0] * CELL_SIZE, -1, 3)
-        return (
-            texel_values
-            + spread_cells[: self._texture_shape[0], : self._texture_shape[1]]
-        )
+        # without what the last cells have beyond the texture
+        n_rows, n_columns = self._texture_shape
+        return texel_values + spread_cells[:n_rows, :n_columns]
 
 
 def _compute_cell_sizes(n_texels: int, n_cells: int) -> Tensor:
