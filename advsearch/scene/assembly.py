@@ -278,6 +278,7 @@ class Assembly:
         if photograph not in self._image_inputs_of:
             view = self._views[photograph]
             image_inputs = make_image_inputs(view, self._resolution)
+            # the plane has the light of the scene itself, whatever the photograph
             image_inputs.pop(PLANE_INPUT, None)
             self._image_inputs_of[photograph] = image_inputs | self._plane
         return self._image_inputs_of[photograph]

@@ -393,9 +393,8 @@ class CameraPreset:
     distance: float
     # Whether azimuth 0 is in the object's lane, behind what drives there.
     in_lane: bool
-    search_azimuth: (
-        float  # how far to either side a search goes, degrees; 180 for all around
-    )
+    # how far to either side a search goes, degrees; 180 for all around
+    search_azimuth: float
     # Other ranges that are searched by default; what has none stays.
     search_ranges: Mapping[str, tuple[float, float]]
 
@@ -405,7 +404,11 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
         # Behind the windscreen of a car, in the lane of the object. What glass and
         # dashboard do to a picture is not in it.
         "dashcam": CameraPreset(
-            height=1.3, fov=75.0, distance=10.0, in_lane=True, search_azimuth=10.0,
+            height=1.3,
+            fov=75.0,
+            distance=10.0,
+            in_lane=True,
+            search_azimuth=10.0,
             search_ranges={"distance": (6.0, 60.0), "fov": (60.0, 90.0)},
         ),
         # The head of a humanoid: the Unitree G1 is 1.32 m tall (its product page), with
@@ -413,11 +416,15 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
         # colour picture of that has 69 x 42 degrees, and its depth reaches to 3 m
         # (Clearpath Robotics, documentation of the RealSense D435).
         "robot": CameraPreset(
-            height=1.2, fov=69.0, distance=1.0, in_lane=False, search_azimuth=180.0,
+            height=1.2,
+            fov=69.0,
+            distance=1.0,
+            in_lane=False,
+            search_azimuth=180.0,
             search_ranges={"distance": (0.5, 3.0)},
         ),
     }
-)  # fmt: skip
+)
 """The mounted cameras by name."""
 TABLE_HEIGHT = 0.75
 TABLE_SIDE = 1.2

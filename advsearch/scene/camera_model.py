@@ -190,6 +190,7 @@ class CameraModel:
         max_visible = min(self._max_visible, MAX_RAY_TANGENT)
         undistorted_radius, converged = self._invert_radial(radius, max_visible)
         undistorted = radial_direction * undistorted_radius[..., None]
+        # p1 and the numbers after it do not depend on the radius alone
         has_decentering = any(self.numbers[NUMBER_NAMES.index("p1") :])
         if has_decentering:
             undistorted, converged = self._invert_distortion(
@@ -270,10 +271,11 @@ class CameraModel:
         """
         bound = min(1.0, max_value)
         while bound < max_value:
-            largest_radius = self._distort_radius(
+            # the largest radius with a solution up to the bound
+            reached_radius = self._distort_radius(
                 torch.tensor(bound, dtype=torch.float64)
             )
-            if not float(largest_radius) < float(target.max()):
+            if not float(reached_radius) < float(target.max()):
                 break
             bound = min(2.0 * bound, max_value)
         return bound

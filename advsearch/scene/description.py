@@ -651,24 +651,26 @@ def load_description(
         check_single_environment(
             imported.surroundings, f"`environment={_spec_text(lit_by)}`"
         )
+    # what stands around the object has a ground of its own
     if source.is_scene and not {"ground.size", "ground.kind"} & set(setting_values):
         values["ground.size"] = 0.0
     requested = set(setting_values)
     if environment_spec is not None:
         requested.add(ENVIRONMENT)
+    # a Mitsuba scene is seen by its first camera, unless settings describe another
     camera = ORBIT_CAMERA
     if is_mitsuba and not _describes_orbit(setting_values):
         camera = next(iter(imported.cameras), ORBIT_CAMERA)
     described = SceneDescription(
-        imported.object,
-        _load_environment(lit_by),
-        values,
-        _spec_text(object_spec),
-        _spec_text(lit_by),
-        up,
-        facing,
-        size,
-        unit,
+        object=imported.object,
+        environment=_load_environment(lit_by),
+        values=values,
+        object_spec=_spec_text(object_spec),
+        environment_spec=_spec_text(lit_by),
+        up=up,
+        facing=facing,
+        size=size,
+        unit=unit,
         requested=frozenset(requested),
         parts=imported.surroundings,
         cameras=imported.cameras,
@@ -888,6 +890,7 @@ def _load_object(
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
+        # any other `up` was refused with the settings
         known_up: Literal["y", "z"] | None = None
         if up == "y":
             known_up = "y"

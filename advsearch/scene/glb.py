@@ -161,8 +161,9 @@ def encode_web_glb(
     # Rows of 3: its axes to the left, up and ahead, then its position.
     camera_rows = camera[:3].T.astype(np.float32)
     camera_matrix = np.eye(4)
-    # glTF's cameras look along their -z, with +x to the right. A row here is a column
-    # of the node's matrix, as the format stores it.
+    # glTF's cameras look along their -z, with +x to the right: the opposite of left and
+    # ahead, while up and the position stay. A row here is a column of the node's
+    # matrix, as the format stores it.
     signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
     camera_matrix[:, :3] = _to_y_up(camera_rows * signs)
     document["cameras"] = [CAMERA_ENTRY]

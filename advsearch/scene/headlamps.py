@@ -431,6 +431,7 @@ def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _
     """
     vertices = np.concatenate(disks)
     disk_faces = _make_disk_faces()
+    # those of the second disk count on behind the vertices of the first
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
     vertex_of_carrier = cKDTree(mesh.vertices).query(vertices)[1]

@@ -160,9 +160,11 @@ swings, and from which it comes down; at 360 its heel strikes.
 # Stride from which both feet are put onto the ground; below, in proportion.
 FULL_CONTACT_STRIDE = 0.1
 STRAIGHT = {
-    "upperarm": ("lowerarm", (0.02, 0.15, -1.0)), "lowerarm": ("hand", (0.16, 0.05, -1.0)),
-    "thigh": ("calf", (0.0, 0.03, -1.0)), "calf": ("foot", (-0.03, 0.0, -1.0)),
-}  # fmt: skip
+    "upperarm": ("lowerarm", (0.02, 0.15, -1.0)),
+    "lowerarm": ("hand", (0.16, 0.05, -1.0)),
+    "thigh": ("calf", (0.0, 0.03, -1.0)),
+    "calf": ("foot", (-0.03, 0.0, -1.0)),
+}
 """For each bone the joint at its end, and its direction with all angles 0 on the
 left.
 """

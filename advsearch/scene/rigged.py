@@ -336,11 +336,13 @@ class SkeletonRig:
         """
         points = self._points.to(device)
         for target in self._targets:
+            # the parameter's value, or else the clip's, or else that at rest
             weight = number_by_name.get(f"{target.name}.{WEIGHT}")
-            if weight is None and target.node in clip_weights:
-                weight = clip_weights[target.node][target.index_in_node]
-            elif weight is None:
-                weight = torch.tensor(target.rest_weight, dtype=torch.float64)
+            if weight is None:
+                if target.node in clip_weights:
+                    weight = clip_weights[target.node][target.index_in_node]
+                else:
+                    weight = torch.tensor(target.rest_weight, dtype=torch.float64)
             # A weight of 0 is left out, unless its derivative is wanted.
             if weight.requires_grad or float(weight) != 0.0:
                 offsets = weight.to(device) * target.offsets.to(device)

@@ -53,39 +53,58 @@ from advsearch.scene.mitsuba_backend.material_view import (
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 LIMITS: Mapping[str, str] = {
-    "without shadow samples the shadows of the mesh, on the ground and on itself, do "
-    "not move":
+    (
+        "without shadow samples the shadows of the mesh, on the ground and on itself, "
+        "do not move"
+    ): (
         "mug on the ground, direct light: cosine 0.65 without, 0.995 with 4 shadow "
-        "samples a pixel",
-    "light that reaches the camera over more than one surface is a constant at the "
-    "first, and its shadows stay":
+        "samples a pixel"
+    ),
+    (
+        "light that reaches the camera over more than one surface is a constant at "
+        "the first, and its shadows stay"
+    ): (
         "mug on the ground, 6 segments: error 0.34, cosine 0.95 (smooth cotangent), "
-        "0.09 and 0.997 (2 pixels); chair "
-        "on the ground: 0.34, 0.97 and 0.43, 0.92",
-    "a cotangent that changes from pixel to pixel is smoothed by a tent two pixels "
-    "wide, and the noise grows":
-        "variance x time against central differences of 16 samples, six axes: 15 times "
-        "better for cotangents smooth "
-        "over 16 pixels, 4 to 14 times over 2 pixels, 0.1 to 1 times for white ones, "
-        "which are off by 0.33",
-    "polished surfaces are noisy, since directions of light are fixed in the world; a "
-    "mirror's reflections stay":
+        "0.09 and 0.997 (2 pixels); chair on the ground: 0.34, 0.97 and 0.43, 0.92"
+    ),
+    (
+        "a cotangent that changes from pixel to pixel is smoothed by a tent two "
+        "pixels wide, and the noise grows"
+    ): (
+        "variance x time against central differences of 16 samples, six axes: 15 "
+        "times better for cotangents smooth over 16 pixels, 4 to 14 times over 2 "
+        "pixels, 0.1 to 1 times for white ones, which are off by 0.33"
+    ),
+    (
+        "polished surfaces are noisy, since directions of light are fixed in the "
+        "world; a mirror's reflections stay"
+    ): (
         "roughness 0.3, 0.1, 0.02: noise of a rotation 0.1, 0.4, 4.5 where the "
-        "gradient is 4",
-    "direct sun: shadow samples ignore where the light comes from, so they are noisy":
+        "gradient is 4"
+    ),
+    (
+        "direct sun: shadow samples ignore where the light comes from, so they are "
+        "noisy"
+    ): (
         "low sun, ground alone, 16 shadow samples a pixel: noise 0.16 where the "
-        "gradient is 0.23",
-    "a deformation that is not rigid reads low, for a reason not found yet":
-        "smooth deformation of a mug or ball: 4 to 5 % low with normals that follow, 7 "
-        "to 13 % with normals held",
-    "shadows of point, spot and directional lights stay where they are":
-        "not measured: derivative 0",
-    "a surface that cuts through another: the line where they meet is taken for fixed":
-        "not measured: about 0",
-    "a thin lens counts as a pinhole; participating media and what shines on the mesh "
-    "itself are left out":
-        "not measured",
-}  # fmt: skip
+        "gradient is 0.23"
+    ),
+    "a deformation that is not rigid reads low, for a reason not found yet": (
+        "smooth deformation of a mug or ball: 4 to 5 % low with normals that follow, "
+        "7 to 13 % with normals held"
+    ),
+    "shadows of point, spot and directional lights stay where they are": (
+        "not measured: derivative 0"
+    ),
+    (
+        "a surface that cuts through another: the line where they meet is taken for "
+        "fixed"
+    ): "not measured: about 0",
+    (
+        "a thin lens counts as a pinhole; participating media and what shines on the "
+        "mesh itself are left out"
+    ): "not measured",
+}
 """What the estimator does not cover, and what that costs where it was measured.
 
 Errors are relative, of the mean of several seeds over six pose axes; noise is the
@@ -290,7 +309,7 @@ def _attach_interaction(
     """
 
     def attach_normal(fixed: Any, normal: Any) -> Any:
-        """Attach a normal to ours, which may point to the other side."""
+        """Give a fixed normal the gradient of another, which may be its opposite."""
         sign = dr.dot(dr.detach(normal), fixed)
         return dr.replace_grad(fixed, dr.mulsign(dr.normalize(normal), sign))
 
@@ -299,9 +318,9 @@ def _attach_interaction(
     moving_si.n = attach_normal(si.n, scaled_normal)
     normal = attach_normal(si.sh_frame.n, shading_normal)
     tangent = si.sh_frame.s
-    tangent = dr.replace_grad(
-        tangent, dr.normalize(dr.fma(-normal, dr.dot(normal, tangent), tangent))
-    )
+    # the part of the tangent that is perpendicular to the normal
+    perpendicular = dr.fma(-normal, dr.dot(normal, tangent), tangent)
+    tangent = dr.replace_grad(tangent, dr.normalize(perpendicular))
     moving_si.sh_frame = mi.Frame3f(tangent, dr.cross(normal, tangent), normal)
     to_eye = dr.normalize(view.camera.eye - point)
     moving_si.wi = dr.replace_grad(si.wi, moving_si.sh_frame.to_local(to_eye))

@@ -718,8 +718,8 @@ class MitsubaScene:
             inputs = {**self._every, **inputs}
             self._applied.clear()
         changes = self._find_changes(inputs)
-        changes_literal = not self._literals.isdisjoint(changes)
-        population.changes += changes_literal
+        if not self._literals.isdisjoint(changes):
+            population.changes += 1
         for name, fresh in changes.items():
             self._write(name, fresh)
             if fresh is None:

@@ -720,17 +720,7 @@ def _parse_base_color(value: object) -> _Color | None:
     if not isinstance(value, Mapping):
         return None
     if value["type"] == "checkerboard":
-        first_color = parse_constant_color(value.get("color0", 0.4))
-        second_color = parse_constant_color(value.get("color1", 0.2))
-        unknown = set(value) - {"type", "id", "color0", "color1", "to_uv"}
-        if first_color is None or second_color is None or unknown:
-            return None
-        checkerboard = np.array(
-            [[first_color, second_color], [second_color, first_color]], np.float32
-        )
-        return _Color(
-            _repeat_texels(checkerboard), {"filter_type": "nearest"}, value.get("to_uv")
-        )
+        return _parse_checkerboard(value)
     pixels = _read_pixels(value) if value["type"] == "bitmap" else None
     if pixels is None:
         return None
@@ -738,6 +728,25 @@ def _parse_base_color(value: object) -> _Color | None:
     if options.get("filter_type") == "nearest":
         pixels = _repeat_texels(pixels)
     return _Color(pixels, options, value.get("to_uv"))
+
+
+def _parse_checkerboard(plugin: Mapping[str, object]) -> _Color | None:
+    """Return a checkerboard as a base color; None if its fields are textures.
+
+    Also None for a plugin with entries that are not known here.
+    """
+    # the defaults are Mitsuba's
+    first_color = parse_constant_color(plugin.get("color0", 0.4))
+    second_color = parse_constant_color(plugin.get("color1", 0.2))
+    unknown = set(plugin) - {"type", "id", "color0", "color1", "to_uv"}
+    if first_color is None or second_color is None or unknown:
+        return None
+    checkerboard = np.array(
+        [[first_color, second_color], [second_color, first_color]], np.float32
+    )
+    return _Color(
+        _repeat_texels(checkerboard), {"filter_type": "nearest"}, plugin.get("to_uv")
+    )
 
 
 def _repeat_texels(texture: Float32Array) -> Float32Array:

@@ -447,7 +447,8 @@ class ViewTracer:
         """
         _, up, along, core, tail = lobe
         to_local = texel_rays.world_to_map(self._scene)
-        # 1e-8: a ray straight down has no direction along the surface
+        # The part of d along the surface. 1e-8: a ray along the normal has none, and
+        # normalising zeros would give NaN.
         tangent = dr.normalize(d + n * cosine + 1e-8)
         direction = dr.normalize(n * up + tangent * along)
         hit = texel_rays.find_opaque_hits(

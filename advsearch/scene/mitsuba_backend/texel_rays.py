@@ -116,6 +116,7 @@ def _spread_points(count: int) -> Float64Array:
     They are the additive recurrence of the plastic number (Roberts 2018, The
     unreasonable effectiveness of quasirandom sequences).
     """
+    # 1 / p and 1 / p^2, where p^3 = p + 1
     increments = np.array([0.7548776662466927, 0.5698402909980532])
     return np.asarray((np.arange(1, count + 1)[:, None] * increments) % 1.0)
 
@@ -554,6 +555,7 @@ def _hit_point(
     A ray onto the point from just above makes it; then its viewer is replaced.
     `to_viewer` are unit vectors in the frame of the surface, one for each lane.
     """
+    # 1e-3: so near that nothing else is in between
     start = mi.Point3f([float(x) for x in position + 1e-3 * normal])
     ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
     # the same ray in every lane

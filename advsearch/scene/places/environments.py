@@ -68,13 +68,12 @@ def import_place(spec: str) -> EnvironmentAsset:
         if illuminance <= 0.0:
             raise InputError(
                 f"{path}: lights.{light_name}: expected a map with light for its lux, "
-                f"got {light.map}, which is black "
-                "where the sky is; leave lux out"
+                f"got {light.map}, which is black where the sky is; leave lux out"
             )
         candelas = light.lux / illuminance
     asset_name = place.name
     if requested_light is not None:
-        # the suffix is taken for that of a file, and left out
+        # `.x` is taken for the suffix of a file, and left out
         asset_name = make_safe_name(Path(f"{place.name}-{light_name}.x"))
     return replace(
         environment,

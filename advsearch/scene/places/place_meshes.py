@@ -262,16 +262,11 @@ def _select_material(
     return primitive.material
 
 
-def _list_posed_meshes(
-    header: Header,
-) -> list[tuple[int, Float64Array]]:
-    """Return the mesh and the pose of each node that shows one, in order of the
-    nodes.
-    """
+def _list_posed_meshes(header: Header) -> list[tuple[int, Float64Array]]:
+    """Return mesh and pose of each node that has a mesh, in the order of nodes."""
     posed_meshes = []
-    for node, pose in sorted(
-        gltf_skeleton.iterate_poses(header), key=lambda item: item[0]
-    ):
+    posed_nodes = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
+    for node, pose in posed_nodes:
         mesh = header.nodes[node].mesh
         if mesh is not None:
             posed_meshes.append((mesh, pose))

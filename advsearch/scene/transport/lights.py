@@ -182,7 +182,7 @@ def _sample_configurations(group: Group, reference: Tensor) -> Iterator[Tensor]:
     """
     fractions = list(PROBE_FRACTIONS)
     if group.options:
-        stride = -(-group.options // MAX_OPTIONS)
+        stride = -(-group.options // MAX_OPTIONS)  # the quotient rounded up
         options = range(0, group.options, stride)
         fractions = [(option + 0.5) / group.options for option in options]
     values = [torch.full((group.size,), fraction) for fraction in fractions]

@@ -619,7 +619,7 @@ def _collect(
     the paths that fill the matrices. With a backdrop, radiance leaves out the
     background, and coverage is its fourth channel.
     """
-    non_finite_before = renderer.non_finite
+    non_finite_before = renderer.non_finite  # a count of pixels so far
     inputs = renderer.find_front(renderer.scene.assembly(renderer.space.inputs(u)))
     # those that belong to the finished image, not to the scene
     image_inputs = {
