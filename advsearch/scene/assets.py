@@ -250,13 +250,12 @@ class EnvironmentAsset:
             row, column = np.unravel_index(int(is_bad.argmax()), is_bad.shape)
             bad_texels = (
                 f"{int(is_bad.sum())} of {is_bad.size} texels that are negative, NaN "
-                "or "
-                "infinite"
+                "or infinite"
             )
             raise InputError(
                 f"environment {self.name!r}: expected finite radiance of at least 0, "
-                f"got {bad_texels} (the first in row "
-                f"{row}, column {column}); clamp them"
+                f"got {bad_texels} (the first in row {row}, column {column}); clamp "
+                "them"
             )
 
 
@@ -558,9 +557,7 @@ def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> Objec
     if not MIN_METRES <= longest_side <= MAX_METRES:
         raise InputError(
             f"{statement}: expected a longest side of {MIN_METRES:g} to {MAX_METRES:g} "
-            "metres, "
-            f"got {longest_side:.4g}; give it in "
-            "metres, such as size=4.9"
+            f"metres, got {longest_side:.4g}; give it in metres, such as size=4.9"
         )
     return replace(asset, size_in_metres=longest_side)
 

@@ -52,8 +52,7 @@ OTHER_FORMATS: tuple[tuple[str, str, str], ...] = (
         r"# ?Bundle file",
         "a Bundler reconstruction, which has no size of its pictures",
         "write the f, k1 and k2 of one of its cameras as COLMAP's cameras.txt: 1 "
-        "RADIAL WIDTH HEIGHT f WIDTH/2 "
-        "HEIGHT/2 k1 k2",
+        "RADIAL WIDTH HEIGHT f WIDTH/2 HEIGHT/2 k1 k2",
     ),
     (
         r"NVM_V3",
@@ -162,9 +161,8 @@ def check_xml_root(path: str, tag: str) -> None:
     if tag in METASHAPE_PROJECT:
         raise FileFormatError(
             f"{path}: expected one camera, got Metashape's <{tag}>, with sensors and "
-            "poses; save the lens alone: "
-            "Tools > Camera Calibration > Adjusted > Save, as Agisoft XML "
-            "(<calibration>)"
+            "poses; save the lens alone: Tools > Camera Calibration > Adjusted > Save, "
+            "as Agisoft XML (<calibration>)"
         )
 
 
@@ -341,8 +339,8 @@ def _translate_kitti(
     elif "image_width" not in data or "image_height" not in data:
         raise FileFormatError(
             f"{path}: KITTI's calibration has no size of the pictures; add it in two "
-            "lines, as in image_width: 1242 "
-            "and image_height: 375 (also 1241 x 376, 1226 x 370, 1224 x 370)"
+            "lines, as in image_width: 1242 and image_height: 375 (also 1241 x 376, "
+            "1226 x 370, 1224 x 370)"
         )
     return entries
 
@@ -463,9 +461,9 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
         entries["k4"] = value_by_name["k4"]
     elif value_by_name["k4"]:
         raise FileFormatError(
-            f"{path}: k4: expected 0, got {value_by_name['k4']:g}: the fourth radial term of "
-            "Metashape is not OpenCV's; leave "
-            "k4 out of the fit and optimize the cameras again"
+            f"{path}: k4: expected 0, got {value_by_name['k4']:g}: the fourth radial "
+            "term of Metashape is not OpenCV's; leave k4 out of the fit and optimize "
+            "the cameras again"
         )
     return entries
 

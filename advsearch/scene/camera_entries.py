@@ -136,8 +136,8 @@ class Entries:
         if len(values) not in counts:
             expected = " or ".join(map(str, counts))
             raise FileFormatError(
-                f"{self.path}: {name}: expected a list of "
-                f"{expected} numbers, got {len(values)}"
+                f"{self.path}: {name}: expected a list of {expected} numbers, got "
+                f"{len(values)}"
             )
         return [parse_number(self.path, name, value) for value in values]
 
@@ -162,9 +162,8 @@ class Entries:
             elif not is_neutral(value):
                 raise FileFormatError(
                     f"{self.path}: expected no {format_name(prefix + spelling)}, got "
-                    f"{format_name(str(value))}: it makes another"
-                    " picture and is not read; calibrate with one of the models in "
-                    "docs/cameras.md"
+                    f"{format_name(str(value))}: it makes another picture and is not "
+                    "read; calibrate with one of the models in docs/cameras.md"
                 )
         return unread
 
@@ -257,8 +256,8 @@ def parse_number(path: str, name: str, entry: object) -> float:
     value = _to_float(entry)
     if not math.isfinite(value):
         raise FileFormatError(
-            f"{path}: {name}: expected a finite number, got "
-            f"{str(entry)[:40]!r}; correct it"
+            f"{path}: {name}: expected a finite number, got {str(entry)[:40]!r}; "
+            "correct it"
         )
     return value
 

@@ -144,10 +144,9 @@ LENS_KEYS = frozenset(
 """Entries of nerfstudio about a camera, of all frames or of one."""
 SCENE_KEYS = frozenset(
     "frames aabb_scale scale offset applied_transform applied_scale ply_file_path "
-    "orientation_override "
-    "auto_scale_poses_override train_filenames val_filenames test_filenames "
-    "camera_angle_x camera_angle_y "
-    "file_path transform_matrix sharpness colmap_im_id mask_path depth_file_path "
+    "orientation_override auto_scale_poses_override train_filenames val_filenames "
+    "test_filenames camera_angle_x camera_angle_y file_path transform_matrix sharpness "
+    "colmap_im_id mask_path depth_file_path "
     "semantic_path time rotation".split()
 )
 """Entries of a transforms.json, and of its frames, that are not about the lens; angles
@@ -239,8 +238,8 @@ def _read_camera_text(path: str) -> str:
         )
     if suffix in MESHES:
         raise FileFormatError(
-            f"{path}: expected a camera file, got a mesh; it is an "
-            "object's, not a camera's"
+            f"{path}: expected a camera file, got a mesh; it is an object's, not a "
+            "camera's"
         )
     limit = MAX_JSON_SIZE if suffix == ".json" else MAX_YAML_BYTES
     return read_existing_text(path, "a camera file", limit)
@@ -286,8 +285,7 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
         got = "an empty file" if data is None else f"a {type(data).__name__}"
         raise FileFormatError(
             f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, "
-            f"got {got}; docs/cameras.md shows "
-            "one of each"
+            f"got {got}; docs/cameras.md shows one of each"
         )
     return data
 
@@ -300,16 +298,15 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise FileFormatError(
-            f"{path}: declares a document type or entities, "
-            "which no camera needs; remove it"
+            f"{path}: declares a document type or entities, which no camera needs; "
+            "remove it"
         )
     root = parse_text(path, text, "XML", ElementTree.fromstring)
     check_xml_root(path, root.tag)
     if root.tag not in ("opencv_storage", METASHAPE_FILE):
         raise FileFormatError(
             f"{path}: expected a camera of OpenCV in <opencv_storage>, got "
-            f"<{root.tag[:40]}>; docs/cameras.md has "
-            "the formats that are read"
+            f"<{root.tag[:40]}>; docs/cameras.md has the formats that are read"
         )
     entries = dict[str, Any]()
     for element in root:
@@ -343,16 +340,15 @@ def _read_colmap(
     if name not in COLMAP_MODELS:
         raise FileFormatError(
             f"{path}: expected one of COLMAP's models {', '.join(COLMAP_MODELS)}, got "
-            f"{name[:40]}, which is another projection"
-            "; fit one of these to it (colmap model_converter does not), or undistort "
-            "the pictures"
+            f"{name[:40]}, which is another projection; fit one of these to it (colmap "
+            "model_converter does not), or undistort the pictures"
         )
     kind, parameters = COLMAP_MODELS[name]
     keys = ["width", "height", *parameters.split()]
     if len(values) != len(keys):
         raise FileFormatError(
-            f"{path}: {name}: expected {' '.join(keys)}, got "
-            f"{len(values)} numbers; correct the line"
+            f"{path}: {name}: expected {' '.join(keys)}, got {len(values)} numbers; "
+            "correct the line"
         )
     numbers = {
         key: parse_number(path, key, value)
@@ -426,9 +422,8 @@ def _read_projection(path: str, entries: Entries) -> str:
     if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
         raise FileFormatError(
             f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, "
-            "got "
-            f"{format_name(name)}, which is another "
-            "projection; fit one of these to it"
+            f"got {format_name(name)}, which is another projection; fit one of these "
+            "to it"
         )
     if entries.get("isfisheye"):
         return FISHEYE
@@ -581,8 +576,8 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
     is_fisheye = not is_neutral(entries.get("fisheyemodel"))
     if len(kinds) > 1:
         raise FileFormatError(
-            f"{path}: expected one model, got a camera_model beside "
-            "another distortion_model"
+            f"{path}: expected one model, got a camera_model beside another "
+            "distortion_model"
         )
     return FISHEYE if is_fisheye else next(iter(kinds), BROWN_CONRADY)
 
@@ -606,8 +601,8 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
     if not any(matrix):
         raise FileFormatError(
             f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
-            "as ROS says of one that is not "
-            "calibrated; calibrate it, and give the file that this writes"
+            "as ROS says of one that is not calibrated; calibrate it, and give the "
+            "file that this writes"
         )
     # skew, cx and cy are 0, and the last row is not
     is_by_columns = not any(matrix[index] for index in (1, 2, 5)) and any(matrix[6:8])
@@ -615,8 +610,8 @@ def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(
-            f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, "
-            "cy, 0, 0, 1, got other numbers"
+            f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got "
+            "other numbers"
         )
     return matrix
 

@@ -95,8 +95,7 @@ class CameraModel:
         if "camera.fov" in setting_names:
             raise InputError(
                 f"`camera={self.name}` and `set` camera.fov contradict each other: the "
-                "camera has focal lengths of its "
-                "own; leave one of the two out"
+                "camera has focal lengths of its own; leave one of the two out"
             )
 
     # ---- Projection and rays ----
@@ -481,9 +480,8 @@ class CameraModel:
         if self.fold_angle < math.radians(self.max_angle):
             sentence = (
                 f"{name}: the lens folds at {math.degrees(self.fold_angle):.1f} "
-                "degrees "
-                f"from its axis, and {black_part}, which only directions beyond that "
-                "would fill, is black."
+                f"degrees from its axis, and {black_part}, which only directions "
+                "beyond that would fill, is black."
             )
         return (*self.reading_notes, sentence)
 
@@ -504,8 +502,8 @@ class CameraModel:
             )
         return (
             f"{self.name} is for {model_width} x {model_height} pixels (width x "
-            "height): its focal lengths and its principal point "
-            f"are scaled to {width} x {height}{stretch_text}.",
+            f"height): its focal lengths and its principal point are scaled to {width} "
+            f"x {height}{stretch_text}.",
         )
 
 

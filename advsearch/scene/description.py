@@ -129,8 +129,7 @@ class SceneDescription(SceneData):
             )
             raise InputError(
                 f"`controls` {part.name}: the scene has something of that name "
-                "already; choose another name, as in "
-                f"light:{part.name}-2{alternative}"
+                f"already; choose another name, as in light:{part.name}-2{alternative}"
             )
         return replace(self, parts=(*self.parts, part))
 
@@ -315,9 +314,8 @@ class SceneDescription(SceneData):
         if camera != ORBIT_CAMERA and camera_settings:
             raise InputError(
                 f"`camera={camera}` and `set` {camera_settings[0]} contradict each "
-                "other: "
-                "the camera of the file has a place and "
-                "a field of view of its own; leave one of the two out"
+                "other: the camera of the file has a place and a field of view of its "
+                "own; leave one of the two out"
             )
         return replace(scene, camera=camera)
 
@@ -373,8 +371,8 @@ class SceneDescription(SceneData):
         if self.object.size_in_metres is None:
             raise InputError(
                 f"`camera={name}` is {preset.height:g} m high, and how large "
-                f"{self.object.name} is is not known; give "
-                "its longest side in metres, such as `size=0.1`"
+                f"{self.object.name} is is not known; give its longest side in metres, "
+                "such as `size=0.1`"
             )
         preset_values = {
             setting: value
@@ -601,8 +599,7 @@ class SceneDescription(SceneData):
         if unit is None:
             raise InputError(
                 "`set` camera.ev: the brightness of this environment has no unit; take "
-                "one of the avenue, or leave "
-                "camera.ev out, and exposure is metered"
+                "one of the avenue, or leave camera.ev out, and exposure is metered"
             )
         return unit / (1.2 * math.pow(2.0, exposure_value))
 
@@ -843,11 +840,8 @@ def check_single_environment(parts: Iterable[ScenePart], requester: str) -> None
         if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
             raise InputError(
                 f"{requester}: the Mitsuba scene has an environment of its own, "
-                f"{part.name} "
-                f"(a {part.plugin['type']}), and "
-                f"there can be one only; leave {requester} out, or take {part.name} "
-                "out of "
-                "the scene"
+                f"{part.name} (a {part.plugin['type']}), and there can be one only; "
+                f"leave {requester} out, or take {part.name} out of the scene"
             )
 
 
@@ -869,9 +863,8 @@ def check_ground(
     table_settings = [name for name in settings.TABLE_SETTINGS if name in requested]
     if table_settings:
         raise InputError(
-            f"`set` ground.kind={kind} and `set` {table_settings[0]} contradict each other: "
-            "only a table has that; "
-            f"leave one of the two out"
+            f"`set` ground.kind={kind} and `set` {table_settings[0]} contradict each "
+            "other: only a table has that; leave one of the two out"
         )
 
 

@@ -416,7 +416,6 @@ class _OnceDifferentiable(torch.autograd.Function):
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         raise NotImplementedError(
             "render: it has first derivatives only, since light is differentiated by "
-            "an adjoint or by differences; "
-            "leave out what needs a second one (a Hessian, a gradient penalty), or "
-            "take differences of gradients"
+            "an adjoint or by differences; leave out what needs a second one (a "
+            "Hessian, a gradient penalty), or take differences of gradients"
         )

@@ -71,8 +71,7 @@ def make_traffic_remark(scene: SceneData) -> str:
     azimuth_behind = (180.0 - scene.azimuth_zero) % 360.0
     return (
         f"The camera is in the lane of {scene.object.name} and looks at its front, "
-        "against the traffic; behind it is "
-        f"`set` camera.azimuth={azimuth_behind:g}"
+        f"against the traffic; behind it is `set` camera.azimuth={azimuth_behind:g}"
     )
 
 
@@ -469,12 +468,10 @@ def _list_range_remarks(
     highest = max(view.height for view in views_beyond)
     return (
         f"{scene.environment_name}: the place around the object is a picture, which "
-        "fits a camera up to "
-        f"{_describe_limits(limits, unit)}; {subject} "
+        f"fits a camera up to {_describe_limits(limits, unit)}; {subject} "
         f"{farthest:.3g} {unit} away and {highest:.3g} {unit} high. There what stands "
-        "around is more than twice too large or "
-        "too high, or the ground ends in sight: predictions from there are about the "
-        "picture, not about a real place",
+        "around is more than twice too large or too high, or the ground ends in sight: "
+        "predictions from there are about the picture, not about a real place",
     )
 
 
@@ -537,6 +534,5 @@ def list_outside_remarks(
         )
     return (
         f"{scene.environment_name}: the place holds for a camera at {box} from the "
-        f"object; {outside_views}. Predictions from "
-        "there are not about a real place",
+        f"object; {outside_views}. Predictions from there are not about a real place",
     )

@@ -180,8 +180,8 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     duplicates = {part.name for part in other_parts} & {lamp.name for lamp in lamps}
     if duplicates:
         raise InputError(
-            "things: lamps of the scene are called "
-            f"{', '.join(sorted(duplicates))}; give yours another name="
+            f"things: lamps of the scene are called {', '.join(sorted(duplicates))}; "
+            "give yours another name="
         )
     return replace(scene, parts=(*other_parts, *lamps))
 
@@ -198,14 +198,13 @@ def _check_units(scene: SceneData, carrier: str) -> float:
     if radiance_unit is None:
         raise InputError(
             f"{setting}: lamps are in candela, and the brightness of this environment "
-            "has no unit; take one of the avenue, "
-            "or leave the lamps off"
+            "has no unit; take one of the avenue, or leave the lamps off"
         )
     if scene.object.size_in_metres is None:
         raise InputError(
             f"{setting}: lamps are so many metres apart, and how large "
-            f"{scene.object_name} is is not known; give its "
-            "longest side in metres, such as `size=4.5`"
+            f"{scene.object_name} is is not known; give its longest side in metres, "
+            "such as `size=4.5`"
         )
     return radiance_unit
 

@@ -200,8 +200,8 @@ def _check_same_statements(view: PhotographView, first: PhotographView) -> None:
         missing = sorted(other.stated_names - file.stated_names)
         if missing:
             raise FileFormatError(
-                f"{file.file}: expected {missing[0]}, which "
-                f"{Path(other.file).name} states; add it"
+                f"{file.file}: expected {missing[0]}, which {Path(other.file).name} "
+                "states; add it"
             )
 
 

@@ -336,8 +336,7 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     if len(face) == 0:
         raise InputError(
             f"mesh texture coordinates: none of the {shape[0]} x {shape[1]} texels "
-            "lies in a triangle; unwrap the mesh "
-            "again"
+            "lies in a triangle; unwrap the mesh again"
         )
     points = np.stack([column, row], axis=1)
     weights = _compute_clipped_weights(corners[face], points)

@@ -269,8 +269,8 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
     is_moved = not np.allclose(first_mount.pose, np.eye(4))
     if is_moved or first_mount.azimuth or first_mount.delay:
         raise FileFormatError(
-            f"{spec}: the first camera is the scene's own; it takes "
-            "no place, turn, around or later"
+            f"{spec}: the first camera is the scene's own; it takes no place, turn, "
+            "around or later"
         )
 
 
@@ -358,8 +358,8 @@ def _parse_numbers(
     )
     if not is_valid:
         raise FileFormatError(
-            f"{where}: {key}: expected {count} numbers up to "
-            f"{limit:g}, got {str(value)[:80]!r}"
+            f"{where}: {key}: expected {count} numbers up to {limit:g}, got "
+            f"{str(value)[:80]!r}"
         )
     return list(map(float, value))
 
@@ -422,8 +422,8 @@ def _parse_transforms(path: str) -> dict[str, Any]:
         isinstance(frame, dict) for frame in frames
     ):
         raise FileFormatError(
-            f"{path}: expected `frames`, a list with a camera each, "
-            "as nerfstudio writes it"
+            f"{path}: expected `frames`, a list with a camera each, as nerfstudio "
+            "writes it"
         )
     return dict(data)
 
@@ -486,8 +486,8 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     if not MIN_SCALE <= scale <= 1.0 / MIN_SCALE:
         limits = f"from {MIN_SCALE:g} to {1.0 / MIN_SCALE:g}"
         raise FileFormatError(
-            f"{path}: applied_scale: expected a scale {limits}, got "
-            f"{scale:g}; correct it"
+            f"{path}: applied_scale: expected a scale {limits}, got {scale:g}; correct "
+            "it"
         )
     return scale
 
@@ -530,8 +530,8 @@ def _parse_images(path: str) -> dict[str, list[str]]:
         )
     if len(words_by_id) < len(image_lines):
         raise FileFormatError(
-            f"{path}: expected each image once, got one with the "
-            "same number twice; correct the file"
+            f"{path}: expected each image once, got one with the same number twice; "
+            "correct the file"
         )
     return words_by_id
 
@@ -545,8 +545,8 @@ def _parse_image(where: str, words: Sequence[str]) -> Float64Array:
     if len(words) != 10:
         raise FileFormatError(
             f"{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got "
-            f"{len(words)} words; a line of "
-            "points, perhaps an empty one, stands between two images"
+            f"{len(words)} words; a line of points, perhaps an empty one, stands "
+            "between two images"
         )
     try:
         numbers = list(map(float, words[1:8]))

@@ -130,8 +130,8 @@ def _parse_thing(part: str) -> RequestedThing:
     has_options = all("=" in word for word in option_words)
     if not (object_spec and has_position and has_options):
         raise InputError(
-            "things: expected WHAT@X,Y in metres, such as "
-            f"car@12,3.5,heading=180, got {part!r}"
+            "things: expected WHAT@X,Y in metres, such as car@12,3.5,heading=180, got "
+            f"{part!r}"
         )
     options = _parse_options(part, option_words)
     x = _parse_number(part, "x", words[0], -MAX_DISTANCE, MAX_DISTANCE)
@@ -216,8 +216,7 @@ def add_things(
     if scene.object.size_in_metres is None:
         raise InputError(
             f"things: they stand in metres beside {scene.object_name}, whose size in "
-            "metres is not known; say it: its "
-            "longest side, such as `size=0.1`"
+            "metres is not known; say it: its longest side, such as `size=0.1`"
         )
     parts = list[ThingPart]()
     remarks = list[str]()
@@ -252,8 +251,8 @@ def _make_thing(
         )
     if name in {part.name for part in scene.parts}:
         raise InputError(
-            f"things: something of the scene is called {name} "
-            "already; add name=NAME to it"
+            f"things: something of the scene is called {name} already; add name=NAME "
+            "to it"
         )
     pose = _compute_pose(scene, asset, thing, asset.size_in_metres)
     part = make_mesh_part(name, asset, pose, asset.material)
@@ -422,6 +421,5 @@ def list_camera_remarks(
     fraction = 100.0 * len(solid_names) / len(eyes)
     return (
         f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: "
-        "it sees no object from there; "
-        "narrow where it goes.",
+        "it sees no object from there; narrow where it goes.",
     )

@@ -217,14 +217,12 @@ def ensure_llvm() -> LibraryFile:
     else:
         raise EnvironmentSetupError(
             f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which "
-            "does not "
-            f"exist. {advice}"
+            f"does not exist. {advice}"
         )
     if library.refusal:
         raise EnvironmentSetupError(
             f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or "
-            "later, got "
-            f"{library}. {advice}"
+            f"later, got {library}. {advice}"
         )
     return replace(library, path=path)  # as the variable has it, not resolved
 
@@ -288,10 +286,8 @@ def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
     separator = "\n" if "\n" in command else " "
     raise EnvironmentSetupError(
         f"expected a libLLVM of version {MIN_VERSION} or later, with which Dr.Jit "
-        "compiles "
-        f"its kernels. {rejected_text} "
-        f"Install one with:{separator}{command}{separator}or name a file in "
-        f"{ENVIRONMENT_VARIABLE}."
+        f"compiles its kernels. {rejected_text} Install one "
+        f"with:{separator}{command}{separator}or name a file in {ENVIRONMENT_VARIABLE}."
     )
 
 

@@ -62,8 +62,8 @@ def find_plugin_numbers(
         if key in other_types:
             raise InputError(
                 f"`controls` mitsuba:{key}: expected a number or a colour, and Mitsuba "
-                f"has {other_types[key]} there; other "
-                "controls may move it, such as pose and texture"
+                f"has {other_types[key]} there; other controls may move it, such as "
+                "pose and texture"
             )
         if key not in numbers:
             raise UnknownNameError("number or colour in Mitsuba", key, numbers)

@@ -598,8 +598,8 @@ def convert_refusals(description: SceneDescription) -> Iterator[None]:
             raise  # it is our own mistake
         reason = " ".join(str(error).split())
         raise InputError(
-            f"{description.object_name}: Mitsuba refuses the scene: "
-            f"{reason}; change it there"
+            f"{description.object_name}: Mitsuba refuses the scene: {reason}; change "
+            "it there"
         ) from error
 
 
@@ -624,8 +624,7 @@ def _check_background(
     if has_plain_backdrop and may_leave_black:
         raise InputError(
             "background: it would show where the camera's lens sees nothing as well; "
-            "leave the plain background out, "
-            "or take a lens that fills the picture"
+            "leave the plain background out, or take a lens that fills the picture"
         )
 
 

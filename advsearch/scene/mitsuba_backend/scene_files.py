@@ -462,8 +462,7 @@ def _describe_missing_attributes(
             available = ", ".join(sorted(mesh.attributes)) or "none"
             yield (
                 f"the mesh has no attribute {format_name(str(name))} (it has "
-                f"{available}), "
-                "so that is black"
+                f"{available}), so that is black"
             )
 
 
@@ -692,8 +691,8 @@ def _read_film_size(film: Mapping[str, object]) -> tuple[float, float]:
     height = float(np.asarray(film.get("height", 576)))
     if not min(width, height) >= 1.0:
         raise InputError(
-            "camera: expected a film of at least 1 x 1 pixels, got "
-            f"{width:g} x {height:g}"
+            f"camera: expected a film of at least 1 x 1 pixels, got {width:g} x "
+            f"{height:g}"
         )
     return width, height
 

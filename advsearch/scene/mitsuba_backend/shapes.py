@@ -111,8 +111,8 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     buffers = _load_any_buffers(shape, name)
     if not np.isfinite(buffers.vertices).all():
         raise InputError(
-            f"object {name}: expected finite vertices, got NaN or "
-            "infinite ones; repair the mesh"
+            f"object {name}: expected finite vertices, got NaN or infinite ones; "
+            "repair the mesh"
         )
     has_uvs = buffers.uvs is not None
     if shape.get("face_normals"):

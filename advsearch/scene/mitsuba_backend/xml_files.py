@@ -407,13 +407,13 @@ def _check_affine(where: str, matrix: Float64Array) -> None:
     """Raise FileFormatError for a matrix (4, 4) not affine or without an inverse."""
     if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise FileFormatError(
-            f"{where}: expected a transform that can be undone, got "
-            "one that squashes; correct it"
+            f"{where}: expected a transform that can be undone, got one that squashes; "
+            "correct it"
         )
     if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
         raise FileFormatError(
-            f"{where}: expected an affine transform, whose last row "
-            "is 0 0 0 1; correct it"
+            f"{where}: expected an affine transform, whose last row is 0 0 0 1; "
+            "correct it"
         )
 
 
@@ -531,9 +531,8 @@ class _FileReader:
             filename = format_name(str(entries["filename"]))
             raise FileFormatError(
                 f"{self._path}: {kind} names the file {filename}, which only Mitsuba "
-                "reads, without checks; convert it to "
-                "a .ply mesh or a picture, or give the scene as a dictionary from "
-                "Python"
+                "reads, without checks; convert it to a .ply mesh or a picture, or "
+                "give the scene as a dictionary from Python"
             )
         return self._readers[kind](entries)
 

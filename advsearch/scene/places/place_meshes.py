@@ -376,8 +376,8 @@ def _check_materials(path: Path, count: int) -> None:
     """Raise InputError if a file has more than `MAX_MESHES` materials."""
     if count > MAX_MESHES:
         raise InputError(
-            f"{path}: expected at most {MAX_MESHES} materials, got "
-            f"{count}; join some of them"
+            f"{path}: expected at most {MAX_MESHES} materials, got {count}; join some "
+            "of them"
         )
 
 
