@@ -450,9 +450,9 @@ def _encode_rows(rows: IntArray) -> IntArray:
 # How large things really are: an object's longest side in metres, from what is said of
 # it or from its file.
 #
-# A scene is as large as its object is 1. `ObjectAsset.size_in_metres` is the one number that
-# makes metres of it: whatever speaks of metres (distances of the camera, the road, what
-# stands beside the object) divides by `SceneDescription.size_in_metres`.
+# A scene is as large as its object is 1. `ObjectAsset.size_in_metres` is the one number
+# that makes metres of it: whatever speaks of metres (distances of the camera, the road,
+# what stands beside the object) divides by `SceneDescription.size_in_metres`.
 
 # metres of the units that a mesh may be in
 METRES_PER_UNIT = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}

@@ -72,8 +72,8 @@ class Entries:
         for key in self._keys.repeated:
             later_key = self._keys.get_spelling(normalize_key(key))
             raise FileFormatError(
-                f"{path}: has {format_name(key)} and {format_name(later_key)}; leave one "
-                "of them out"
+                f"{path}: has {format_name(key)} and {format_name(later_key)}; leave "
+                "one of them out"
             )
         # Keys of matrices that are not read.
         self._unread_matrix_keys: list[str] = []
@@ -346,7 +346,8 @@ def _check_numbers(
         """Raise the error of a number that is not valid."""
         if not is_valid:
             raise FileFormatError(
-                f"{path}: {name}: expected {expected}, got {value_by_name[name]:g}{hint}"
+                f"{path}: {name}: expected {expected}, got "
+                f"{value_by_name[name]:g}{hint}"
             )
 
     for name, side in (("fx", width), ("fy", height)):
@@ -355,7 +356,8 @@ def _check_numbers(
         check(
             name,
             min_focal <= value_by_name[name] <= max_focal,
-            f"a focal length from {min_focal:g} to {max_focal:g} pixels for a side of {side:g}",
+            f"a focal length from {min_focal:g} to {max_focal:g} pixels for a side of "
+            f"{side:g}",
         )
     for name, side in (("cx", width), ("cy", height)):
         check(

@@ -179,8 +179,8 @@ def read_camera(spec: str) -> CameraModel:
 
     Raises:
         FileFormatError: the file is missing, is of no known kind, has a model that is
-            not one of ours, numbers that no camera has, or an entry that changes the image
-            and is not read.
+            not one of ours, numbers that no camera has, or an entry that changes the
+            image and is not read.
     """
     path, _, camera_name = spec.partition("#")
     text = _read_camera_text(path)
@@ -208,8 +208,8 @@ def read_camera(spec: str) -> CameraModel:
         return _read_kalibr(spec, camera, Entries(path, other_entries).find_unread())
     if camera_name:
         raise FileFormatError(
-            f"{path}: expected several cameras, as {camera_name!r} is asked for, got one; "
-            f"leave #{camera_name} out"
+            f"{path}: expected several cameras, as {camera_name!r} is asked for, got "
+            f"one; leave #{camera_name} out"
         )
     if "intrinsics" in data and "camera_model" in data:
         return _read_kalibr(spec, Entries(path, data))

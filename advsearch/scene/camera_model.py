@@ -442,7 +442,7 @@ class CameraModel:
     def _compute_border_tangent(
         self, center: Tensor, axis: int, border: float
     ) -> float:
-        """Return the largest tangent on the line from the axis to a border of the image.
+        """Return the largest tangent on the line from the axis to an image border.
 
         Args:
             center: (1, 2) image coordinates of the axis.

@@ -1,7 +1,7 @@
 """Pictures of depth: how far what a photograph shows is from its camera.
 
-Depth counts along the camera's axis, as depth cameras and BOP have it. 0, and what is no
-finite number, is unknown.
+Depth counts along the camera's axis, as depth cameras and BOP have it. 0, and what is
+no finite number, is unknown.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ def check_no_depth(mode: str, path: Path) -> None:
     """Raise FileFormatError if a mask has the mode of a picture of depth."""
     if mode in LEVEL_BITS:
         raise FileFormatError(
-            f"{path}: expected a mask of 8 bits, got a picture of 16 bits; if it is one "
-            f"of depth, give the metres of a level behind its name, as in {path}#0.001"
+            f"{path}: expected a mask of 8 bits, got a picture of 16 bits; if it is "
+            "one of depth, give the metres of a level behind its name, as in "
+            f"{path}#0.001"
         )
 
 

@@ -1,5 +1,6 @@
-"""A scene as its users have it: `SceneData` with its light, its exposure, its cameras and
-what there is to say of it. And `load_description`, which reads one.
+"""A scene as its users have it: `SceneData` with its light, exposure and cameras.
+
+It also has what there is to say of the scene. `load_description` reads one.
 """
 
 from __future__ import annotations
@@ -196,9 +197,10 @@ class SceneDescription(SceneData):
         )
         if other_grounds:
             raise InputError(
-                f"`backdrop={photograph.spec}` and `set` {other_grounds[0]} contradict each "
-                "other: the ground of a photograph is a plane that takes the shadow, "
-                f"with {', '.join(sorted(PLANE_SETTINGS))}; leave one of the two out"
+                f"`backdrop={photograph.spec}` and `set` {other_grounds[0]} contradict "
+                "each other: the ground of a photograph is a plane that takes the "
+                f"shadow, with {', '.join(sorted(PLANE_SETTINGS))}; leave one of the "
+                "two out"
             )
         if self.rig:
             raise InputError(
@@ -273,7 +275,8 @@ class SceneDescription(SceneData):
         to_world = pose @ AXES
         to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)
-        # of half the width and half the height; the larger one is that of the larger side
+        # of half the width and half the height; the larger one is that of the larger
+        # side
         tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
         cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}

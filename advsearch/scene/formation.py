@@ -1,6 +1,6 @@
 """Image formation: from linear radiance to the display-referred image of the model.
 
-    display = sRGB(clip(gain * denoised(radiance), 0, 1))          (IEC 61966-2-1 transfer)
+    display = sRGB(clip(gain * denoised(radiance), 0, 1))       (IEC 61966-2-1 transfer)
 
 It is part of a run, named and stored, and the same in search and verification
 (docs/design.md, "Image formation"). Verification then rounds to 8 bits, as a file

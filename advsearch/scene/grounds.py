@@ -450,7 +450,7 @@ def list_view_remarks(
 def _list_range_remarks(
     scene: SceneData, surroundings: Surroundings, views: Sequence[CameraView]
 ) -> tuple[str, ...]:
-    """Return a remark where views are too far, or too high, for an environment's picture.
+    """Return a remark if views are too far or too high for an environment's picture.
 
     Arguments are as for `list_view_remarks`; empty if no view is.
     """

@@ -421,7 +421,10 @@ def _make_disks(
 
 
 def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _Glass:
-    """Return two disks as glass that belongs to the nearest vertices and faces of a car.
+    """Return two disks as glass that is carried by a car.
+
+    Each point belongs to the nearest vertex of the car, and each face to the face
+    with the nearest center.
 
     Args:
         mesh: mesh of the car.

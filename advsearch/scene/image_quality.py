@@ -127,7 +127,8 @@ def _measure_edges(image: Float64Array) -> float | None:
     ratio = (narrow[is_edge] / np.maximum(wide[is_edge], 1e-12)) ** 2
     # 1.01: so blurred that both copies are alike; the upper end: not blurred at all
     ratio = np.clip(ratio, 1.01, (WIDE / NARROW) ** 2)
-    # An edge blurred by s has the ratio (s^2 + WIDE^2) / (s^2 + NARROW^2): solved for s^2.
+    # An edge blurred by s has the ratio (s^2 + WIDE^2) / (s^2 + NARROW^2): solved for
+    # s^2.
     squared_blur = (WIDE**2 - ratio * NARROW**2) / (ratio - 1.0)
     return float(np.sqrt(np.quantile(squared_blur, SHARP_FRACTION)))
 

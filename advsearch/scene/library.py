@@ -121,7 +121,7 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
 
 
 def _read_environment_facts() -> dict[str, dict[str, Any]]:
-    """Return what the scripts have stored about each bundled environment, by its name."""
+    """Return what the scripts have stored about each bundled environment, by name."""
     text = (_get_data_directory() / "environments" / "environments.json").read_text(
         "utf-8"
     )

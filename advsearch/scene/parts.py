@@ -258,8 +258,8 @@ class BeamLamp(ScenePart):
     """
 
     carrier: str  # the mesh that carries it, or `CAMERA`
-    # (4, 4) its pose in what carries it (see `compute_carried_pose`): it shines along its +z and
-    # has +y up
+    # (4, 4) its pose in what carries it (see `compute_carried_pose`): it shines along
+    # its +z and has +y up
     pose_on_carrier: Float64Array
     # (h, w) intensities on a plane before it, row 0 on top, as far as tangents of 1 to
     # either side

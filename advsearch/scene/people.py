@@ -493,8 +493,8 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     """
     # how far the value is through each of the n - 1 intervals
     fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
-    # 1 for intervals before the value, 0 for those after it. At a node the derivative is
-    # that of one side, not the sum of both.
+    # 1 for intervals before the value, 0 for those after it. At a node the derivative
+    # is that of one side, not the sum of both.
     is_within = (fraction >= 0.0) & (fraction < 1.0)
     fraction = torch.where(is_within, fraction, (fraction >= 1.0).to(fraction.dtype))
     # A node's weight is the fraction of the interval before it (1 for the first node)

@@ -611,9 +611,10 @@ def _make_mounts(
 
 
 def _measure_scale(path: str, applied_transform: Any) -> float:
-    """Return the scale of nerfstudio's `applied_transform`, of 3 or 4 rows of 4 numbers.
+    """Return the scale of nerfstudio's `applied_transform`.
 
-    Raises FileFormatError: it is no rotation times a scale, with a shift.
+    It has 3 or 4 rows of 4 numbers. Raises FileFormatError: it is no rotation times a
+    scale, with a shift.
     """
     rows = _to_rows(applied_transform)
     cells = [cell for row in rows for cell in row]

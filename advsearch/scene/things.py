@@ -294,7 +294,7 @@ def _compute_pose(
     requested: RequestedThing,
     metres: float,
 ) -> Float64Array:
-    """Return the pose (4, 4) of a thing that stands on the ground where it is requested.
+    """Return the pose (4, 4) of a thing on the ground where it is requested.
 
     Args:
         scene: scene with the object, whose size is the unit of lengths.

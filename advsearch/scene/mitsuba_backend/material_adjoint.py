@@ -173,7 +173,7 @@ def material_adjoint(
 
 
 def _is_rough(cotangent: Tensor) -> bool:
-    """Return whether neighbouring pixels of a cotangent (H, W, 3) are hardly correlated.
+    """Return whether neighbouring pixels of a cotangent (H, W, 3) hardly correlate.
 
     That is, by less than `ROUGH_COTANGENT`. The mean square of the difference of two
     neighbours is 2 v (1 - c), where v is the mean square of the values and c their

@@ -582,8 +582,8 @@ def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tens
     # one number for each pair of positions, in either direction
     edge_keys, owner = torch.unique(lower * len(vertices) + higher, return_inverse=True)
     side_index = torch.arange(len(owner))
-    # An edge has the vertices of the first side that lies on it. To assign them by index
-    # would take those of any side, not the same one in each call.
+    # An edge has the vertices of the first side that lies on it. To assign them by
+    # index would take those of any side, not the same one in each call.
     first_side = torch.full((len(edge_keys),), len(owner)).scatter_reduce(
         0, owner, side_index, "amin"
     )

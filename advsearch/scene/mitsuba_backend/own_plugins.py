@@ -397,7 +397,7 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
 def _eval_towards_emitter(
     bsdf: Any, si: Any, ds: Any, scattered: Any, active: Any, throughput: Any
 ) -> Any:
-    """Return throughput times MIS weight times the value of an event towards an emitter.
+    """Return throughput times MIS weight times value of an event towards an emitter.
 
     The value is that of the phase function where light is `scattered` in the haze, else
     that of the BSDF.
@@ -729,7 +729,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     """
 
     def __init__(self, props: Any) -> None:
-        """Read the model, the clipping and perhaps drops from the sensor's properties."""
+        """Read model, clipping and perhaps drops from the sensor's properties."""
         super().__init__(props)
         values = tuple(float(props[name]) for name in NUMBER_NAMES)
         self._model = CameraModel(

@@ -296,7 +296,7 @@ def _translate_plugin(part: parts.PluginPart) -> Translation:
 
 @translate_part.register
 def _translate_numbers(part: parts.PluginNumbers) -> Translation:
-    """Return inputs for numbers of other plugins; those of other parts exist already."""
+    """Return inputs for numbers of other plugins; other parts have theirs already."""
     return Translation(
         {},
         tuple(

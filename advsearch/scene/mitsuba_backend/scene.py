@@ -186,9 +186,9 @@ class MitsubaScene:
     def _set_integrator(self, integrator: str | None) -> None:
         """Set the integrator of images, and the lengths from which paths may end early.
 
-        Among walls light is reflected many times: there Russian roulette saves more time
-        than its noise costs. `integrator` is Mitsuba's type; None takes "path" there, and
-        "prb" elsewhere.
+        Among walls light is reflected many times: there Russian roulette saves more
+        time than its noise costs. `integrator` is Mitsuba's type; None takes "path"
+        there, and "prb" elsewhere.
         """
         self.integrator = integrator or "prb"
         self.roulette_depth = NO_ROULETTE_DEPTH
@@ -229,7 +229,7 @@ class MitsubaScene:
         return inputs
 
     def _declare_inputs(self, inputs: Sequence[parts.SceneInput]) -> None:
-        """Set `declared_inputs`, the inputs that the scene really has, and sets of them.
+        """Set `declared_inputs`, inputs that the scene really has, and sets of them.
 
         An input is left out if Mitsuba has no parameter for it.
         """
@@ -279,7 +279,8 @@ class MitsubaScene:
         other = MitsubaScene(
             description, self.resolution, filter=filter_name, **arguments
         )
-        # Load both now: one that is loaded later makes the recordings of all scenes stale.
+        # Load both now: one that is loaded later makes the recordings of all scenes
+        # stale.
         for method in ("path", "guides"):
             other._integrator(method)
         return other
@@ -681,8 +682,8 @@ class MitsubaScene:
                 projector,
                 self._find_plane(),
             )
-            # Coordinates are converted to those of a repeating texture, which a principled
-            # surface of ours has already.
+            # Coordinates are converted to those of a repeating texture, which a
+            # principled surface of ours has already.
             size = self.parameters[key].shape[:2]
             surface = None
             if projector is None:

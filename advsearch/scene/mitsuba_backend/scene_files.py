@@ -262,7 +262,7 @@ def import_mitsuba_scene(
 
 
 def _make_upright(mesh: Mesh, rotation: Float64Array) -> Mesh:
-    """Return a mesh turned by the rotation (3, 3) from a scene's coordinates to z up."""
+    """Return a mesh turned by a rotation (3, 3) from scene coordinates to z up."""
     matrix = rotation.astype(np.float32).T
     return replace(mesh, vertices=mesh.vertices @ matrix, normals=mesh.normals @ matrix)
 

@@ -432,8 +432,8 @@ def _read_haze_medium(
     """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
-    # The cube root of the determinant is the scale of lengths, from the scene's to those
-    # of the object. What is per length becomes smaller by it.
+    # The cube root of the determinant is the scale of lengths, from the scene's to
+    # those of the object. What is per length becomes smaller by it.
     length_scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / length_scale
     # one value for all channels
@@ -613,7 +613,7 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
     base: _Color | None = None
 
     def replace_color(plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin whose base color, if it is the first, is stored and replaced."""
+        """Return a plugin, and store and replace its base color if it is the first."""
         nonlocal base
         key = BASE_COLOR_KEYS.get(str(plugin["type"]))
         if key is not None and base is None:

@@ -250,7 +250,7 @@ def is_visible_from_behind(
 
 
 def _sample_outside_rays(positions: Float32Array) -> Any:
-    """Return `N_OUTSIDE_RAYS` random rays from outside and above to positions (n, 3)."""
+    """Return `N_OUTSIDE_RAYS` random rays onto positions (n, 3), from above outside."""
     generator = np.random.default_rng(0)
     to_origin = generator.standard_normal((N_OUTSIDE_RAYS, 3))
     to_origin /= np.linalg.norm(to_origin, axis=1, keepdims=True)
@@ -472,8 +472,8 @@ def measure_lobes(
         0.0, 1.0 - samples.x * along[:, None] - samples.z * up[:, None]
     )
     core, tail = _measure_spreads(samples.weight, squared_angle)
-    # The base colors were 0.5 and 0: what reflects more with the grey one is the diffuse
-    # part, and per base color it is twice that.
+    # The base colors were 0.5 and 0: what reflects more with the grey one is the
+    # diffuse part, and per base color it is twice that.
     by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
     diffuse = np.maximum(by_color, 0.0) / 0.5
     # the viewer is at positive x, and `Lobes.along` is away from the viewer

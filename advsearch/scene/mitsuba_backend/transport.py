@@ -505,7 +505,8 @@ def _sample_bounce(
     context = mi.BSDFContext()
     mis_weight = mi.ad.integrators.common.mis_weight
 
-    # Towards a light. One that a BSDF sample can't meet, a point, has all of the weight.
+    # Towards a light. One that a BSDF sample can't meet, a point, has all of the
+    # weight.
     ds, em_weight = scene.sample_emitter_direction(
         si, noise.next_2d(active), True, active
     )

@@ -247,7 +247,7 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
 
 
 def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
-    """Return a mesh's plugin with its inputs, which are taken out of the remaining ones.
+    """Return a mesh's plugin with its inputs, which stop being remaining ones.
 
     Base color, light and the numbers of the surface are set here. Vertices and normals
     are dropped: the file that is written has them. Other inputs stay among

@@ -215,9 +215,10 @@ class _SceneText:
             depth += 1
             self.elements += 1
             if self.elements > scale_limit(MAX_ELEMENTS) or depth > MAX_NESTING:
-                limit = f"at most {scale_limit(MAX_ELEMENTS):,} elements, {MAX_NESTING} deep"
+                max_elements = scale_limit(MAX_ELEMENTS)
                 raise FileFormatError(
-                    f"{self.path}: expected {limit}, got more; split the scene up"
+                    f"{self.path}: expected at most {max_elements:,} elements, "
+                    f"{MAX_NESTING} deep, got more; split the scene up"
                 )
             if tag in ("alias", "path"):
                 where = f"{self.path}: line {parser.CurrentLineNumber}"
@@ -489,7 +490,7 @@ class _FileReader:
     """
 
     def __init__(self, path: Path, notes: list[str]) -> None:
-        """Prepare to read the files of a scene file; `notes` gets the readers' remarks."""
+        """Prepare to read a scene file's files; `notes` gets the readers' remarks."""
         self._path = path
         self._notes = notes
         self._references = References(path)

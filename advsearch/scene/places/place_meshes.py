@@ -233,7 +233,7 @@ def _note_left_out(
 
 
 def _find_variant(path: Path, header: Header, variant: str) -> int:
-    """Return the index of a variant; raises UnknownNameError if the file has none such."""
+    """Return the index of a variant; raises UnknownNameError without one such."""
     extension = _read_extension(path, _Variants, _get_extension(header, VARIANTS))
     names = [entry.name for entry in extension.variants]
     if variant not in names:
@@ -415,7 +415,7 @@ def _group_by_material(
         parts_by_mesh.setdefault((name, variant_material), []).append(part)
 
     def get_order(mesh: NameAndMaterial) -> int:
-        """Return the index of a mesh's material; before all others where it has none."""
+        """Return the index of a mesh's material; below all others without one."""
         _, material = mesh
         return -1 if material is None else material
 
@@ -489,8 +489,8 @@ def _with_finish(
     is_plain = part.opacity is None and part.normal_map is None
     if coat.clearcoatFactor == 0.0 or not is_plain:
         return part
-    # The width of the coat's lobe is the square of glTF's roughness; Mitsuba's goes from
-    # `DULL_COAT` at a gloss of 0 to `GLOSSY_COAT` at 1.
+    # The width of the coat's lobe is the square of glTF's roughness; Mitsuba's goes
+    # from `DULL_COAT` at a gloss of 0 to `GLOSSY_COAT` at 1.
     gloss = (DULL_COAT - coat.clearcoatRoughnessFactor**2) / (DULL_COAT - GLOSSY_COAT)
     principled = {
         "type": "principled",

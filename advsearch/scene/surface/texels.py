@@ -472,8 +472,8 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, n_rows)
-    # The solid angle of a texel goes by this, and is 1 at the horizon. The texels at the
-    # poles reach half a texel from it: they take the sine in the middle of that.
+    # The solid angle of a texel goes by this, and is 1 at the horizon. The texels at
+    # the poles reach half a texel from it: they take the sine in the middle of that.
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE_WEIGHTS

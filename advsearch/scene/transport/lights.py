@@ -380,7 +380,7 @@ class LightBasis:
             ]
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
-        """Return the factor (lights, 3) of each light in scene inputs; differentiable."""
+        """Return the factor (lights, 3) of each light, differentiable in the inputs."""
         weights = [torch.ones(1, 3)] if self._has_fixed_light else []
         weights += [inputs[name].reshape(1, 3) for name in self._lamps]
         if self._basis_maps is not None:
@@ -456,7 +456,7 @@ class BasisRenderer(Predictor):
     def _trace_lights(
         self, traced: Renderer, u: Tensor, seed: int, tick: ProgressCallback
     ) -> list[LinearRenderer]:
-        """Trace the image and the matrices under each light; arguments as of the class."""
+        """Trace image and matrices under each light; arguments as of the class."""
         set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
         linear_names = set_inputs & find_linear_inputs(traced)
         # patterns of projectors shine in the first light alone
